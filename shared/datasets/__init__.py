@@ -1,4 +1,4 @@
-"""Data sets of visual place recognition: their layouts, their measures, and a generated city.
+"""Datasets of visual place recognition: layouts on disk, ground truth, and checks.
 
-Nothing here imports torch: data sets are read and written where no network is installed.
+Nothing here imports torch.
 """

@@ -1,12 +1,12 @@
-"""What a folder holds, as `placewise datasets check` tells it: sets, figures, and what is wrong.
+"""Dataset checks: what a folder contains, undecodable photos, and suspect ground truth labels.
 
-Photos that don't decode, found by decoding them all: on all cores, each to its last pixel.
+`inspect_dataset` opens every set in a folder and collects problems, for `placewise datasets check`.
 
-Answers that a ground truth calls wrong although they may be right.
+`find_undecodable` decodes every photo completely, on all cores.
 
-A confident first match just outside the rule, 30 m away say, or in the right spot but looking
-another way, often shows the place: whoever made the ground truth should look at it. Users of
-published sets have found whole figures wrong for such labels.
+`find_suspect_labels` lists confident first matches that the ground truth counts as wrong although
+they are close: a match 30 m away, or at the right position with another heading, often shows the
+place. Such labels should be reviewed; in published sets they have invalidated whole results.
 """
 
 from __future__ import annotations
@@ -40,25 +40,28 @@ from shared.errors import InvalidRequest, NotFound, PlacewiseError, Unprocessabl
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count, open_photo
 
 MAX_DECODED_PIXELS = 100_000_000
-"""Of a photo that is decoded: more is an attack on memory, or no photo of a street."""
+"""Maximum of width x height of a decoded photo; larger ones would exhaust memory."""
 PHOTOS_PER_TASK = 1024
 
 
 def find_undecodable(
     paths: Sequence[Path], on_progress: Callable[[int], None] = lambda count: None
 ) -> list[tuple[Path, str]]:
-    """Each photo that can't be decoded, with what is wrong; `on_progress` is told of each photo."""
+    """Return the photos that can't be decoded, with the reason.
+
+    `on_progress` is called with 1 after each photo.
+    """
     broken = []
-    # Pillow decodes without the lock. Its warnings, of strange EXIF, are ignored around all threads
-    # at once: the filters are the process's, not a thread's.
+    # Threads suffice, because Pillow releases the GIL while decoding. Its warnings about unusual
+    # EXIF are ignored around all threads, because warning filters are process-wide.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as pool:
         warnings.simplefilter("ignore")
         for start in range(0, len(paths), PHOTOS_PER_TASK):
-            some = paths[start : start + PHOTOS_PER_TASK]
-            for path, fault in zip(some, pool.map(_decode_error, some), strict=True):
+            chunk = paths[start : start + PHOTOS_PER_TASK]
+            for path, reason in zip(chunk, pool.map(_decode_error, chunk), strict=True):
                 on_progress(1)
-                if fault is not None:
-                    broken.append((path, fault))
+                if reason is not None:
+                    broken.append((path, reason))
     return broken
 
 
@@ -80,44 +83,51 @@ RADIUS_RULE = PositiveRule("radius")
 
 @dataclass(frozen=True, slots=True)
 class DatasetProblem:
-    """Something that is wrong with a data set, and how often."""
+    """A problem of a dataset, with the number of its occurrences."""
 
     code: str
     count: int
     detail: str
     examples: tuple[str, ...] = ()
-    """at most MOST_EXAMPLES"""
+    """At most MAX_EXAMPLES"""
 
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """What was found at or below a folder; what could not be opened is among the problems."""
+    """The sets at or below a folder; sets that can't be opened are listed as problems."""
 
     root: Path
     training: TrainingSet | None
     evaluation: tuple[EvaluationSet, ...]
     layouts: tuple[str, ...]
-    """of the training set, if there is one, and then of each evaluation set"""
+    """Layout names: of the training set, if there is one, then of each evaluation set"""
     problems: tuple[DatasetProblem, ...]
 
     def photos(self) -> tuple[Path, ...]:
-        """Every photo of every set, once, in order."""
+        """Return all photos of all sets, in order and without duplicates."""
         return tuple(dict.fromkeys(_photos(self.training, self.evaluation)))
 
 
 def inspect_dataset(
     root: Path, *, protocol: str | None = None, rule: str | None = None, min_photos: int = 2
 ) -> DatasetReport:
-    """Open whatever there is. `protocol` and `rule` are those of the evaluation sets.
+    """Open all sets at or below a folder and collect their problems.
 
-    Raises NotFound (`no_data_set`) where there is nothing to open at all.
+    Args:
+        root: The folder.
+        protocol: Protocol of the evaluation sets; None for their default.
+        rule: Positive-match criterion of the evaluation sets; None for their own.
+        min_photos: Training places with fewer photos are left out.
+
+    Raises:
+        NotFound: `no_data_set` if there is no set.
     """
-    found = find_evaluation_sets(root)
+    discovered = find_evaluation_sets(root)
     layout = find_training_layout(root)
-    if not found and layout is None:
+    if not discovered and layout is None:
         raise NotFound(
             "no_data_set",
-            f"No data set was recognised in {root}. docs/how-to/data-sets.md shows every layout.",
+            f"No dataset was recognised in {root}. See docs/how-to/data-sets.md for all layouts.",
         )
     problems: list[DatasetProblem] = []
     training: TrainingSet | None = None
@@ -129,77 +139,81 @@ def inspect_dataset(
         except PlacewiseError as error:
             problems.append(DatasetProblem(error.code, 1, error.detail))
     evaluation = []
-    for one in found:
-        layouts.append(one.layout.name)
+    for candidate in discovered:
+        layouts.append(candidate.layout.name)
         try:
-            opened = open_evaluation_set(root, one.name, protocol=protocol, rule=rule)
+            opened = open_evaluation_set(root, candidate.name, protocol=protocol, rule=rule)
         except PlacewiseError as error:
-            problems.append(DatasetProblem(error.code, 1, f"{one.name}: {error.detail}"))
+            problems.append(DatasetProblem(error.code, 1, f"{candidate.name}: {error.detail}"))
         else:
             evaluation.append(opened)
             problems += _find_problems(opened)
-    recognised = DatasetReport(root, training, tuple(evaluation), tuple(layouts), tuple(problems))
-    return _add_missing_files(recognised)
+    report = DatasetReport(root, training, tuple(evaluation), tuple(layouts), tuple(problems))
+    return _add_missing_files(report)
 
 
 def find_undecodable_photos(
-    report: DatasetReport, done: Callable[[int], None] = lambda count: None
+    report: DatasetReport, on_progress: Callable[[int], None] = lambda count: None
 ) -> list[DatasetProblem]:
-    """Open every photo to its last pixel; `done` is told how many more have been."""
+    """Decode every photo of a report completely and return the problem, if there is one.
+
+    `on_progress` is called with the number of photos done since the last call.
+    """
     photos = report.photos()
-    there = [path for path in photos if path.is_file()]
-    done(len(photos) - len(there))  # these are among the problems already
-    broken = [f"{path}: {fault}" for path, fault in find_undecodable(there, done)]
+    existing = [path for path in photos if path.is_file()]
+    on_progress(len(photos) - len(existing))  # missing photos are reported already
+    broken = [f"{path}: {reason}" for path, reason in find_undecodable(existing, on_progress)]
     return [_problem("undecodable_photo", broken, "photos can't be decoded")] if broken else []
 
 
-def _add_missing_files(recognised: DatasetReport) -> DatasetReport:
-    missing = [str(path) for path in recognised.photos() if not path.is_file()]
+def _add_missing_files(report: DatasetReport) -> DatasetReport:
+    missing = [str(path) for path in report.photos() if not path.is_file()]
     if not missing:
-        return recognised
-    problem = _problem("missing_photo", missing, "photos are named, and are not there")
+        return report
+    problem = _problem("missing_photo", missing, "listed photos do not exist")
     return DatasetReport(
-        recognised.root,
-        recognised.training,
-        recognised.evaluation,
-        recognised.layouts,
-        (*recognised.problems, problem),
+        report.root,
+        report.training,
+        report.evaluation,
+        report.layouts,
+        (*report.problems, problem),
     )
 
 
 def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
     name = evaluation.name
-    for role, shots in (("database", evaluation.database), ("queries", evaluation.queries)):
-        twice = _duplicates(shot.name for shot in shots)
-        if twice:
-            yield _problem("listed_twice", twice, f"photos stand twice in {name}'s {role}")
-    both = {shot.path for shot in evaluation.database}
-    shared = [shot.name for shot in evaluation.queries if shot.path in both]
+    for role, photos in (("database", evaluation.database), ("queries", evaluation.queries)):
+        duplicates = _duplicates(photo.name for photo in photos)
+        if duplicates:
+            yield _problem(
+                "listed_twice", duplicates, f"photos are listed twice in {name}'s {role}"
+            )
+    database_paths = {photo.path for photo in evaluation.database}
+    shared = [photo.name for photo in evaluation.queries if photo.path in database_paths]
     if shared:
-        yield _problem("query_in_database", shared, f"queries of {name} are database photos, too")
+        yield _problem("query_in_database", shared, f"queries of {name} are also database photos")
     differing = _differing_positives(evaluation)
     if differing:
         yield _problem(
             "ground_truth_differs",
             differing,
             f"of {len(evaluation.queries)} queries of {name} have other positives by "
-            f"{RADIUS_RULE} than "
-            f"in the ground truth that the set brings",
+            f"{RADIUS_RULE} than in the ground truth of the set",
         )
 
 
 def _differing_positives(evaluation: EvaluationSet) -> list[str]:
-    """Queries whose given positives are not those of 25 m, where both are known."""
-    shots = (*evaluation.queries, *evaluation.database)
-    if not evaluation.rule.startswith("given ") or not all(has_position(shot) for shot in shots):
+    """Return the queries whose given positives differ from those within 25 m, if both exist."""
+    photos = (*evaluation.queries, *evaluation.database)
+    if not evaluation.rule.startswith("given ") or not all(has_position(photo) for photo in photos):
         return []
     computed = find_positives(RADIUS_RULE, evaluation.queries, evaluation.database)
     return [
         query.name
-        for query, given, found in zip(
+        for query, given, within_radius in zip(
             evaluation.queries, evaluation.positives, computed, strict=True
         )
-        if given.tolist() != found.tolist()
+        if given.tolist() != within_radius.tolist()
     ]
 
 
@@ -216,29 +230,30 @@ def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:
 def _photos(training: TrainingSet | None, evaluation: Iterable[EvaluationSet]) -> Iterator[Path]:
     for place in training.places if training else ():
         yield from place.photos
-    for one in evaluation:
-        for shot in (*one.database, *one.queries):
-            yield shot.path
+    for opened in evaluation:
+        for photo in (*opened.database, *opened.queries):
+            yield photo.path
 
 
 MAX_RULE_MULTIPLE = 4.0
-"""How far outside of the rule a match is still worth a look."""
+"""Matches within this multiple of the rule's distance count as suspect."""
 
 
 @dataclass(frozen=True, slots=True)
 class SuspectLabel:
-    """A query whose confident first match counts as wrong."""
+    """A query whose confident first match is not a positive."""
 
     query: int
-    """index"""
+    """Index of the query"""
     database: int
+    """Index of the match"""
     query_name: str
     database_name: str
     score: float | None
     metres: float | None
-    """between them; None where one has no position"""
+    """Distance of query and match; None if one has no position"""
     degrees: float | None
-    """between the ways they look, 0 to 180; None where one has no heading"""
+    """Difference of their headings, 0 to 180; None if one has no heading"""
 
 
 def find_suspect_labels(
@@ -248,15 +263,23 @@ def find_suspect_labels(
     *,
     min_score: float | None = None,
 ) -> list[SuspectLabel]:
-    """First matches that are no positives, are confident, and lie just outside the set's rule.
+    """Find confident first matches that are not positives but lie just outside the set's rule.
 
-    `ranked` is (queries, k) database indices and `scores` (queries, k), the higher the better. A
-    match is confident from `min_score` on; left out, from the median score of the first matches
-    that are right. Without scores every first match is. "Just outside" is TIMES_THE_RULE its
-    metres or frames, whatever the heading; where the set's rule is unknown or of labels, its 25 m
-    count. Most confident first.
+    "Just outside" means within MAX_RULE_MULTIPLE times the metres or frames of the rule, for any
+    heading; 25 m if the rule is unknown or `place-label`.
 
-    Raises InvalidRequest (`predictions_of_other_queries`).
+    Args:
+        evaluation: The evaluation set.
+        ranked: (queries, k) database indices, best first.
+        scores: (queries, k) scores, higher is better; None treats every first match as confident.
+        min_score: Minimum score of a confident match; None for the median score of the first
+            matches that are positives.
+
+    Returns:
+        Suspects, most confident first.
+
+    Raises:
+        InvalidRequest: `predictions_of_other_queries`.
     """
     if len(ranked) != len(evaluation.queries) or (
         scores is not None and len(scores) != len(ranked)
@@ -269,29 +292,34 @@ def find_suspect_labels(
     if not ranked.size:
         return []
     first = ranked[:, 0]
-    right = np.array(
-        [found in positives for found, positives in zip(first, evaluation.positives, strict=True)],
+    correct = np.array(
+        [match in positives for match, positives in zip(first, evaluation.positives, strict=True)],
         dtype=bool,
     )
-    confident = ~right
+    confident = ~correct
     if scores is not None:
         if min_score is None:
-            min_score = float(np.median(scores[right, 0])) if right.any() else -np.inf
+            min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
         confident &= scores[:, 0] >= min_score
-    suspects = _near(evaluation, first, np.flatnonzero(confident), scores)
-    return sorted(suspects, key=lambda one: (-(one.score or 0.0), one.query))
+    suspects = _just_outside(evaluation, first, np.flatnonzero(confident), scores)
+    return sorted(suspects, key=lambda suspect: (-(suspect.score or 0.0), suspect.query))
 
 
-def _near(
-    evaluation: EvaluationSet, first: Indices, asked: Indices, scores: NDArray[np.float32] | None
+def _just_outside(
+    evaluation: EvaluationSet,
+    first: Indices,
+    candidates: Indices,
+    scores: NDArray[np.float32] | None,
 ) -> list[SuspectLabel]:
-    queries = [evaluation.queries[number] for number in asked]
-    matches = [evaluation.database[number] for number in first[asked]]
+    queries = [evaluation.queries[number] for number in candidates]
+    matches = [evaluation.database[number] for number in first[candidates]]
     rule = _rule_of(evaluation)
     metres = pairwise_distances_m(queries, matches)
     suspects = []
-    for number, query, match, away in zip(asked.tolist(), queries, matches, metres, strict=True):
-        if _is_just_outside(rule, query, match, float(away)):
+    for number, query, match, distance in zip(
+        candidates.tolist(), queries, matches, metres, strict=True
+    ):
+        if _is_just_outside(rule, query, match, float(distance)):
             suspects.append(
                 SuspectLabel(
                     number,
@@ -299,7 +327,7 @@ def _near(
                     query.name,
                     match.name,
                     None if scores is None else float(scores[number, 0]),
-                    None if np.isnan(away) else float(away),
+                    None if np.isnan(distance) else float(distance),
                     _degrees(query, match),
                 )
             )
@@ -313,13 +341,13 @@ def _is_just_outside(
         if query.frame is None or match.frame is None:
             return False
         return abs(query.frame - match.frame) <= MAX_RULE_MULTIPLE * max(rule.frames, 1)
-    return metres <= MAX_RULE_MULTIPLE * rule.radius_m  # never of NaN
+    return metres <= MAX_RULE_MULTIPLE * rule.radius_m  # False for NaN
 
 
 def _rule_of(evaluation: EvaluationSet) -> PositiveRule:
     try:
         return parse_rule(evaluation.rule)
-    except InvalidRequest:  # a ground truth of unknown making, named after its file
+    except InvalidRequest:  # a ground truth file without a known rule
         return PositiveRule("radius")
 
 

@@ -1,15 +1,13 @@
-"""What a data set is, once it has been read: photos, where they were taken, what shows what.
+"""Dataset types: photos, evaluation sets, training sets, their fingerprints, published results.
 
-Every layout (`shared/datasets/layouts`) becomes these types, and whatever trains, evaluates or
-reports takes nothing else. `shared/datasets/open_dataset.py` opens them.
+Every layout (`shared/datasets/layouts`) is read into these types; training, evaluation and reports
+use nothing else. `shared/datasets/open_dataset.py` opens datasets.
 
-Published figures, each with the set that it was measured on.
-
-A figure is comparable only where protocol and fingerprint are the same: the same photos, the same
-positives, the same queries counted. Reports of "92.2 instead of 95.1" mostly compare two sets of
-one name. The lists of the published sets can't be shipped, so a fingerprint joins this table when
-someone has the set and has checked it against the publication; until then nothing is placed beside
-a result.
+Published results are comparable only with the same protocol and fingerprint: the same photos, the
+same positives, the same set of counted queries. Most differences such as "92.2 instead of 95.1"
+come from different sets of the same name. The lists of the published sets can't be shipped, so
+PUBLISHED_RESULTS gets an entry only after its fingerprint was checked against the publication;
+until then results are reported without a comparison.
 """
 
 from __future__ import annotations
@@ -27,17 +25,17 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 
 MISSING_FILE_BYTES = -1
-"""the size that a fingerprint takes for a photo that is not there"""
+"""Size of a missing photo in a fingerprint."""
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetPhoto:
-    """One photo of a set. None means "not said"."""
+    """One photo of a dataset. None means unknown."""
 
     path: Path
-    """To open it."""
+    """The file to open."""
     name: str
-    """As the set names it, relative and separated by `/`: what predictions and reports say."""
+    """Relative path in the dataset, separated by `/`; used in predictions and reports."""
     easting: float | None = None
     """metres, UTM"""
     northing: float | None = None
@@ -56,18 +54,18 @@ class DatasetPhoto:
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Database photos, queries, and which database photos are right for each query."""
+    """Database photos, queries, and the positives of each query."""
 
     name: str
     root: Path
     database: tuple[DatasetPhoto, ...]
     queries: tuple[DatasetPhoto, ...]
     positives: tuple[Indices, ...]
-    """Ascending database indices, of each query; empty where it has none."""
+    """Ascending database indices for each query; empty if it has no positives."""
     rule: str
-    """Who is a positive, in words such as `radius 25 m`."""
+    """The positive-match criterion, such as `radius 25 m`."""
     protocol: str
-    """How the set was put together: `placewise`, `msls-official`, `vme`."""
+    """How the set was assembled: `placewise`, `msls-official`, `vme`."""
 
     def __post_init__(self) -> None:
         if len(self.positives) != len(self.queries):
@@ -75,42 +73,42 @@ class EvaluationSet:
 
     @property
     def without_positives(self) -> Indices:
-        """Ascending indices of the queries that no database photo is right for."""
-        empty = [number for number, found in enumerate(self.positives) if not len(found)]
+        """Ascending indices of the queries without positives."""
+        empty = [index for index, rows in enumerate(self.positives) if not len(rows)]
         return np.array(empty, np.int64)
 
     @cached_property
     def fingerprint(self) -> str:
-        """sha256 over names and sizes in bytes of all photos, positives and protocol.
+        """sha256 of the names and sizes in bytes of all photos, the positives and the protocol.
 
-        Two results are comparable only where it is the same. It takes one look at each file; a
-        file that is not there counts as of size NO_FILE.
+        Two results are comparable only if their fingerprints are equal. Reads the metadata of each
+        file; a missing file has the size MISSING_FILE_BYTES.
         """
         digest = hashlib.sha256()
         for text in ("evaluation", self.protocol):
             _update_digest(digest, text)
-        for role, shots in (("database", self.database), ("queries", self.queries)):
-            _update_digest(digest, f"{role} {len(shots)}")
-            for shot in shots:
-                _update_digest(digest, f"{shot.name} {_size(shot.path)}")
-        for found in self.positives:
-            _update_digest(digest, " ".join(map(str, found.tolist())))
+        for role, photos in (("database", self.database), ("queries", self.queries)):
+            _update_digest(digest, f"{role} {len(photos)}")
+            for photo in photos:
+                _update_digest(digest, f"{photo.name} {_size(photo.path)}")
+        for rows in self.positives:
+            _update_digest(digest, " ".join(map(str, rows.tolist())))
         return digest.hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlace:
-    """Photos that show one place."""
+    """Photos of the same place."""
 
     place_id: int
-    """unique over the cities of its set"""
+    """Unique over all cities of the set"""
     city: str
     photos: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """Places to learn from, city after city."""
+    """Labelled places for training, city by city."""
 
     name: str
     root: Path
@@ -119,17 +117,21 @@ class TrainingSet:
 
     @property
     def cities(self) -> tuple[str, ...]:
-        """In the order of their places."""
+        """City names in the order of their places."""
         return tuple(dict.fromkeys(place.city for place in self.places))
 
     @property
     def photo_count(self) -> int:
+        """Number of photos of all places."""
         return sum(len(place.photos) for place in self.places)
 
     @cached_property
     def fingerprint(self) -> str:
-        """sha256 over cities, place numbers and photo names in their order, not over sizes: half
-        a million photos on a disk far away would take minutes."""
+        """sha256 of cities, place ids and photo names, in their order.
+
+        Sizes are not included: reading them takes minutes for half a million photos on a network
+        disk.
+        """
         digest = hashlib.sha256()
         _update_digest(digest, "training")
         for place in self.places:
@@ -140,7 +142,7 @@ class TrainingSet:
 
 
 def list_fingerprint(names: Iterable[str]) -> str:
-    """sha256 over the names of a list in their order: what a ground truth is true of."""
+    """Return the sha256 of names in their order; identifies the list of a ground truth."""
     digest = hashlib.sha256()
     for name in names:
         _update_digest(digest, name)
@@ -148,7 +150,7 @@ def list_fingerprint(names: Iterable[str]) -> str:
 
 
 def _update_digest(digest: hashlib._Hash, text: str) -> None:
-    # A name may hold any character but NUL, so that NUL ends it beyond doubt.
+    # A file name may contain any character but NUL, so NUL is an unambiguous terminator.
     digest.update(text.encode("utf-8", "surrogateescape") + b"\0")
 
 
@@ -161,15 +163,18 @@ def _size(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class PublishedResult:
+    """A published result and the exact evaluation set that it was measured on."""
+
     protocol: str
     fingerprint: str
-    """`EvaluationSet.fingerprint` of the very set"""
+    """`EvaluationSet.fingerprint` of the set"""
     method: str
     recall: dict[int, float]
-    """by k, 0 to 1"""
+    """Recall@k by k, 0 to 1"""
     source: str
 
     def as_json(self) -> dict[str, Any]:
+        """Return the result as JSON values."""
         return asdict(self) | {"recall": {str(k): share for k, share in self.recall.items()}}
 
 
@@ -179,9 +184,9 @@ PUBLISHED_RESULTS: tuple[PublishedResult, ...] = ()
 def find_published_results(
     evaluation: EvaluationSet, known: tuple[PublishedResult, ...] = PUBLISHED_RESULTS
 ) -> tuple[PublishedResult, ...]:
-    """What has been published of exactly this set."""
+    """Return the published results of exactly this set, by protocol and fingerprint."""
     return tuple(
-        found
-        for found in known
-        if (found.protocol, found.fingerprint) == (evaluation.protocol, evaluation.fingerprint)
+        result
+        for result in known
+        if (result.protocol, result.fingerprint) == (evaluation.protocol, evaluation.fingerprint)
     )

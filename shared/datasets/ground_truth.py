@@ -1,10 +1,10 @@
-"""Which database photos are right for each query, by a rule; in memory that grows with the answer.
+"""Ground truth: rules for positive matches, and the positives of each query by a rule.
 
-The distance is that of published figures: a straight line in UTM metres, its bound included
-(VPR-datasets-downloader, deep-visual-geo-localization-benchmark). Over the border of two UTM zones,
-where their metres mean nothing to each other, the database is projected into the query's zone.
+Distances are those of published results: a straight line in UTM metres, the bound included
+(VPR-datasets-downloader, deep-visual-geo-localization-benchmark). Across the border of two UTM
+zones, whose metres are not comparable, the database is projected into the query's zone.
 
-Who counts as showing the same place: the rules of ground truth, as people write them.
+Memory grows with the number of positives, not with queries x database.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _PATTERNS = {
 
 @dataclass(frozen=True, slots=True)
 class PositiveRule:
-    """A database photo is a positive of a query when they meet all that is said here."""
+    """Criterion by which a database photo is a positive of a query."""
 
     kind: Kind
     radius_m: float = 25.0
-    """`radius` and `heading`: at most so far apart, in metres; the bound is included"""
+    """`radius` and `heading`: maximum distance in metres, inclusive"""
     degrees: float = 40.0
-    """`heading`: looking ways that differ by at most so much"""
+    """`heading`: maximum difference of the headings"""
     frames: int = 0
-    """`frames`: at most so many frames apart"""
+    """`frames`: maximum difference of the frame numbers"""
     same_sequence: bool = False
-    """`frames`: and of the same sequence"""
+    """`frames`: whether both photos must be of the same sequence"""
 
     def __str__(self) -> str:
         match self.kind:
@@ -62,8 +62,10 @@ class PositiveRule:
 
 
 def parse_rule(text: str) -> PositiveRule:
-    """`radius 25 m`, `heading 25 m 40 deg`, `frames 5 in sequence`, `place-label`; units may be
-    left out. Raises InvalidRequest (`unknown_rule`)."""
+    """Parse a rule such as `radius 25 m`, `heading 25 m 40 deg`, `frames 5 in sequence`.
+
+    Also `place-label`. Units are optional. Raises InvalidRequest (`unknown_rule`).
+    """
     cleaned = " ".join(text.lower().split())
     if match := _PATTERNS["radius"].fullmatch(cleaned):
         return PositiveRule("radius", radius_m=float(match[1] or 25))
@@ -75,16 +77,20 @@ def parse_rule(text: str) -> PositiveRule:
         return PositiveRule("frames", frames=int(match[1]), same_sequence=bool(match[2]))
     if _PATTERNS["place-label"].fullmatch(cleaned):
         return PositiveRule("place-label")
-    raise InvalidRequest("unknown_rule", f"There is no rule {text!r}. Known are: {RULE_SYNTAX}.")
+    raise InvalidRequest("unknown_rule", f"Unknown rule {text!r}. Valid rules: {RULE_SYNTAX}.")
 
 
 def find_positives(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    """For each query the ascending indices of its positives in the database.
+    """Find the positives of each query in the database.
 
-    Raises InvalidRequest where photos don't say what the rule needs: `no_positions`, `no_headings`,
-    `no_frames`, `no_places`.
+    Returns:
+        Ascending database indices for each query.
+
+    Raises:
+        InvalidRequest: Photos lack what the rule needs: `no_positions`, `no_headings`, `no_frames`,
+            `no_places`.
     """
     match rule.kind:
         case "radius":
@@ -100,85 +106,92 @@ def find_positives(
 def _within(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    found: list[Indices] = [np.empty(0, np.int64)] * len(queries)
-    for asked, kept, query_metres, metres in group_by_utm_plane(
+    positives: list[Indices] = [np.empty(0, np.int64)] * len(queries)
+    for query_indices, database_indices, query_metres, metres in group_by_utm_plane(
         utm_positions(queries), utm_positions(database)
     ):
         near = positives_within(query_metres, metres, rule.radius_m)
-        for number, positives in zip(asked.tolist(), near, strict=True):
-            found[number] = kept[positives]
-    return found
+        for query, rows in zip(query_indices.tolist(), near, strict=True):
+            positives[query] = database_indices[rows]
+    return positives
 
 
 def _same_heading(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    asked = _required_values("heading", "no_headings", queries, lambda shot: shot.heading)
-    looking = _required_values("heading", "no_headings", database, lambda shot: shot.heading)
-    found = _within(rule, queries, database)
+    query_headings = _required_values(
+        "heading", "no_headings", queries, lambda photo: photo.heading
+    )
+    database_headings = _required_values(
+        "heading", "no_headings", database, lambda photo: photo.heading
+    )
+    within_radius = _within(rule, queries, database)
     return [
-        near[heading_differences(looking[near], heading) <= rule.degrees]
-        for near, heading in zip(found, asked, strict=True)
+        rows[heading_differences(database_headings[rows], heading) <= rule.degrees]
+        for rows, heading in zip(within_radius, query_headings, strict=True)
     ]
 
 
 def heading_differences(
     headings: np.ndarray[tuple[int, ...], np.dtype[np.float64]], heading: float
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Angles between looking ways, 0 to 180 degrees; a heading may be of any turn, such as 370."""
+    """Return the angles between headings, 0 to 180 degrees; headings of 360 or more are valid."""
     return np.abs(np.mod(headings - heading + 180.0, 360.0) - 180.0)
 
 
 def _frames(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    asked = _required_values("frame number", "no_frames", queries, lambda shot: shot.frame).astype(
-        np.int64
-    )
+    query_frames = _required_values(
+        "frame number", "no_frames", queries, lambda photo: photo.frame
+    ).astype(np.int64)
     frames = _required_values(
-        "frame number", "no_frames", database, lambda shot: shot.frame
+        "frame number", "no_frames", database, lambda photo: photo.frame
     ).astype(np.int64)
     groups: dict[str | None, list[int]] = {}
-    for number, shot in enumerate(database):
-        groups.setdefault(shot.sequence if rule.same_sequence else None, []).append(number)
+    for number, photo in enumerate(database):
+        groups.setdefault(photo.sequence if rule.same_sequence else None, []).append(number)
     ordered = {
         key: np.array(numbers)[np.argsort(frames[numbers], kind="stable")]
         for key, numbers in groups.items()
     }
-    found = []
-    for shot, frame in zip(queries, asked, strict=True):
-        order = ordered.get(shot.sequence if rule.same_sequence else None, np.empty(0, np.int64))
+    positives = []
+    for photo, frame in zip(queries, query_frames, strict=True):
+        order = ordered.get(photo.sequence if rule.same_sequence else None, np.empty(0, np.int64))
         first = np.searchsorted(frames[order], frame - rule.frames, "left")
         last = np.searchsorted(frames[order], frame + rule.frames, "right")
-        found.append(np.sort(order[first:last]))
-    return found
+        positives.append(np.sort(order[first:last]))
+    return positives
 
 
 def _same_place(queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]) -> list[Indices]:
-    for shots in (queries, database):
-        if all(shot.place is None for shot in shots):
-            raise _missing_values_error("place label", "no_places", shots)
+    for photos in (queries, database):
+        if all(photo.place is None for photo in photos):
+            raise _missing_values_error("place label", "no_places", photos)
     by_place: dict[str, list[int]] = {}
-    for number, shot in enumerate(database):
-        if shot.place is not None:
-            by_place.setdefault(shot.place, []).append(number)
-    # A query without a label is of no place that the database knows.
-    return [np.array(by_place.get(shot.place or "", []), np.int64) for shot in queries]
+    for number, photo in enumerate(database):
+        if photo.place is not None:
+            by_place.setdefault(photo.place, []).append(number)
+    # A query without a label has no positives.
+    return [np.array(by_place.get(photo.place or "", []), np.int64) for photo in queries]
 
 
 def _required_values(
-    what: str, code: str, shots: Sequence[DatasetPhoto], of: Callable[[DatasetPhoto], float | None]
+    what: str,
+    code: str,
+    photos: Sequence[DatasetPhoto],
+    get_value: Callable[[DatasetPhoto], float | None],
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    values = [of(shot) for shot in shots]
-    lacking = [shot for shot, value in zip(shots, values, strict=True) if value is None]
-    if lacking:
-        raise _missing_values_error(what, code, lacking)
+    values = [get_value(photo) for photo in photos]
+    missing = [photo for photo, value in zip(photos, values, strict=True) if value is None]
+    if missing:
+        raise _missing_values_error(what, code, missing)
     return np.array(values, np.float64)
 
 
-def _missing_values_error(what: str, code: str, shots: Sequence[DatasetPhoto]) -> InvalidRequest:
+def _missing_values_error(what: str, code: str, photos: Sequence[DatasetPhoto]) -> InvalidRequest:
     return InvalidRequest(
         code,
-        f"{len(shots)} photos say no {what} (the first: {shots[0].name}), which this rule needs. "
-        "Give it in a CSV, or take another rule.",
+        f"{len(photos)} photos have no {what} (first: {photos[0].name}), which this rule needs. "
+        "Add it in a CSV, or use another rule.",
     )

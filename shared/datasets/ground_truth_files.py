@@ -1,13 +1,12 @@
-"""A ground truth on disk: the rows in a `.npy`, and beside it which lists they are true of.
+"""Ground truth files: positives in `.npy` files, and the sidecar that identifies their lists.
 
-Rows are positions in two lists, so that they are worthless for the same photos in another order:
-beside `gt.npy`, `gt.json` keeps the fingerprints of both lists, and other lists are refused.
+Rows are indices into two lists of photos, so they are invalid for the same photos in another order.
+Beside `gt.npy`, `gt.json` stores the fingerprints of both lists; other lists are rejected.
 
-Arrays of lists of integers in `.npy` files: the ground truths of the field, read without trust.
-
-Such a file holds a pickle, and a pickle from the internet can run any program. Here it may name
-only what NumPy writes for arrays, types and numbers, and each of these names leads to a stand-in
-that merely keeps its arguments. What comes out is lists of integers, or an error.
+The published ground truths are object arrays of lists, which NumPy stores as pickles, and loading
+an untrusted pickle can run any program. The unpickler here accepts only the names that NumPy writes
+for arrays, dtypes and scalars, and maps each of them to a stand-in class that only stores its
+arguments. The result is lists of integers, or an error.
 """
 
 from __future__ import annotations
@@ -27,24 +26,25 @@ from shared.errors import InvalidRequest, PlacewiseError
 
 INTEGER_KINDS = "iub"
 PADDING = -1
-"""in tables of fixed width: no further positive"""
+"""Fills unused cells in tables of fixed width"""
 
 
 def write_integer_lists(path: Path, lists: Sequence[Indices]) -> None:
-    """An object array (n,) of Python lists of ints, as `np.save` with pickles writes it."""
+    """Write an object array (n,) of Python lists of ints, as `np.save` with pickles does."""
     rows = np.empty(len(lists), object)
-    for number, found in enumerate(lists):
-        rows[number] = found.tolist()
+    for index, indices in enumerate(lists):
+        rows[index] = indices.tolist()
     with path.open("wb") as file:
         np.save(file, rows, allow_pickle=True)
 
 
 def read_integer_lists(path: Path) -> list[Indices]:
-    """One ascending array of integers, without doubles, for each row.
+    """Read one ascending array of unique integers for each row, without running the file's pickle.
 
-    Read are an object array (n,) of lists or arrays of integers, an integer array (n, k) with
-    PADDING where a row is shorter, and (n,) with one integer a row. Raises InvalidRequest
-    (`bad_ground_truth`) for anything else; nothing of the file is run.
+    Accepts an object array (n,) of lists or arrays of integers, an integer array (n, k) with
+    PADDING in shorter rows, and an integer array (n,) with one integer for each row.
+
+    Raises InvalidRequest (`bad_ground_truth`) for anything else.
     """
     try:
         with path.open("rb") as file:
@@ -53,8 +53,8 @@ def read_integer_lists(path: Path) -> list[Indices]:
                 file.seek(0)
                 return [_row(row, path) for row in _table(np.load(file, allow_pickle=False))]
             if dtype != np.dtype(object):
-                raise ValueError(f"it holds {dtype}, and lists of integers are needed")
-            return [_row(value, path) for value in _unpickled(file, shape)]
+                raise ValueError(f"it contains {dtype}, expected lists of integers")
+            return [_row(value, path) for value in _unpickle(file, shape)]
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise _bad_list_error(path, str(error)) from error
     except (
@@ -65,23 +65,26 @@ def read_integer_lists(path: Path) -> list[Indices]:
         RecursionError,
         MemoryError,
     ) as error:
-        # What a pickle that is no pickle, or a malicious one, makes the unpickler stumble over.
+        # Raised by the unpickler for damaged and malicious pickles.
         raise _bad_list_error(path, f"its pickle is broken ({type(error).__name__})") from error
 
 
 def read_names(path: Path) -> list[str]:
-    """The texts of a one-dimensional `.npy` array. InvalidRequest (`bad_list`) for any other."""
+    """Read a one-dimensional `.npy` array of strings.
+
+    Raises InvalidRequest (`bad_list`) for other files.
+    """
     try:
         with path.open("rb") as file:
             dtype, _ = _header(file)
             if dtype.kind not in "US":
-                raise ValueError(f"it holds {dtype}, and texts are needed")
+                raise ValueError(f"it contains {dtype}, expected strings")
             file.seek(0)
             names = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError, MemoryError) as error:
-        raise InvalidRequest("bad_list", f"{path} is no .npy list of paths: {error}.") from error
+        raise InvalidRequest("bad_list", f"{path} is not a .npy list of paths: {error}.") from error
     if names.ndim != 1:
-        raise InvalidRequest("bad_list", f"{path} is an array {names.shape}, and no list.")
+        raise InvalidRequest("bad_list", f"{path} has the shape {names.shape}, expected (n,).")
     return [str(name) for name in names.astype(str).tolist()]
 
 
@@ -96,7 +99,7 @@ def _header(file: BinaryIO) -> tuple[np.dtype[Any], tuple[int, ...]]:
 
 def _table(rows: np.ndarray[Any, Any]) -> list[Any]:
     if rows.ndim not in (1, 2):
-        raise ValueError(f"it is an array {rows.shape}, and (n, k) is needed")
+        raise ValueError(f"its shape is {rows.shape}, expected (n, k)")
     table = rows.reshape(len(rows), -1).astype(np.int64)
     return [row[row != PADDING] for row in table]
 
@@ -106,35 +109,35 @@ def _row(value: Any, path: Path) -> Indices:
         value = value.values()
     if not isinstance(value, list | tuple | np.ndarray):
         value = [value]
-    plain = [one.value() if isinstance(one, _Scalar) else one for one in value]
-    if not all(isinstance(one, int | np.integer) and one >= 0 for one in plain):
-        raise _bad_list_error(path, "a row holds something else than indices from 0")
-    return np.unique(np.array(plain, np.int64))
+    indices = [item.value() if isinstance(item, _Scalar) else item for item in value]
+    if not all(isinstance(index, int | np.integer) and index >= 0 for index in indices):
+        raise _bad_list_error(path, "a row contains values that are not indices from 0")
+    return np.unique(np.array(indices, np.int64))
 
 
-def _unpickled(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
+def _unpickle(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
     array = _Unpickler(file, encoding="latin1").load()
     if not isinstance(array, _Array) or array.fortran or len(shape) not in (1, 2):
-        raise ValueError(f"it is no list of lists but of the shape {shape}")
+        raise ValueError(f"it is not a list of lists; its shape is {shape}")
     values = array.values()
     if len(values) != math.prod(shape):
-        raise ValueError(f"it promises {math.prod(shape)} values and has {len(values)}")
+        raise ValueError(f"it declares {math.prod(shape)} values and contains {len(values)}")
     if len(shape) == 1:
         return values
-    # NumPy makes lists of one length a table, whoever meant a list of lists.
+    # NumPy stores lists of equal length as a table.
     return [values[start : start + shape[1]] for start in range(0, len(values), shape[1] or 1)]
 
 
-def _bad_list_error(path: Path, fault: str) -> InvalidRequest:
+def _bad_list_error(path: Path, reason: str) -> InvalidRequest:
     return InvalidRequest(
         "bad_ground_truth",
-        f"{path} is no ground truth: {fault}. It has to be an array of lists of database indices, "
-        "such as `placewise datasets ground-truth` writes.",
+        f"{path} is not a ground truth: {reason}. Use an array of lists of database indices, as "
+        "written by `placewise datasets ground-truth`.",
     )
 
 
 class _Array:
-    """Stands for an array until it is known to hold integers or lists."""
+    """Stand-in for an array, until it is known to contain integers or lists."""
 
     def __init__(self, *_: object) -> None:
         self.data: object = []
@@ -154,7 +157,7 @@ class _Array:
 
 
 class _Dtype:
-    """Stands for a type: a name such as `i8` and the byte order that comes later."""
+    """Stand-in for a dtype: a name such as `i8`, and the byte order from its state."""
 
     def __init__(self, name: str, *_: object) -> None:
         self.name = name
@@ -165,12 +168,12 @@ class _Dtype:
 
     def integers(self) -> np.dtype[Any]:
         if not isinstance(self.name, str) or self.name[:1] not in INTEGER_KINDS:
-            raise ValueError(f"an array in it holds {self.name!r} and no integers")
+            raise ValueError(f"an array in it contains {self.name!r}, expected integers")
         return np.dtype(f"{self.order if self.order in '<>' else '='}{self.name}")
 
 
 class _Scalar:
-    """Stands for one of NumPy's own numbers."""
+    """Stand-in for a NumPy scalar."""
 
     def __init__(self, dtype: _Dtype, data: object) -> None:
         self.dtype = dtype
@@ -182,7 +185,7 @@ class _Scalar:
 
 
 def _as_bytes(data: object) -> bytes:
-    if isinstance(data, str):  # as protocols before 3 write bytes
+    if isinstance(data, str):  # how protocols before 3 encode bytes
         return data.encode("latin1")
     if isinstance(data, bytes | bytearray):
         return bytes(data)
@@ -198,12 +201,12 @@ def _no_bytes() -> bytes:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds stand-ins, and nothing else."""
+    """Resolves names to stand-ins, and rejects all others."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _STAND_INS:
             return _STAND_INS[module, name]
-        raise pickle.UnpicklingError(f"its pickle asks for {module}.{name}, which is refused")
+        raise pickle.UnpicklingError(f"its pickle refers to {module}.{name}, which is not allowed")
 
 
 _STAND_INS: dict[tuple[str, str], Any] = {
@@ -228,76 +231,90 @@ def write_ground_truth(
     queries: Sequence[str],
     rule: str,
 ) -> None:
-    """Write rows and, beside them, what they belong to. `path` ends in `.npy`."""
+    """Write a ground truth and its sidecar with the rule and the fingerprints of the lists.
+
+    Args:
+        path: The file; its suffix must be `.npy`.
+        positives: Database indices for each query.
+        database: Names of the database photos, in order.
+        queries: Names of the queries, in order.
+        rule: The positive-match criterion.
+    """
     write_integer_lists(path, positives)
-    said = {
+    sidecar = {
         "made_by": "placewise datasets ground-truth",
         "rule": rule,
         "database": {"count": len(database), "sha256": list_fingerprint(database)},
         "queries": {"count": len(queries), "sha256": list_fingerprint(queries)},
     }
-    sidecar_path(path).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    sidecar_path(path).write_text(json.dumps(sidecar, indent=1) + "\n", encoding="utf-8")
 
 
 def read_ground_truth(
     path: Path, *, database: Sequence[str], queries: Sequence[str]
 ) -> tuple[list[Indices], str | None]:
-    """The positives of each query, and the rule where it is known.
+    """Read a ground truth and check that it belongs to these lists.
 
-    The names are those of the lists, in their order. Raises InvalidRequest (`bad_ground_truth`,
-    `ground_truth_of_other_lists`).
+    Args:
+        path: The `.npy` file.
+        database: Names of the database photos, in order.
+        queries: Names of the queries, in order.
+
+    Returns:
+        The positives of each query, and the rule if the file has a sidecar.
+
+    Raises:
+        InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
     """
-    found = read_integer_lists(path)
+    positives = read_integer_lists(path)
     rule = _check_sidecar(path, database, queries)
-    if len(found) != len(queries):
-        raise _mismatch_error(
-            path, f"it has {len(found)} rows, and there are {len(queries)} queries"
-        )
-    largest = max((int(row[-1]) for row in found if len(row)), default=-1)
+    if len(positives) != len(queries):
+        raise _mismatch_error(path, f"it has {len(positives)} rows for {len(queries)} queries")
+    largest = max((int(row[-1]) for row in positives if len(row)), default=-1)
     if largest >= len(database):
         raise _mismatch_error(
-            path, f"it speaks of photo {largest}, and there are {len(database)} from 0"
+            path, f"it contains the index {largest}, but the database has {len(database)} photos"
         )
-    return found, rule
+    return positives, rule
 
 
 def sidecar_path(path: Path) -> Path:
-    """`gt.npy` -> `gt.json`"""
+    """Return the path of a ground truth's sidecar: `gt.npy` -> `gt.json`."""
     return path.with_suffix(".json")
 
 
 def _check_sidecar(path: Path, database: Sequence[str], queries: Sequence[str]) -> str | None:
-    """The rule; None where nothing is said, as with every published ground truth."""
-    beside = sidecar_path(path)
+    """Return the sidecar's rule; None without one, as for all published ground truths."""
+    sidecar_file = sidecar_path(path)
     try:
-        said: Any = json.loads(beside.read_text(encoding="utf-8"))
-        kept = {role: (said[role]["count"], said[role]["sha256"]) for role in ROLES}
-        rule = str(said["rule"])
+        sidecar: Any = json.loads(sidecar_file.read_text(encoding="utf-8"))
+        stored = {role: (sidecar[role]["count"], sidecar[role]["sha256"]) for role in ROLES}
+        rule = str(sidecar["rule"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InvalidRequest(
             "bad_ground_truth",
-            f"{beside} does not say which lists {path.name} is true of ({error}). Make both again "
-            "by `placewise datasets ground-truth`.",
+            f"{sidecar_file} does not identify the lists of {path.name} ({error}). Create both "
+            "files again with `placewise datasets ground-truth`.",
         ) from error
     for role, names in zip(ROLES, (database, queries), strict=True):
-        count, fingerprint = kept[role]
+        count, fingerprint = stored[role]
         if count != len(names):
             raise _mismatch_error(
-                path, f"it was made for {count} {role}, and here are {len(names)}"
+                path, f"it was created for {count} {role}, but there are {len(names)}"
             )
         if fingerprint != list_fingerprint(names):
-            raise _mismatch_error(path, f"the {role} are others, or in another order")
+            raise _mismatch_error(path, f"the {role} differ, or have another order")
     return rule
 
 
 ROLES = ("database", "queries")
 
 
-def _mismatch_error(path: Path, fault: str) -> PlacewiseError:
+def _mismatch_error(path: Path, reason: str) -> PlacewiseError:
     return InvalidRequest(
         "ground_truth_of_other_lists",
-        f"{path} was made for other lists: {fault}. Take the lists that it was made for, or make "
-        "one for these: placewise datasets ground-truth.",
+        f"{path} was created for other lists: {reason}. Use the lists that it was created for, or "
+        "create a new one for these: placewise datasets ground-truth.",
     )

@@ -1,7 +1,7 @@
-"""Open a data set, whatever its layout: places to learn from, and sets to be measured on.
+"""Opens datasets of any layout: training sets and evaluation sets.
 
-Looked at are the folder itself and the folders in it, and `images/` in each of these: so the same
-call opens one data set, and a folder of several.
+Searches a folder, its subfolders, and `images/` in each of them, so that the same functions open
+one dataset or a folder of several.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ __all__ = [
 ]
 
 PART_FOLDERS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
-"""folders of a data set that are never a data set of their own"""
-LAYOUTS_HELP = "docs/how-to/data-sets.md shows every layout."
+"""Subfolders of datasets that are never datasets of their own"""
+LAYOUTS_HELP = "See docs/how-to/data-sets.md for all layouts."
 
 
 @dataclass(frozen=True, slots=True)
 class DiscoveredSet:
-    """An evaluation set that is there to be opened."""
+    """An evaluation set that was found in a folder."""
 
     name: str
     layout: EvaluationLayout
@@ -49,7 +49,7 @@ class DiscoveredSet:
 
 
 def find_training_layout(root: Path) -> tuple[TrainingLayout, Path] | None:
-    """The layout of the places to learn from, and the folder at or below `root` that has it."""
+    """Return the layout of the training set at or below `root`, and its folder."""
     for _, bases in _candidate_folders(root):
         for base in bases:
             for layout in TRAINING_LAYOUTS:
@@ -61,70 +61,81 @@ def find_training_layout(root: Path) -> tuple[TrainingLayout, Path] | None:
 def open_training_set(
     root: Path, cities: Sequence[str] | None = None, *, min_photos: int = 2
 ) -> TrainingSet:
-    """The places below `root` that have at least `min_photos` photos; no photo is opened.
+    """Open the training set at or below `root`, without opening photos.
 
-    Cities in the order asked (upper or lower case is the same), all by name when None; only their
-    tables are read. The i-th city's place numbers are its own plus `i * 10**5`; a city with
-    numbers of 100,000 or more widens that step, for all cities, to the next power of ten.
+    The i-th city's place ids are its own plus `i * 10**5`. If any city has ids of 100,000 or more,
+    the step of all cities is the next power of ten.
 
-    Raises NotFound (`no_training_set`, `city_missing`), InvalidRequest (`missing_column`,
-    `bad_table`, `no_places`).
+    Args:
+        root: Folder of the dataset, or of several.
+        cities: Cities to open, in this order, case-insensitive; None opens all, sorted by name.
+            Only their tables are read.
+        min_photos: Places with fewer photos are left out.
+
+    Raises:
+        NotFound: `no_training_set`, `city_missing`.
+        InvalidRequest: `missing_column`, `bad_table`, `no_places`.
     """
-    found = find_training_layout(_existing_folder(root))
-    if found is None:
+    located = find_training_layout(_existing_folder(root))
+    if located is None:
         raise NotFound(
             "no_training_set",
-            f"{root} holds no places to learn from: neither gsv_xs (train/CITY and "
+            f"{root} contains no training set: neither gsv_xs (train/CITY and "
             f"dataframes/CITY.csv) nor GSV-Cities (Images/CITY and Dataframes/CITY.csv) nor a "
             f"train.csv. {LAYOUTS_HELP}",
         )
-    layout, base = found
+    layout, base = located
     opened = layout.open(base, cities, min_photos)
     if not opened.places:
         raise InvalidRequest(
             "no_places",
             f"No place of {base} ({', '.join(cities or layout.cities(base))}) has {min_photos} "
-            "photos or more. Ask for fewer photos per place.",
+            "photos or more. Lower the minimum of photos per place.",
         )
     return opened
 
 
 def find_evaluation_sets(root: Path) -> tuple[DiscoveredSet, ...]:
-    """Every evaluation set at or below `root`, by name.
+    """Find all evaluation sets at or below `root`, sorted by name.
 
-    Of two layouts of one name in the same data set the first is taken: lists before folders. Data
-    sets that share a name are told apart by a number: `city`, `city_2`.
+    If two layouts of the same dataset define a set of the same name, the first one wins: lists
+    before folders. Sets of the same name in different datasets get a number: `city`, `city_2`.
     """
-    found: dict[str, DiscoveredSet] = {}
+    sets: dict[str, DiscoveredSet] = {}
     for home, bases in _candidate_folders(_existing_folder(root)):
-        here: dict[str, DiscoveredSet] = {}
+        folder_sets: dict[str, DiscoveredSet] = {}
         prefix = set_prefix(home.resolve().name)
         for base in bases:
             for layout in EVALUATION_LAYOUTS:
                 for name, key in layout.sets(base, prefix).items():
-                    here.setdefault(name, DiscoveredSet(name, layout, base, key))
-        for name, one in here.items():
-            free = next(n for n in _numbered(name) if n not in found)
-            found[free] = replace(one, name=free)
-    return tuple(found[name] for name in sorted(found))
+                    folder_sets.setdefault(name, DiscoveredSet(name, layout, base, key))
+        for name, discovered in folder_sets.items():
+            unique = next(n for n in _numbered_names(name) if n not in sets)
+            sets[unique] = replace(discovered, name=unique)
+    return tuple(sets[name] for name in sorted(sets))
 
 
 def evaluation_set_names(root: Path) -> tuple[str, ...]:
-    """What `open_evaluation_set` takes as a name, in order."""
-    return tuple(found.name for found in find_evaluation_sets(root))
+    """Return the names of all evaluation sets at or below `root`, sorted."""
+    return tuple(discovered.name for discovered in find_evaluation_sets(root))
 
 
 def open_evaluation_set(
     root: Path, name: str | None = None, *, protocol: str | None = None, rule: str | None = None
 ) -> EvaluationSet:
-    """One evaluation set; `name` may be left out where there is only one. No photo is opened,
-    but for the EXIF of those whose position nothing else says.
+    """Open an evaluation set; photos are opened only to read a missing position from EXIF.
 
-    `rule` is `radius 25`, `heading 25 40`, `frames 5` or `place-label` (`parse_rule`); left out, it
-    is the ground truth that the set brings, or else 25 m.
+    Args:
+        root: Folder of the dataset, or of several.
+        name: Name of the set; optional if there is only one.
+        protocol: One of the layout's protocols; None for its first one.
+        rule: `radius 25`, `heading 25 40`, `frames 5` or `place-label` (see `parse_rule`); None for
+            the ground truth of the set, or else 25 m.
 
-    Raises NotFound (`no_evaluation_set`, `set_missing`), InvalidRequest (`which_set`,
-    `unknown_protocol`, `unknown_rule`, `no_positions`, `ground_truth_of_other_lists`, ...).
+    Raises:
+        NotFound: `no_evaluation_set`, `set_missing`.
+        InvalidRequest: `which_set`, `unknown_protocol`, `unknown_rule`, `no_positions`,
+            `ground_truth_of_other_lists` and others.
     """
     chosen = _choose_set(root, find_evaluation_sets(root), name)
     protocols = chosen.layout.protocols
@@ -132,62 +143,66 @@ def open_evaluation_set(
         raise InvalidRequest(
             "unknown_protocol",
             f"{chosen.name} ({chosen.layout.name}) has no protocol {protocol!r}. "
-            f"Known are: {', '.join(protocols)}.",
+            f"Valid protocols: {', '.join(protocols)}.",
         )
-    meant = protocol or protocols[0]
-    asked = parse_rule(rule) if rule is not None else None
-    listed = chosen.layout.open(chosen.base, chosen.key, meant)
-    for role, shots in (("database photo", listed.database), ("query", listed.queries)):
-        if not shots:
+    chosen_protocol = protocol or protocols[0]
+    parsed_rule = parse_rule(rule) if rule is not None else None
+    listed = chosen.layout.open(chosen.base, chosen.key, chosen_protocol)
+    for role, photos in (("database photo", listed.database), ("query", listed.queries)):
+        if not photos:
             raise InvalidRequest("empty_set", f"{chosen.name} in {chosen.base} has no {role}.")
-    return _make_evaluation_set(chosen, listed, meant, str(asked) if asked else None)
+    return _make_evaluation_set(
+        chosen, listed, chosen_protocol, str(parsed_rule) if parsed_rule else None
+    )
 
 
 def _make_evaluation_set(
     chosen: DiscoveredSet, listed: ListedSet, protocol: str, rule: str | None
 ) -> EvaluationSet:
     if rule is None and listed.positives is not None:
-        meant, positives = listed.rule, listed.positives
+        applied_rule, positives = listed.rule, listed.positives
     else:
-        asked = parse_rule(rule or listed.rule)
-        meant = str(asked)
-        positives = tuple(find_positives(asked, listed.queries, listed.database))
+        parsed_rule = parse_rule(rule or listed.rule)
+        applied_rule = str(parsed_rule)
+        positives = tuple(find_positives(parsed_rule, listed.queries, listed.database))
     queries = listed.queries
     if listed.drops_queries:
-        kept = [number for number, found in enumerate(positives) if len(found)]
-        queries = tuple(queries[number] for number in kept)
-        positives = tuple(positives[number] for number in kept)
+        with_positives = [index for index, rows in enumerate(positives) if len(rows)]
+        queries = tuple(queries[index] for index in with_positives)
+        positives = tuple(positives[index] for index in with_positives)
     return EvaluationSet(
         name=chosen.name,
         root=chosen.base,
         database=listed.database,
         queries=queries,
-        positives=tuple(found.astype(np.int64, copy=False) for found in positives),
-        rule=meant,
+        positives=tuple(rows.astype(np.int64, copy=False) for rows in positives),
+        rule=applied_rule,
         protocol=protocol,
     )
 
 
-def _choose_set(root: Path, found: Sequence[DiscoveredSet], name: str | None) -> DiscoveredSet:
-    names = ", ".join(one.name for one in found)
-    if not found:
+def _choose_set(root: Path, sets: Sequence[DiscoveredSet], name: str | None) -> DiscoveredSet:
+    names = ", ".join(discovered.name for discovered in sets)
+    if not sets:
         raise NotFound(
             "no_evaluation_set",
-            f"{root} holds no set to measure on: neither database/ and queries/ nor lists as "
-            f".npy nor another layout that is known. {LAYOUTS_HELP}",
+            f"{root} contains no evaluation set: neither database/ and queries/ nor .npy lists "
+            f"nor another known layout. {LAYOUTS_HELP}",
         )
     if name is None:
-        if len(found) > 1:
-            raise InvalidRequest("which_set", f"{root} holds several sets: {names}. Name one.")
-        return found[0]
-    for one in found:
-        if one.name == name:
-            return one
-    raise NotFound("set_missing", f"{root} has no set {name}. There are: {names}.")
+        if len(sets) > 1:
+            raise InvalidRequest(
+                "which_set", f"{root} contains several evaluation sets: {names}. Name one of them."
+            )
+        return sets[0]
+    for discovered in sets:
+        if discovered.name == name:
+            return discovered
+    raise NotFound("set_missing", f"{root} has no evaluation set {name}. Available: {names}.")
 
 
 def _candidate_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
-    """Folders that may be a data set, each with the folders in which its parts may lie."""
+    """Yield folders that may be a dataset, each with the folders to search for its parts."""
     children = sorted(
         child
         for child in root.iterdir()
@@ -198,18 +213,18 @@ def _candidate_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         yield home, [home, images] if images.is_dir() else [home]
 
 
-def _numbered(name: str) -> Iterator[str]:
+def _numbered_names(name: str) -> Iterator[str]:
     yield name
     for number in itertools.count(2):
         yield f"{name}_{number}"
 
 
 def set_prefix(name: str) -> str:
-    """`SF_XS` -> `sfxs`: so a folder's sets are called as the lists of the same data set are."""
+    """Return the prefix of a folder's set names: `SF_XS` -> `sfxs`, as in lists of that dataset."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) or "set"
 
 
 def _existing_folder(root: Path) -> Path:
     if not root.is_dir():
-        raise NotFound("no_data_set", f"There is no folder {root}.")
+        raise NotFound("no_data_set", f"The folder {root} does not exist.")
     return root

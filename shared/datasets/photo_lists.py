@@ -1,8 +1,7 @@
-"""Lists of photos: a `.npy` of paths, a CSV with a position a row, or one path a line.
+"""Photo lists: CSV with positions, `.npy` arrays of paths, text files with one path per line.
 
-Photos on disk as shots: by their file names, and by EXIF where names say nothing.
-
-CSV tables of data sets: by their columns' names, with errors that name file and line.
+Also reads positions from `@UTM@` file names and EXIF, and CSV tables by column names, with errors
+that name file and line.
 """
 
 from __future__ import annotations
@@ -18,65 +17,69 @@ from shared.datasets.utm_filenames import parse_utm_file_name
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.imaging.photo_header import read_photo_header
 
-UNLIMITED_PIXELS = 2**62  # of pixels: only the header is read here
+UNLIMITED_PIXELS = 2**62  # no limit: only the header is read
 
 
 def photo_from_filename(path: Path, name: str, place: str | None = None) -> DatasetPhoto:
-    """By an `@UTM@` file name; a photo of another name has no position.
+    """Create a photo with the position of its `@UTM@` file name; without one for other names.
 
     Raises InvalidRequest (`bad_coordinates`).
     """
-    spot = parse_utm_file_name(path.name)
-    if spot is None:
+    location = parse_utm_file_name(path.name)
+    if location is None:
         return DatasetPhoto(path, name, place=place)
     return DatasetPhoto(
         path,
         name,
-        easting=spot.east,
-        northing=spot.north,
-        zone=spot.zone,
-        latitude=spot.latitude,
-        longitude=spot.longitude,
-        heading=spot.heading,
+        easting=location.east,
+        northing=location.north,
+        zone=location.zone,
+        latitude=location.latitude,
+        longitude=location.longitude,
+        heading=location.heading,
         place=place,
     )
 
 
 def add_exif_positions(
-    shots: Iterable[DatasetPhoto], done: Callable[[int], None] = lambda count: None
+    photos: Iterable[DatasetPhoto], on_progress: Callable[[int], None] = lambda count: None
 ) -> list[DatasetPhoto]:
-    """The shots, those without a position with what EXIF says; a photo that has none, or that can't
-    be read, stays without."""
+    """Add positions from EXIF to photos without one.
+
+    Photos without EXIF, and unreadable ones, are returned unchanged. `on_progress` is called with 1
+    after each photo.
+    """
     located = []
-    for shot in shots:
-        located.append(shot if shot.easting is not None else _add_exif_position(shot))
-        done(1)
+    for photo in photos:
+        located.append(photo if photo.easting is not None else _add_exif_position(photo))
+        on_progress(1)
     return located
 
 
-def _add_exif_position(shot: DatasetPhoto) -> DatasetPhoto:
+def _add_exif_position(photo: DatasetPhoto) -> DatasetPhoto:
     try:
-        with shot.path.open("rb") as file:
+        with photo.path.open("rb") as file:
             header = read_photo_header(file, UNLIMITED_PIXELS)
     except (OSError, Unprocessable):
-        # Whoever decodes it says so; here it is a photo of which nothing is known.
-        return shot
+        # Reported when the photo is decoded; here its position is unknown.
+        return photo
     return DatasetPhoto(
-        shot.path,
-        shot.name,
+        photo.path,
+        photo.name,
         latitude=header.latitude,
         longitude=header.longitude,
         heading=header.heading,
-        place=shot.place,
-        frame=shot.frame,
-        sequence=shot.sequence,
+        place=photo.place,
+        frame=photo.frame,
+        sequence=photo.sequence,
     )
 
 
 def read_table(path: Path, needed: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Each row, by column, with its line in the file; further columns are there too.
+    """Yield the line number and the cells by column name of each row of a CSV file.
 
-    Raises InvalidRequest (`missing_column`, which names those that are there; `bad_table`).
+    `needed`: required columns; others are returned, too. Raises InvalidRequest: `missing_column`
+    (which lists the existing columns), `bad_table`.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -86,15 +89,17 @@ def read_table(path: Path, needed: Sequence[str]) -> Iterator[tuple[int, dict[st
             if missing:
                 raise InvalidRequest(
                     "missing_column",
-                    f"{path} has no column {', '.join(missing)}. Its first line, read as separated "
-                    f"by commas, is: {', '.join(columns) or 'empty'}.",
+                    f"{path} has no column {', '.join(missing)}. Its first line, separated by "
+                    f"commas, is: {', '.join(columns) or 'empty'}.",
                     missing=missing,
                 )
             for row in reader:
                 line = reader.line_num
                 if None in row or None in row.values():
                     raise bad_row_error(
-                        path, line, f"has not the {len(columns)} cells of the first line"
+                        path,
+                        line,
+                        f"it does not have the {len(columns)} cells of the first line",
                     )
                 yield line, row
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -102,57 +107,65 @@ def read_table(path: Path, needed: Sequence[str]) -> Iterator[tuple[int, dict[st
 
 
 def parse_integer(path: Path, line: int, row: dict[str, str], column: str) -> int:
-    """A cell as an integer; `7.0`, as data frames write it, is 7."""
+    """Parse a cell as an integer; accepts `7.0`, as pandas writes integers."""
     value = parse_number(path, line, row, column)
     if value != int(value):
-        raise bad_row_error(path, line, f"{column} {row[column]!r} is no whole number")
+        raise bad_row_error(path, line, f"{column} {row[column]!r} is not an integer")
     return int(value)
 
 
 def parse_number(path: Path, line: int, row: dict[str, str], column: str) -> float:
+    """Parse a cell as a finite number; raises InvalidRequest (`bad_table`)."""
     try:
         value = float(row[column])
         if abs(value) < float("inf"):
             return value
     except ValueError:
         pass
-    raise bad_row_error(path, line, f"{column} {row[column]!r} is no number")
+    raise bad_row_error(path, line, f"{column} {row[column]!r} is not a number")
 
 
-def bad_row_error(path: Path, line: int, fault: str) -> PlacewiseError:
-    return InvalidRequest("bad_table", f"{path}, line {line}: {fault}.", line=line)
+def bad_row_error(path: Path, line: int, reason: str) -> PlacewiseError:
+    """Return the error for a row of a table that can't be used."""
+    return InvalidRequest("bad_table", f"{path}, line {line}: {reason}.", line=line)
 
 
 PATH_COLUMNS = ("path", "filename", "file")
 COLUMN_ALIASES = {"lat": "latitude", "lon": "longitude", "UTMx": "easting", "UTMy": "northing"}
-"""columns by the names that other data sets give them"""
+"""Canonical columns by the names that other datasets use"""
 NUMBER_COLUMNS = ("latitude", "longitude", "easting", "northing", "heading")
 TEXT_COLUMNS = ("zone", "place", "sequence")
 
 
 def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhoto, ...]:
-    """The photos in the list's order, whose paths begin at `folder` (left out: the list's own).
+    """Read the photos of a list, in its order.
 
-    Their positions stand in a CSV's columns, in `@UTM@` file names, or in the EXIF of those that
-    are there. Raises InvalidRequest (`bad_list`, `bad_table`, `missing_column`, `bad_coordinates`).
+    Positions come from the columns of a CSV, from `@UTM@` file names, or from EXIF.
+
+    Args:
+        path: The list: `.csv`, `.npy`, or any other suffix for one path per line.
+        folder: Folder that the paths are relative to; None for the list's own.
+
+    Raises:
+        InvalidRequest: `bad_list`, `bad_table`, `missing_column`, `bad_coordinates`.
     """
     root = path.parent if folder is None else folder
     match path.suffix.lower():
         case ".csv":
-            shots = [
+            photos = [
                 _row(path, line, row, root, _path_column(path, row))
                 for line, row in read_table(path, ())
             ]
         case ".npy":
-            shots = [_named(root, name) for name in read_names(path)]
+            photos = [_photo_of_name(root, name) for name in read_names(path)]
         case _:
-            shots = [_named(root, name) for name in _lines(path)]
-    if not shots:
-        raise InvalidRequest("bad_list", f"{path} names no photo.")
-    return add_utm_positions(add_exif_positions(add_utm_positions(shots)))
+            photos = [_photo_of_name(root, name) for name in _lines(path)]
+    if not photos:
+        raise InvalidRequest("bad_list", f"{path} lists no photos.")
+    return add_utm_positions(add_exif_positions(add_utm_positions(photos)))
 
 
-def _named(root: Path, name: str) -> DatasetPhoto:
+def _photo_of_name(root: Path, name: str) -> DatasetPhoto:
     return photo_from_filename(root / name.lstrip("/"), name)
 
 
@@ -176,33 +189,33 @@ def _path_column(path: Path, row: dict[str, str]) -> str:
 
 
 def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: str) -> DatasetPhoto:
-    """Empty cells are not said; further columns are the set's own business."""
+    """Read a row of a CSV list; empty cells are unknown values, other columns are ignored."""
     name = row[path_column].strip()
     if not name:
         raise bad_row_error(path, line, f"its {path_column} is empty")
-    said = {
+    values = {
         COLUMN_ALIASES.get(column, column): cell for column, cell in row.items() if cell.strip()
     }
     numbers = {
-        column: parse_number(path, line, said, column)
+        column: parse_number(path, line, values, column)
         for column in NUMBER_COLUMNS
-        if column in said
+        if column in values
     }
-    for one, other in (("latitude", "longitude"), ("easting", "northing")):
-        if (one in numbers) != (other in numbers):
-            raise bad_row_error(path, line, f"{one} and {other} come in pairs")
-    by_name = _named(root, name)
-    placed = by_name if not numbers.keys() & {"latitude", "easting"} else None
+    for first, second in (("latitude", "longitude"), ("easting", "northing")):
+        if (first in numbers) != (second in numbers):
+            raise bad_row_error(path, line, f"{first} and {second} must be given together")
+    named = _photo_of_name(root, name)
+    location = named if not numbers.keys() & {"latitude", "easting"} else None
     return DatasetPhoto(
-        by_name.path,
+        named.path,
         name,
-        easting=numbers.get("easting", placed.easting if placed else None),
-        northing=numbers.get("northing", placed.northing if placed else None),
-        zone=said.get("zone", placed.zone if placed else None),
-        latitude=numbers.get("latitude", placed.latitude if placed else None),
-        longitude=numbers.get("longitude", placed.longitude if placed else None),
-        heading=numbers["heading"] % 360 if "heading" in numbers else by_name.heading,
-        place=said.get("place"),
-        frame=parse_integer(path, line, said, "frame") if "frame" in said else None,
-        sequence=said.get("sequence"),
+        easting=numbers.get("easting", location.easting if location else None),
+        northing=numbers.get("northing", location.northing if location else None),
+        zone=values.get("zone", location.zone if location else None),
+        latitude=numbers.get("latitude", location.latitude if location else None),
+        longitude=numbers.get("longitude", location.longitude if location else None),
+        heading=numbers["heading"] % 360 if "heading" in numbers else named.heading,
+        place=values.get("place"),
+        frame=parse_integer(path, line, values, "frame") if "frame" in values else None,
+        sequence=values.get("sequence"),
     )

@@ -1,7 +1,4 @@
-"""UTM positions of photos in more than one zone, put on one plane so that metres are metres.
-
-How far two photos of each pair were taken from each other.
-"""
+"""UTM coordinates of photos: conversion, several zones on one plane, distances of pairs."""
 
 from __future__ import annotations
 
@@ -17,41 +14,44 @@ from shared.errors import InvalidRequest
 from shared.geodesy import distance_m
 
 UtmGrid = tuple[int, bool]
-"""zone number, and whether it is counted from the equator northwards: metres of one grid compare"""
+"""Zone number, and whether it is on the northern hemisphere; metres of one grid are comparable"""
 Positions = NDArray[np.float64]
 
 MAX_ZONE_SPAN_DEGREES = 9.0
-"""Of longitude from a zone's meridian. No zone is wider than 6 degrees to one side; beyond 9 the
-series of the projection loses millimetres, and nothing there is within any rule's radius."""
+"""Maximum distance in longitude from a zone's meridian for projecting into the zone. No zone
+extends more than 6 degrees to one side; beyond 9 degrees the projection is off by millimetres, and
+no photo there is within the radius of any rule."""
 
 
-def utm_positions(shots: Sequence[DatasetPhoto]) -> tuple[Positions, list[UtmGrid | None]]:
-    """(n, 2) UTM metres and each photo's grid, None where no zone is said.
+def utm_positions(photos: Sequence[DatasetPhoto]) -> tuple[Positions, list[UtmGrid | None]]:
+    """Return (n, 2) UTM metres and the grid of each photo.
 
-    A photo with latitude and longitude alone is put into the zone that it lies in. Raises
-    InvalidRequest (`no_positions`, `bad_coordinates`).
+    The grid is None if the photo's zone is unknown. Latitude and longitude alone are converted to
+    the zone that they lie in.
+
+    Raises InvalidRequest: `no_positions`, `bad_coordinates`.
     """
-    metres = np.full((len(shots), 2), np.nan)
-    grids: list[UtmGrid | None] = [None] * len(shots)
+    metres = np.full((len(photos), 2), np.nan)
+    grids: list[UtmGrid | None] = [None] * len(photos)
     degrees: list[int] = []
     missing: list[str] = []
-    for number, shot in enumerate(shots):
-        if shot.easting is not None and shot.northing is not None:
-            metres[number] = shot.easting, shot.northing
-            grids[number] = None if shot.zone is None else parse_utm_grid(shot.zone, shot.name)
-        elif shot.latitude is not None and shot.longitude is not None:
+    for number, photo in enumerate(photos):
+        if photo.easting is not None and photo.northing is not None:
+            metres[number] = photo.easting, photo.northing
+            grids[number] = None if photo.zone is None else parse_utm_grid(photo.zone, photo.name)
+        elif photo.latitude is not None and photo.longitude is not None:
             degrees.append(number)
         else:
-            missing.append(shot.name)
+            missing.append(photo.name)
     if missing:
         raise InvalidRequest(
             "no_positions",
-            f"{len(missing)} of {len(shots)} photos have no position (the first: {missing[0]}). "
-            "It can stand in an @UTM@ file name, a CSV or EXIF; a set without positions needs "
+            f"{len(missing)} of {len(photos)} photos have no position (first: {missing[0]}). "
+            "Positions are read from @UTM@ file names, a CSV or EXIF. Without positions, use "
             "another rule: frames N, or place-label.",
             missing=missing[:20],
         )
-    _project(shots, degrees, metres, grids)
+    _project(photos, degrees, metres, grids)
     return metres, grids
 
 
@@ -59,107 +59,127 @@ def group_by_utm_plane(
     queries: tuple[Positions, Sequence[UtmGrid | None]],
     database: tuple[Positions, Sequence[UtmGrid | None]],
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Positions, Positions]]:
-    """Query indices, database indices, and the (n, 2) and (m, 2) metres of both on one plane.
+    """Group photos into UTM planes within which metres are comparable.
 
-    One plane for each grid that queries lie in; every query is on exactly one. Of the database, a
-    plane has all photos of its grid as they are, and those of other grids near its zone, projected
-    into it. Where no photo says a zone all are taken for neighbours, and so are those without one
-    where there is only one other. Raises InvalidRequest (`no_utm_zone`) where that is ambiguous.
+    There is one plane for each grid of the queries; every query is in exactly one. A plane contains
+    all database photos of its grid, and those of other grids near its zone, projected into it. If
+    the photos have at most one known grid, all photos are in one plane.
+
+    Args:
+        queries: (n, 2) UTM metres and grids, from `utm_positions`.
+        database: The same of the database.
+
+    Returns:
+        For each plane: query indices, database indices, (n, 2) metres of the queries and (m, 2)
+        metres of the database photos.
+
+    Raises:
+        InvalidRequest: `no_utm_zone` if there are several grids and some photos have none.
     """
     known = sorted({grid for grid in (*queries[1], *database[1]) if grid is not None})
     if len(known) <= 1:
-        everyone = np.arange(len(queries[0])), np.arange(len(database[0]))
-        return [(*everyone, queries[0], database[0])]
+        all_indices = np.arange(len(queries[0])), np.arange(len(database[0]))
+        return [(*all_indices, queries[0], database[0])]
     if None in queries[1] or None in database[1]:
         raise InvalidRequest(
             "no_utm_zone",
-            f"The photos lie in {len(known)} UTM zones, and some say none: it is unknown how far "
-            "they are from the others. Give each photo its zone.",
+            f"The photos lie in {len(known)} UTM zones, but some have no zone, so their distances "
+            "to the others are unknown. Give each photo its zone.",
         )
-    query_numbers, numbers = _numbered(known, queries[1]), _numbered(known, database[1])
-    latitudes, longitudes = _degrees(known, numbers, database[0])
-    found = []
-    for plane in np.unique(query_numbers):
+    query_planes, database_planes = (
+        _plane_numbers(known, queries[1]),
+        _plane_numbers(known, database[1]),
+    )
+    latitudes, longitudes = _degrees(known, database_planes, database[0])
+    groups = []
+    for plane in np.unique(query_planes):
         grid = known[plane]
-        own = numbers == plane
-        near = own | (np.abs(_apart(longitudes, _meridian(grid[0]))) <= MAX_ZONE_SPAN_DEGREES)
-        guests = near & ~own
+        in_plane = database_planes == plane
+        near = in_plane | (
+            np.abs(_longitude_difference(longitudes, _meridian(grid[0]))) <= MAX_ZONE_SPAN_DEGREES
+        )
+        projected = near & ~in_plane
         metres = database[0].copy()
-        if guests.any():
+        if projected.any():
             east, north, _, _ = utm.from_latlon(
-                latitudes[guests],
-                longitudes[guests],
+                latitudes[projected],
+                longitudes[projected],
                 force_zone_number=grid[0],
-                force_northern=grid[1],  # over the equator the metres go on, without a step
+                force_northern=grid[1],  # northings continue across the equator
             )
-            metres[guests] = np.column_stack((east, north))
-        asked = np.flatnonzero(query_numbers == plane)
-        kept = np.flatnonzero(near)
-        found.append((asked, kept, queries[0][asked], metres[kept]))
-    return found
+            metres[projected] = np.column_stack((east, north))
+        query_rows = np.flatnonzero(query_planes == plane)
+        database_rows = np.flatnonzero(near)
+        groups.append((query_rows, database_rows, queries[0][query_rows], metres[database_rows]))
+    return groups
 
 
 def utm_to_degrees(grid: UtmGrid, metres: Positions) -> tuple[float, float]:
-    """Latitude and longitude of one position, (2,) UTM metres of the grid."""
+    """Convert (2,) UTM metres of a grid to latitude and longitude."""
     east, north = metres.tolist()
     latitude, longitude = utm.to_latlon(east, north, grid[0], northern=grid[1], strict=False)
     return float(latitude), float(longitude)
 
 
 def parse_utm_grid(zone: str, name: str) -> UtmGrid:
-    """`32T` -> (32, True). Raises InvalidRequest (`bad_coordinates`), which names the photo."""
+    """Parse a UTM zone: `32T` -> (32, True).
+
+    `name` is the photo's, for the error. Raises InvalidRequest (`bad_coordinates`).
+    """
     number, letter = zone[:-1], zone[-1:].upper()
     if number.isdecimal() and 1 <= int(number) <= 60 and letter in "CDEFGHJKLMNPQRSTUVWX":
         return int(number), letter >= "N"
-    raise InvalidRequest("bad_coordinates", f"{name}: there is no UTM zone {zone!r}.")
+    raise InvalidRequest("bad_coordinates", f"{name}: {zone!r} is not a UTM zone.")
 
 
-def add_utm_positions(shots: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
-    """The photos, those with latitude and longitude alone also in UTM metres and with a zone."""
+def add_utm_positions(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    """Add UTM metres and zone to photos that only have latitude and longitude."""
     degrees = [
         number
-        for number, shot in enumerate(shots)
-        if shot.easting is None and shot.latitude is not None and shot.longitude is not None
+        for number, photo in enumerate(photos)
+        if photo.easting is None and photo.latitude is not None and photo.longitude is not None
     ]
-    metres = np.full((len(shots), 2), np.nan)
-    grids: list[UtmGrid | None] = [None] * len(shots)
-    _project(shots, degrees, metres, grids)
-    known = list(shots)
+    metres = np.full((len(photos), 2), np.nan)
+    grids: list[UtmGrid | None] = [None] * len(photos)
+    _project(photos, degrees, metres, grids)
+    located = list(photos)
     for number in degrees:
-        shot = shots[number]
+        photo = photos[number]
         grid = grids[number]
         assert grid is not None
-        assert shot.latitude is not None
+        assert photo.latitude is not None
         east, north = metres[number].tolist()
-        letter = utm.latitude_to_zone_letter(shot.latitude)
-        known[number] = replace(shot, easting=east, northing=north, zone=f"{grid[0]:02d}{letter}")
-    return tuple(known)
+        letter = utm.latitude_to_zone_letter(photo.latitude)
+        located[number] = replace(
+            photo, easting=east, northing=north, zone=f"{grid[0]:02d}{letter}"
+        )
+    return tuple(located)
 
 
 def _project(
-    shots: Sequence[DatasetPhoto],
+    photos: Sequence[DatasetPhoto],
     degrees: Sequence[int],
     metres: Positions,
     grids: list[UtmGrid | None],
 ) -> None:
-    """Fill in UTM metres and grids of the photos of these indices, all of one zone at once."""
+    """Set `metres` and `grids` of the photos with the indices `degrees`, one zone at a time."""
     by_grid: dict[UtmGrid, list[int]] = {}
     for number in degrees:
-        latitude, longitude = shots[number].latitude, shots[number].longitude
+        latitude, longitude = photos[number].latitude, photos[number].longitude
         assert latitude is not None
         assert longitude is not None
         if not (-80 <= latitude <= 84 and -180 <= longitude <= 180):
             raise InvalidRequest(
                 "bad_coordinates",
-                f"{shots[number].name}: {latitude:g}, {longitude:g} is outside of UTM, which "
-                "reaches from 80 degrees south to 84 north.",
+                f"{photos[number].name}: {latitude:g}, {longitude:g} is outside of UTM, which "
+                "covers 80 degrees south to 84 degrees north.",
             )
         zone = int(utm.latlon_to_zone_number(latitude, longitude))
         by_grid.setdefault((zone, latitude >= 0), []).append(number)
     for grid, numbers in by_grid.items():
-        # The asserts above have told that none of them is None.
-        latitudes = np.array([shots[number].latitude for number in numbers], np.float64)
-        longitudes = np.array([shots[number].longitude for number in numbers], np.float64)
+        # None of them is None: see the asserts above.
+        latitudes = np.array([photos[number].latitude for number in numbers], np.float64)
+        longitudes = np.array([photos[number].longitude for number in numbers], np.float64)
         east, north, _, _ = utm.from_latlon(
             latitudes, longitudes, force_zone_number=grid[0], force_northern=grid[1]
         )
@@ -168,60 +188,65 @@ def _project(
             grids[number] = grid
 
 
-def _numbered(known: Sequence[UtmGrid], grids: Sequence[UtmGrid | None]) -> NDArray[np.int64]:
-    number = {grid: index for index, grid in enumerate(known)}
-    return np.array([number[grid] for grid in grids if grid is not None], np.int64)
+def _plane_numbers(known: Sequence[UtmGrid], grids: Sequence[UtmGrid | None]) -> NDArray[np.int64]:
+    plane_of = {grid: index for index, grid in enumerate(known)}
+    return np.array([plane_of[grid] for grid in grids if grid is not None], np.int64)
 
 
 def _degrees(
-    known: Sequence[UtmGrid], numbers: NDArray[np.int64], metres: Positions
+    known: Sequence[UtmGrid], planes: NDArray[np.int64], metres: Positions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     latitudes, longitudes = np.empty(len(metres)), np.empty(len(metres))
-    for plane in np.unique(numbers):
-        here = numbers == plane
-        latitudes[here], longitudes[here] = utm.to_latlon(
-            metres[here, 0],
-            metres[here, 1],
+    for plane in np.unique(planes):
+        rows = planes == plane
+        latitudes[rows], longitudes[rows] = utm.to_latlon(
+            metres[rows, 0],
+            metres[rows, 1],
             known[plane][0],
             northern=known[plane][1],
             strict=False,
         )
-    return latitudes, _apart(longitudes, 0.0)
+    return latitudes, _longitude_difference(longitudes, 0.0)
 
 
 def _meridian(zone_number: int) -> float:
     return zone_number * 6.0 - 183.0
 
 
-def _apart(longitudes: NDArray[np.float64], other: float) -> NDArray[np.float64]:
-    """From `other` to these, in [-180, 180) degrees."""
+def _longitude_difference(longitudes: NDArray[np.float64], other: float) -> NDArray[np.float64]:
+    """Return the differences to `other`, in [-180, 180) degrees."""
     return np.mod(longitudes - other + 180.0, 360.0) - 180.0
 
 
 def pairwise_distances_m(
-    some: Sequence[DatasetPhoto], others: Sequence[DatasetPhoto]
+    first: Sequence[DatasetPhoto], second: Sequence[DatasetPhoto]
 ) -> NDArray[np.float64]:
-    """(n,) metres between the photos of each pair, NaN where one has no position.
+    """Return the (n,) distances in metres of pairs; NaN if a photo has no position.
 
-    Straight in the plane of the UTM zone that both lie in; over a zone's border on the sphere.
+    Euclidean within a UTM zone, on the sphere across a zone's border.
     """
-    metres = np.full(len(some), np.nan)
-    placed = [
+    metres = np.full(len(first), np.nan)
+    located = [
         number
-        for number, pair in enumerate(zip(some, others, strict=True))
-        if all(has_position(shot) for shot in pair)
+        for number, pair in enumerate(zip(first, second, strict=True))
+        if all(has_position(photo) for photo in pair)
     ]
-    here, zones = utm_positions([some[number] for number in placed])
-    there, other_zones = utm_positions([others[number] for number in placed])
-    metres[placed] = np.hypot(*(there - here).T)
-    for index, number in enumerate(placed):
-        zone, other = zones[index], other_zones[index]
-        if zone != other and zone is not None and other is not None:
+    first_metres, first_grids = utm_positions([first[number] for number in located])
+    second_metres, second_grids = utm_positions([second[number] for number in located])
+    metres[located] = np.hypot(*(second_metres - first_metres).T)
+    for index, number in enumerate(located):
+        from_grid, to_grid = first_grids[index], second_grids[index]
+        if from_grid != to_grid and from_grid is not None and to_grid is not None:
             metres[number] = distance_m(
-                *utm_to_degrees(zone, here[index]), *utm_to_degrees(other, there[index])
+                *utm_to_degrees(from_grid, first_metres[index]),
+                *utm_to_degrees(to_grid, second_metres[index]),
             )
     return metres
 
 
-def has_position(shot: DatasetPhoto) -> bool:
-    return None not in (shot.easting, shot.northing) or None not in (shot.latitude, shot.longitude)
+def has_position(photo: DatasetPhoto) -> bool:
+    """Whether the photo has UTM metres, or latitude and longitude."""
+    return None not in (photo.easting, photo.northing) or None not in (
+        photo.latitude,
+        photo.longitude,
+    )

@@ -1,7 +1,7 @@
-"""The `@UTM@` file names of visual place recognition data sets: read and written here alone.
+"""The `@UTM@` file names of visual place recognition datasets: parsing and formatting.
 
 `@ UTM_east @ UTM_north @ zone_number @ zone_letter @ latitude @ longitude @ pano_id @ tile @
-heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two are always there.
+heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two are always present.
 (github.com/gmberton/VPR-datasets-downloader, "Images naming convention")
 """
 
@@ -16,13 +16,13 @@ import utm
 
 from shared.errors import InvalidRequest
 
-FIELDS = 16  # between the leading and the closing `@` lie 14; the split has two more
-FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by their length; a year or a month is no day
+FIELDS = 16  # 14 between the first and the last `@`; splitting gives two more
+FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by length; a year or a month alone is not a date
 
 
 @dataclass(frozen=True, slots=True)
 class UtmFileName:
-    """What a name of the convention says of a photo that is about to be written."""
+    """The fields of an `@UTM@` file name to be written."""
 
     east: float
     """metres"""
@@ -38,9 +38,9 @@ class UtmFileName:
     note: str = ""
 
     def file_name(self, suffix: str = ".jpg") -> str:
-        """The name as the convention writes it; latitude and longitude follow from the UTM."""
+        """Format the name; latitude and longitude are computed from the UTM position."""
         if "@" in self.pano_id + self.note:
-            raise ValueError("the fields of an @UTM@ name can't hold an @")
+            raise ValueError("the fields of an @UTM@ file name can't contain an @")
         latitude, longitude = _degrees(self.east, self.north, self.zone_number, self.zone_letter)
         fields = (
             f"{self.east:010.2f}",
@@ -63,7 +63,7 @@ class UtmFileName:
 
 @dataclass(frozen=True, slots=True)
 class FileNameLocation:
-    """Where a photo was taken, as its name says; None means "not said"."""
+    """The location in an `@UTM@` file name; None means that the field is empty."""
 
     east: float
     """metres"""
@@ -76,14 +76,13 @@ class FileNameLocation:
     heading: float | None
     """degrees clockwise from north, in [0, 360)"""
     note: str
-    """free text; gsv_xs has the place and the city there"""
+    """free text; gsv_xs stores the place and the city here"""
 
 
 def parse_utm_file_name(name: str) -> FileNameLocation | None:
-    """What a file name of the convention says of its place; None for any other name.
+    """Parse the location of an `@UTM@` file name; None for other names.
 
-    `name` is that of the file alone: an `@` in a folder's name has no meaning. Raises
-    InvalidRequest (`bad_coordinates`).
+    `name` is the file name without folders. Raises InvalidRequest (`bad_coordinates`).
     """
     position = utm_position_of_file_name(name)
     if position is None:
@@ -102,9 +101,9 @@ def parse_utm_file_name(name: str) -> FileNameLocation | None:
 
 
 def utm_position_of_file_name(name: str) -> tuple[float, float] | None:
-    """UTM east and north in metres as the name says them; None for any other name.
+    """Parse UTM east and north, in metres, of an `@UTM@` file name; None for other names.
 
-    Raises InvalidRequest (`bad_coordinates`) where the convention's two numbers are none.
+    Raises InvalidRequest (`bad_coordinates`) if they are not finite numbers.
     """
     parts = name.split("@")
     if len(parts) < 4 or parts[0]:
@@ -112,18 +111,19 @@ def utm_position_of_file_name(name: str) -> tuple[float, float] | None:
     try:
         east, north = float(parts[1]), float(parts[2])
         if not math.isfinite(east + north):
-            raise ValueError(f"{parts[1]} and {parts[2]} are no metres")
+            raise ValueError(f"{parts[1]} and {parts[2]} are not finite numbers")
     except ValueError as error:
         raise _bad_coordinates(name, error) from error
     return east, north
 
 
 def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str]:
-    """What a name says, in the upload form's names; {} for a name of no such convention.
+    """Parse an `@UTM@` file name into fields of the upload form; {} for other names.
 
-    `utm_zone` (such as `32T`) is meant where the name has none. A timestamp becomes `captured_at`
-    only when it is a full date: `201905` names a month, and a photo is not taken in a month's first
-    second. Raises InvalidRequest (`no_utm_zone`, `bad_coordinates`).
+    `utm_zone` (such as `32T`) is the zone of names without one. A timestamp becomes `captured_at`
+    only if it is a full date; `201905` names a month only.
+
+    Raises InvalidRequest: `no_utm_zone`, `bad_coordinates`.
     """
     parts = name.split("@")
     if len(parts) < 4 or parts[0]:
@@ -135,13 +135,13 @@ def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str
         if zone is None:
             raise InvalidRequest(
                 "no_utm_zone",
-                f"{name} says UTM east and north but no zone. Give it: --utm-zone 32T.",
+                f"{name} has UTM east and north but no zone. Pass it, for example --utm-zone 32T.",
             )
         try:
-            found = _degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
+            degrees = _degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
         except (ValueError, utm.OutOfRangeError) as error:
             raise _bad_coordinates(name, error) from error
-        latitude, longitude = f"{found[0]:.7f}", f"{found[1]:.7f}"
+        latitude, longitude = f"{degrees[0]:.7f}", f"{degrees[1]:.7f}"
     fields = {"latitude": latitude, "longitude": longitude}
     with contextlib.suppress(ValueError):  # the heading is optional in the convention
         fields["heading"] = f"{float(parts[9]) % 360:g}"
@@ -165,14 +165,14 @@ def _degrees(east: float, north: float, number: int, letter: str) -> tuple[float
 
 
 def _full_date(timestamp: str) -> datetime | None:
-    """The date of a timestamp field, the time with it where it is there; None for all others."""
+    """Parse a timestamp of a date or of date and time; None for others."""
     digits = timestamp.replace("_", "")
     pattern = FULL_DATES.get(len(digits)) if digits.isdecimal() and digits.isascii() else None
     if pattern is None:
         return None
     try:
         return datetime.strptime(digits, pattern).replace(tzinfo=UTC)
-    except ValueError:  # such as a thirteenth month: it is no date
+    except ValueError:  # not a date, such as month 13
         return None
 
 

@@ -1,6 +1,7 @@
-"""From a photo's bytes to its global descriptor. torch lives here and nowhere else in `shared`.
+"""Image descriptors: photo bytes to global descriptors. The only PyTorch code in `shared`.
 
 bytes --decode, preprocessing--> RGB pixels --backbone--> dense local features --aggregator--> row
 
-`decode`, `preprocessing` and `resample` import no torch: they run in the decoding child processes.
+Decoding and preprocessing live in `shared.imaging`, which does not import torch, because they run
+in the decoding child processes.
 """

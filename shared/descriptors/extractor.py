@@ -1,5 +1,8 @@
-"""Extractors: recipes (`shared.extractor_config.configs`) with their weights loaded, at work on
-pixels."""
+"""Extractors: turn batches of decoded photos into global descriptors.
+
+An `Extractor` is an `ExtractorConfig` with its backbone's weights loaded on a device. The
+descriptor's value is determined by `Extractor.spec`, which every generation stores.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +64,7 @@ def _torchhub(recipe: ExtractorConfig, device: torch.device, _weights: Path | No
 
 def _trained(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
     assert recipe.trained is not None
-    assert recipe.trained.file is not None, "an added model is loaded by who knows the catalog"
+    assert recipe.trained.file is not None, "a registered model is loaded through the catalog"
     return TrainedBackbone.from_checkpoint(recipe.name, Path(recipe.trained.file), device)
 
 
@@ -76,7 +79,10 @@ BACKBONES: dict[str, Callable[[ExtractorConfig, torch.device, Path | None], Back
 
 
 def choose_device(device: str) -> torch.device:
-    """The device called `auto`, `cpu` or `cuda`; `auto` is CUDA where there is one."""
+    """Resolve `auto`, `cpu` or `cuda` to a device; `auto` is CUDA if available, else CPU.
+
+    Raises Misconfigured (`cuda_missing`) if CUDA is requested but not available.
+    """
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device == "cuda" and not torch.cuda.is_available():
@@ -89,7 +95,7 @@ def choose_device(device: str) -> torch.device:
 
 
 class Extractor:
-    """A recipe with its weights loaded: the backbone is shared by all its vocabularies."""
+    """A loaded extractor. One backbone serves any number of vocabularies."""
 
     def __init__(
         self,
@@ -101,23 +107,31 @@ class Extractor:
         backbone: Backbone | None = None,
         limit: BatchSizeLimit | None = None,
     ) -> None:
-        """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
-        `backbone`: one that is loaded already, of the same `recipe.local_features`, as that of an
-        added model has to be; `limit` is what is known of it.
+        """Load the backbone's weights, unless `backbone` is given.
 
-        Raises Misconfigured (`weights_missing`, `weights_unfit`, `torchhub_unfit`), and for a
-        checkpoint as `TrainedModel.of_checkpoint`.
+        Args:
+            recipe: The configuration of the extractor.
+            device: The device that the backbone runs on.
+            precision: The precision that the backbone computes in.
+            dino_weights: The setting DINO_WEIGHTS, for DINOv2 backbones; None means timm's weights
+                from the Hugging Face hub.
+            backbone: A loaded backbone with the same `recipe.local_features`. Required for a
+                registered model.
+            limit: The batch size limit that was measured for `backbone`.
+
+        Raises:
+            Misconfigured: `weights_missing`, `weights_unfit`, `torchhub_unfit`.
+            PlacewiseError: For a checkpoint, as `TrainedBackbone.from_checkpoint` raises.
         """
         self.recipe = recipe
         self.precision: Precision = precision
         self.limit = limit or BatchSizeLimit()
         self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
         self.preprocessing: Preprocessing = _preprocessing(recipe, self.backbone)
-        told = recipe.width
-        assert told in (None, self.backbone.width), "the recipe tells others the width"
+        assert recipe.width in (None, self.backbone.width), "recipe.width must match the backbone"
 
     def at(self, precision: Precision) -> Extractor:
-        """The same weights computing in `precision`."""
+        """Return an extractor with the same weights that computes in `precision`."""
         if precision == self.precision:
             return self
         return Extractor(
@@ -129,7 +143,10 @@ class Extractor:
         )
 
     def shipped_vocabulary(self) -> tuple[ClusterCentres, dict[str, Any]] | None:
-        """The vocabulary that comes with the extractor, with its provenance; None without one."""
+        """Return the vocabulary shipped with the extractor and its provenance, or None.
+
+        Raises Misconfigured (`vocabulary_unfit`) if it was fitted with other weights.
+        """
         if self.recipe.shipped_vocabulary is None:
             return None
         path = SHIPPED_VOCABULARIES / self.recipe.shipped_vocabulary
@@ -138,7 +155,7 @@ class Extractor:
         if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
             raise Misconfigured(
                 "vocabulary_unfit",
-                f"The shipped vocabulary {path.name} was learnt with other weights "
+                f"The shipped vocabulary {path.name} was fitted with other weights "
                 f"({provenance['backbone_fingerprint'][:12]}) than those installed "
                 f"({self.backbone.fingerprint[:12]}). Install the pinned packages: `make setup`.",
             )
@@ -147,7 +164,7 @@ class Extractor:
     def spec(
         self, centres: ClusterCentres | None, projection: PcaProjection | None = None
     ) -> dict[str, Any]:
-        """Everything that decides a descriptor's value."""
+        """Return the extractor spec: everything that determines a descriptor's value (JSON)."""
         spec: dict[str, Any] = {
             "extractor": self.recipe.name,
             "backbone": self.backbone.name,
@@ -178,45 +195,52 @@ class Extractor:
     def dimension(
         self, centres: ClusterCentres | None, projection: PcaProjection | None = None
     ) -> int:
-        """Length of a descriptor."""
+        """Return the number of dimensions of a descriptor."""
         if projection is not None:
             return projection.kept
         return self.backbone.width * (centres.clusters if centres else 1)
 
     def warm_up(self, photos: int) -> None:
-        """One pass as large as any of a batch of `photos`: kernels are chosen, memory is taken, and
-        what does not fit is found out before a photo waits for it.
+        """Run one forward pass of the largest size that a batch of `photos` photos needs.
 
-        Misconfigured (`gpu_out_of_memory`) where not even one photo of the usual size fits.
+        It selects kernels, allocates memory and detects an out-of-memory condition before the
+        first job.
+
+        Raises Misconfigured (`gpu_out_of_memory`) if not even one photo of the usual size fits.
         """
         height, width = self.preprocessing.typical_size
-        at_once = self.limit.photos(photos, height * width)
-        blank = [np.zeros((height, width, 3), np.uint8)] * at_once
+        batch_size = self.limit.photos(photos, height * width)
+        blank = [np.zeros((height, width, 3), np.uint8)] * batch_size
         try:
             for _ in self._run_in_batches(blank, lambda features: features):
                 pass
         except PhotoTooLargeForGpu as error:
             raise Misconfigured(
                 "gpu_out_of_memory",
-                f"The GPU holds the weights of {self.recipe.name}, but not one photo beside them. "
-                "See what else uses it (`nvidia-smi`), or set a smaller extractor or DEVICE=cpu.",
+                f"After loading the weights of {self.recipe.name}, the GPU has no memory left for "
+                "a single photo. Check what else uses the GPU (`nvidia-smi`), or configure a "
+                "smaller extractor or DEVICE=cpu.",
             ) from error
 
     def features(self, pixels: Pixels) -> torch.Tensor:
-        """(B, H, W, 3) of one size -> (B, patches, width) float32 local features on the device."""
+        """Compute (B, patches, width) float32 features of (B, H, W, 3) pixels, on the device."""
         with autocast(self.precision, self.backbone.device):
             return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 
     def local_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
-        """Of each photo, in their order, (patches, width) float32 on the CPU; any sizes.
+        """Return the local features of photos of any sizes, in their order.
 
-        Raises PhotoDoesNotFit.
+        Returns:
+            One (patches, width) float32 tensor for each photo, on the CPU.
+
+        Raises:
+            PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
         """
-        found: list[torch.Tensor] = [torch.empty(0)] * len(photos)
-        for places, features in self._run_in_batches(photos, torch.Tensor.cpu):
-            for place, one in zip(places, features, strict=True):
-                found[place] = one
-        return found
+        results: list[torch.Tensor] = [torch.empty(0)] * len(photos)
+        for indices, features in self._run_in_batches(photos, torch.Tensor.cpu):
+            for index, photo_features in zip(indices, features, strict=True):
+                results[index] = photo_features
+        return results
 
     def describe(
         self,
@@ -224,13 +248,21 @@ class Extractor:
         centres: ClusterCentres | None,
         projection: PcaProjection | None = None,
     ) -> NDArray[np.float32]:
-        """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
+        """Compute the global descriptors of photos.
 
-        Rows in the photos' order, of length 1; or 0, see `shared.descriptors.aggregation`; or
-        NaN throughout
-        where the network's features are not finite: these must not be stored (`not_finite_error`).
+        Args:
+            photos: (H, W, 3) pixels as `preprocessing` returns them; sizes may differ.
+            centres: The vocabulary; required if `recipe.needs_vocabulary`.
+            projection: A PCA whitening to apply to the descriptors.
 
-        Raises PhotoDoesNotFit for a photo that is too much for the GPU even alone.
+        Returns:
+            (n, dimension) float32 rows in the photos' order. Rows have length 1, or 0 for a photo
+            without structure (see `shared.descriptors.aggregation`). A row is NaN throughout if the
+            network's features are not finite; such a row must not be stored (`not_finite_error`).
+
+        Raises:
+            PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
+            ValueError: The extractor needs a vocabulary and `centres` is None.
         """
         if self.recipe.needs_vocabulary and centres is None:
             raise ValueError(f"{self.recipe.name} needs a vocabulary")
@@ -238,21 +270,24 @@ class Extractor:
         if centres is not None:
             on_device = torch.from_numpy(centres.array).to(self.backbone.device)
 
-        def row(features: torch.Tensor) -> torch.Tensor:
-            described = self._aggregate(features, on_device)
-            return (described if projection is None else projection(described)).cpu()
+        def to_rows(features: torch.Tensor) -> torch.Tensor:
+            descriptors = self._aggregate(features, on_device)
+            return (descriptors if projection is None else projection(descriptors)).cpu()
 
         rows = np.empty((len(photos), self.dimension(centres, projection)), np.float32)
-        for places, found in self._run_in_batches(photos, row):
-            rows[places] = found.numpy()
+        for indices, batch_rows in self._run_in_batches(photos, to_rows):
+            rows[indices] = batch_rows.numpy()
         return rows
 
     def _run_in_batches(
-        self, photos: Collection[Pixels], then: Callable[[torch.Tensor], torch.Tensor]
+        self, photos: Collection[Pixels], transform: Callable[[torch.Tensor], torch.Tensor]
     ) -> Iterator[tuple[list[int], torch.Tensor]]:
-        """Places in `photos`, and what `then` makes of the local features of those."""
+        """Yield, per batch, indices into `photos` and `transform` of their local features."""
         return run_in_batches(
-            photos, lambda pixels: then(self.features(pixels)), self.limit, self.backbone.device
+            photos,
+            lambda pixels: transform(self.features(pixels)),
+            self.limit,
+            self.backbone.device,
         )
 
     def _aggregate(self, features: torch.Tensor, centres: torch.Tensor | None) -> torch.Tensor:
@@ -271,8 +306,8 @@ class Extractor:
             case "none":
                 rows = features[:, 0]
             case other:
-                raise ValueError(f"there is no aggregator {other!r}")
-        # Said outright: a comparison or a clamp on the way may hide a NaN.
+                raise ValueError(f"unknown aggregator {other!r}")
+        # Set explicitly: a comparison or a clamp in the aggregator may hide a NaN.
         finite = torch.isfinite(features).flatten(1).all(dim=1, keepdim=True)
         return torch.where(finite, rows, torch.nan)
 
@@ -280,19 +315,19 @@ class Extractor:
 def _preprocessing(recipe: ExtractorConfig, backbone: Backbone) -> Preprocessing:
     if recipe.preprocessing is not None:
         return get_preprocessing(recipe.preprocessing)
-    assert isinstance(backbone, TrainedBackbone), "only a trained model brings its own"
+    assert isinstance(backbone, TrainedBackbone), "preprocessing is missing"
     return backbone.preprocessing
 
 
 def not_finite_error() -> Unprocessable:
-    """Why a photo whose row is NaN has no descriptor."""
+    """Return the error for a photo whose descriptor row is NaN."""
     return Unprocessable(
         "features_not_finite",
-        "The network's features of this photo are not finite numbers: it has no descriptor. If "
-        "this is said of many photos, check the weights (`placewise doctor`) and the GPU.",
+        "The network's features of this photo are not finite numbers, so it has no descriptor. "
+        "If many photos fail with this error, check the weights (`placewise doctor`) and the GPU.",
     )
 
 
 def spec_fingerprint(spec: dict[str, Any]) -> str:
-    """sha256 of the spec's canonical JSON."""
+    """Return the sha256 of the spec's canonical JSON, hexadecimal."""
     return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()

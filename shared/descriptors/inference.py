@@ -1,18 +1,13 @@
-"""How much goes through a network at once, and what happens when that is more than the GPU holds.
+"""Batched inference: batch size limits, out-of-memory recovery, precision, GPU memory.
 
-A pass for which memory does not suffice is repeated with half of its photos, and from then on none
-is larger. What one photo needs grows with its pixels, so it is pixels that are counted.
+Batch size: a forward pass that runs out of GPU memory is retried with half of its photos, and later
+passes do not exceed that size. Memory grows with pixels, so the limit counts pixels, not photos.
 
-In which numbers a network computes: `float32`, or `bfloat16` where that loses little.
-
-bfloat16 is autocast: weights, the sums along the residual path, normalisations and everything after
-the backbone stay float32; products of matrices and convolutions are taken in bfloat16. It has
-float32's range, so that what fits into one fits into the other, and 8 bits of precision.
-
-float32 means just that. PyTorch would let convolutions on a GPU round their inputs to TF32, with 11
-bits of precision; here nothing does.
-
-How full the GPUs of this process are.
+Precision: `float32`, or `bfloat16` where that loses little accuracy. bfloat16 uses autocast:
+weights, residual sums, normalisations and everything after the backbone stay float32; matrix
+products and convolutions run in bfloat16. It has float32's range, so that what fits into one fits
+into the other, and 8 bits of precision. In float32, TF32 (11 bits of precision), which PyTorch
+allows for convolutions by default, is disabled.
 """
 
 from __future__ import annotations
@@ -34,49 +29,51 @@ from shared.imaging.preprocessing import Pixels
 
 log = logging.getLogger(__name__)
 
-DEFAULT_PHOTO_PIXELS = 224 * 224  # of a photo, by which the size of a pass is chosen
+DEFAULT_PHOTO_PIXELS = 224 * 224  # the pixels of one photo, for the default size of a batch
 
-# All threads of a process queue their work on one GPU in one line: side by side they would gain
-# nothing, and need memory for both.
+# Serializes GPU work across threads: concurrent passes would not be faster and would need the
+# memory of both.
 _gpu_lock = threading.Lock()
 
 
 class PhotoTooLargeForGpu(Unprocessable):
-    """One photo alone is too much for the GPU: code `gpu_out_of_memory`."""
+    """One photo alone exceeds the GPU's memory: code `gpu_out_of_memory`."""
 
     place = 0
-    """Which of the photos that were to be described, counted from 0."""
+    """Index of the photo in the input, from 0."""
 
     @classmethod
     def for_photo(cls, place: int, height: int, width: int) -> PhotoTooLargeForGpu:
         error = cls(
             "gpu_out_of_memory",
-            "The GPU's memory does not suffice for this photo alone, of which the preprocessing "
-            f"makes {width} x {height} pixels. See what else uses the GPU (`nvidia-smi`) and retry "
-            "the job; or take a preprocessing that makes photos smaller (square224), a smaller "
-            "extractor, or DEVICE=cpu.",
+            f"The GPU ran out of memory for this photo alone ({width} x {height} pixels after "
+            "preprocessing). Check what else uses the GPU (`nvidia-smi`) and retry the job; or "
+            "use a preprocessing with smaller photos (square224), a smaller extractor, or "
+            "DEVICE=cpu.",
         )
         error.place = place
         return error
 
 
 class BatchSizeLimit:
-    """What one loaded network can take at once. Kept as long as the process lives."""
+    """The largest batch of one loaded network that fits the GPU. Lives as long as the process."""
 
     def __init__(self) -> None:
-        self._most_pixels: float = math.inf
+        self._max_pixels: float = math.inf
 
     def photos(self, batch: int, photo_pixels: int) -> int:
-        """How many photos of that size make one pass of a batch of `batch` photos: together no more
-        pixels than the batch would have at 224 x 224, or else one photo.
+        """Return how many photos of `photo_pixels` pixels to run in one pass, at least 1.
+
+        Together they have no more pixels than `batch` photos of 224 x 224, and no more than the
+        limit that was recorded.
         """
-        return max(1, int(min(batch * DEFAULT_PHOTO_PIXELS, self._most_pixels)) // photo_pixels)
+        return max(1, int(min(batch * DEFAULT_PHOTO_PIXELS, self._max_pixels)) // photo_pixels)
 
     def record_out_of_memory(self, photos: int, photo_pixels: int) -> None:
-        """A pass of several such photos did not fit: the next ones have half of it at most."""
-        self._most_pixels = min(self._most_pixels, photos * photo_pixels // 2)
+        """Halve the limit after a pass of `photos` photos ran out of memory."""
+        self._max_pixels = min(self._max_pixels, photos * photo_pixels // 2)
         log.warning(
-            "%d photos of %d pixels at once are too much for the GPU: half of that from now on",
+            "%d photos of %d pixels at once are too much for the GPU; halving the batch size limit",
             photos,
             photo_pixels,
         )
@@ -88,24 +85,34 @@ def run_in_batches(
     limit: BatchSizeLimit,
     device: torch.device,
 ) -> Iterator[tuple[list[int], torch.Tensor]]:
-    """Pass by pass: the places of its photos in `photos`, and what `run` makes of them.
+    """Run `run` on batches of photos of the same size; halve the batch when memory runs out.
 
-    `run` takes (B, H, W, 3): photos of one size, as many as `limit` says. On a GPU it has to leave
-    nothing of its own there but what it returns. Raises PhotoDoesNotFit.
+    Args:
+        photos: (H, W, 3) pixels; sizes may differ.
+        run: Takes a (B, H, W, 3) batch of photos of one size. On a GPU it must not leave anything
+            allocated but its return value.
+        limit: The batch size limit; lowered when a batch runs out of memory.
+        device: Where `run` computes.
+
+    Yields:
+        The indices of the batch's photos in `photos`, and the result of `run`.
+
+    Raises:
+        PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
     """
-    listed = list(photos)
-    of_shape: dict[tuple[int, ...], list[int]] = {}
-    for place, photo in enumerate(listed):
-        of_shape.setdefault(photo.shape, []).append(place)
-    for (height, width, _), left in of_shape.items():
-        while left:
-            chosen = left[: limit.photos(len(listed), height * width)]
-            found = _run_unless_out_of_memory(
-                run, np.stack([listed[place] for place in chosen]), device
+    photo_list = list(photos)
+    by_shape: dict[tuple[int, ...], list[int]] = {}
+    for index, photo in enumerate(photo_list):
+        by_shape.setdefault(photo.shape, []).append(index)
+    for (height, width, _), pending in by_shape.items():
+        while pending:
+            chosen = pending[: limit.photos(len(photo_list), height * width)]
+            result = _run_unless_out_of_memory(
+                run, np.stack([photo_list[index] for index in chosen]), device
             )
-            if found is not None:
-                left = left[len(chosen) :]
-                yield chosen, found
+            if result is not None:
+                pending = pending[len(chosen) :]
+                yield chosen, result
             elif len(chosen) > 1:
                 limit.record_out_of_memory(len(chosen), height * width)
             else:
@@ -115,13 +122,13 @@ def run_in_batches(
 def _run_unless_out_of_memory(
     run: Callable[[Pixels], torch.Tensor], pixels: Pixels, device: torch.device
 ) -> torch.Tensor | None:
-    """None where the GPU has no memory for it."""
+    """Return None if the GPU runs out of memory."""
     with _gpu_lock if device.type == "cuda" else contextlib.nullcontext():
         try:
             return run(pixels)
         except torch.cuda.OutOfMemoryError:
             pass
-        # Outside of the handler, which would still hold what the pass had come to.
+        # Outside of the handler, whose traceback would keep the tensors of the failed pass alive.
         torch.cuda.empty_cache()
         return None
 
@@ -133,11 +140,11 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 def choose_precision(
     requested: Literal["auto", "float32", "bfloat16"], recipe: ExtractorConfig, device: torch.device
 ) -> Precision:
-    """What a new generation is made in; `requested` is PRECISION.
+    """Return the precision of a new generation; `requested` is the setting PRECISION.
 
-    `auto` is bfloat16 for DINOv2 on CUDA, and float32 for all else: EfficientNet-Lite0, which takes
-    no time anyway, sums in bfloat16 from block to block and loses too much by it
-    (`benchmarks/RESULTS.md`), and of torch.hub entries nobody has tried it.
+    `auto` is bfloat16 for DINOv2 on CUDA, else float32: EfficientNet-Lite0 is fast anyway, and in
+    bfloat16 its sums from block to block lose too much accuracy (`benchmarks/RESULTS.md`);
+    bfloat16 is not measured for torch.hub entries.
     """
     if requested != "auto":
         return requested
@@ -146,8 +153,8 @@ def choose_precision(
 
 @contextlib.contextmanager
 def autocast(precision: Precision, device: torch.device) -> Iterator[None]:
-    """What the block computes on `device` is computed in `precision`."""
-    # For the whole process, and each time: code from torch.hub may have said otherwise meanwhile.
+    """Compute in `precision` on `device` within the context."""
+    # Process-wide settings, set again each time: code from torch.hub may have changed them.
     torch.backends.cudnn.allow_tf32 = False
     torch.set_float32_matmul_precision("highest")
     if precision == "float32":
@@ -159,15 +166,17 @@ def autocast(precision: Precision, device: torch.device) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class GpuMemory:
+    """Memory of one GPU."""
+
     name: str
     """`cuda:0`"""
     used_bytes: int
-    """Held by this process's PyTorch, its own reserve included."""
+    """Reserved by PyTorch in this process, its cache included."""
     total_bytes: int
 
 
 def gpu_memory() -> list[GpuMemory]:
-    """Of each GPU that this process has begun to use: none on a CPU."""
+    """Return the memory of each GPU that this process uses; empty if CUDA is not initialized."""
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return []
     return [

@@ -1,7 +1,7 @@
-"""The local features that a vocabulary is learnt from: some patches of each photo, in an object
-store, so that memory never depends on how many there are.
+"""Training samples for vocabularies: random patches of each photo, in an object store.
 
-A vocabulary from photos at hand: their patches lie in a temporary folder meanwhile.
+The patches are stored as objects and read in ranges, so memory does not depend on their number.
+`fit_vocabulary` fits a vocabulary to local photos, with the patches in a temporary folder.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ FLOAT32 = np.dtype("<f4")
 
 
 def max_photos_to_sample(width: int) -> int:
-    """How many photos can give one patch each; `width` is the length of a local feature."""
+    """Return how many photos fit the store with one patch each, of `width` numbers."""
     return max(1, PATCHES_BYTES // (FLOAT32.itemsize * width))
 
 
 def sample_photos(available: int, sample: int, width: int, seed: int) -> list[int]:
-    """Which of so many photos to learn from, at most `sample`: their numbers, in a random order.
+    """Choose at most `sample` of `available` photos to fit on.
 
-    The order lets each batch of patches stand for all photos.
+    Returns:
+        Their indices in random order, so that each batch of patches represents all photos.
     """
     size = min(sample, available, max_photos_to_sample(width))
     chosen: list[int] = (
@@ -44,7 +45,7 @@ def sample_photos(available: int, sample: int, width: int, seed: int) -> list[in
 
 
 class PatchStore:
-    """Patches as objects `PREFIX<photo's place>.f32`: float32 rows, little-endian, C order."""
+    """Writes patches as objects `PREFIX<first photo>.f32`: float32 rows, little-endian, C order."""
 
     def __init__(self, store: ObjectStore, prefix: str, width: int) -> None:
         """`width`: the length of a local feature."""
@@ -53,18 +54,24 @@ class PatchStore:
         self.width = width
 
     def add(self, features: Iterable[torch.Tensor], first: int, photos: int, seed: int) -> None:
-        """Keep (patches, width) features of each of a few photos, which are the `first` and
-        following of all `photos`. Each gives an equal share of PATCHES_BYTES, chosen by `seed` and
-        its place.
+        """Store a random sample of the patches of a batch of photos.
+
+        Args:
+            features: (patches, width) features of each photo of the batch.
+            first: Index of the batch's first photo among all photos.
+            photos: Number of all photos; each gets an equal share of PATCHES_BYTES.
+            seed: Selects the patches, together with the photo's index.
         """
         share = max(1, PATCHES_BYTES // (FLOAT32.itemsize * self.width * photos))
-        kept = [
-            one[np.random.default_rng([seed, place]).permutation(len(one))[:share]].cpu().numpy()
-            for place, one in enumerate(features, first)
+        sampled = [
+            photo[np.random.default_rng([seed, index]).permutation(len(photo))[:share]]
+            .cpu()
+            .numpy()
+            for index, photo in enumerate(features, first)
         ]
-        rows: NDArray[np.float32] = np.concatenate(kept)
-        # A patch without any structure has a zero feature, which no centre can describe. What is
-        # not finite is refused when the photo is described.
+        rows: NDArray[np.float32] = np.concatenate(sampled)
+        # A patch without any structure has a zero feature, which no centre can describe. Photos
+        # with non-finite features are rejected when they are described.
         lengths = np.linalg.norm(rows, axis=1)
         rows = rows[np.isfinite(lengths) & (lengths > 0)]
         self._store.put(
@@ -72,16 +79,16 @@ class PatchStore:
         )
 
     def open(self) -> StoredPatches:
-        """What is there now, in the order of the photos."""
-        found = sorted((info.key, info.size_bytes) for info in self._store.list(self._prefix))
-        return StoredPatches(self._store, found, self.width)
+        """Open the patches stored so far, in the order of the photos."""
+        objects = sorted((info.key, info.size_bytes) for info in self._store.list(self._prefix))
+        return StoredPatches(self._store, objects, self.width)
 
 
 class StoredPatches:
-    """The rows of all objects as one (n, width) array that is read piece by piece."""
+    """Reads row ranges of the stored patches as if they were one (n, width) array."""
 
     def __init__(self, store: ObjectStore, objects: list[tuple[str, int]], width: int) -> None:
-        """`objects`: key and size in bytes of each."""
+        """`objects`: the key and the size in bytes of each."""
         self._store = store
         self._keys = [key for key, _ in objects]
         self._row_bytes = FLOAT32.itemsize * width
@@ -93,7 +100,7 @@ class StoredPatches:
         return self._begins[-1]
 
     def read(self, begin: int, end: int) -> torch.Tensor:
-        """(end - begin, width) float32 on the CPU; Unavailable as the store raises it."""
+        """Return rows [begin, end), float32 on the CPU. Raises Unavailable as the store does."""
         parts = []
         at = bisect_right(self._begins, begin) - 1
         while begin < end:
@@ -118,16 +125,22 @@ def fit_vocabulary(
     *,
     clusters: int,
     seed: int,
-    on_progress: Callable[[str, int, int], None] = lambda what, done, most: None,
+    on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> VocabularyFile:
-    """Learn `clusters` centres, or as many as the photos bear.
+    """Fit a VLAD vocabulary to photos.
 
-    `batches` are photos (height, width, 3) as the extractor's preprocessing leaves them, of any
-    sizes, in a random order (`shared.descriptors.patches.sample_photos`); of `photos` at most.
-    `on_progress` hears what is being done (`describing`, `clustering`), how far it is and where
-    it ends.
+    Args:
+        extractor: Computes the local features.
+        batches: Photos (height, width, 3) as the extractor's preprocessing returns them, of any
+            sizes, in random order (`sample_photos`).
+        photos: Upper bound of the number of photos.
+        clusters: Requested number of centres; fewer if there are too few patches.
+        seed: Seed of the sampling and of k-means.
+        on_progress: Called with the stage (`describing`, `clustering`), the steps done and the
+            total.
 
-    Raises Unprocessable (`no_photos`) when no photo comes.
+    Raises:
+        Unprocessable: `no_photos` if `batches` is empty.
     """
     with tempfile.TemporaryDirectory(prefix="placewise-fit-") as folder:
         store = PatchStore(

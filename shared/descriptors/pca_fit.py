@@ -1,16 +1,13 @@
-"""The rows that a PCA is fitted on: how many, and how they are read, by blocks of columns.
+"""PCA fit: computes a PCA whitening from descriptor rows, in resumable steps by blocks of columns.
 
-Fitting a PCA whitening (`shared.descriptors.pca_whitening`) on database rows: queries would
-tell the map what
-they are.
+Fit on database rows only: queries of an evaluation would leak into the projection.
 
-At 98,304 dimensions the covariance (39 GB) can't be held. With fewer rows than dimensions the same
-directions come from the n x n Gram matrix (Turk and Pentland 1991): XX' = U diag(s^2) U' gives
+At 98,304 dimensions the covariance (39 GB) does not fit memory. With fewer rows than dimensions the
+same directions come from the n x n Gram matrix (Turk and Pentland 1991): XX' = U diag(s^2) U' gives
 l = s^2 / (n - 1) and p = X'u / s. X is read in blocks of columns, each centred by its own mean,
-once for XX' and once for the directions, so that memory holds n x n numbers, one block, and what
-comes of it. Each block is a step, and a fit can be interrupted between any two.
-
-A whitening from rows that come batch by batch: they lie in a temporary folder meanwhile.
+once for XX' and once for the directions, so that memory holds n x n numbers, one block and its
+result. Each block is a step, and a fit can be saved and resumed between any two steps.
+scikit-learn's IncrementalPCA reads batches of rows and holds a matrix of components in memory.
 """
 
 from __future__ import annotations
@@ -30,25 +27,25 @@ from shared.descriptors.pca_whitening import PcaWhitening, Rows
 from shared.errors import Unprocessable
 from shared.storage import FolderStore, ObjectStore
 
-BLOCK_BYTES = 64_000_000  # of float64 columns that are looked at together
-SAMPLE_BYTES = 1_000_000_000  # of rows, where they lie while a fit works on them
+BLOCK_BYTES = 64_000_000  # of float64 columns in one block
+SAMPLE_BYTES = 1_000_000_000  # maximum size of the sample of rows
 MIN_SAMPLE_ROWS = 1000
 SAMPLE_PER_DIMENSION = 4
 FLOAT32 = np.dtype("<f4")
 
 
 def sample_size(dimension: int, kept: int) -> int:
-    """How many rows of `dimension` numbers a fit to `kept` learns from, at most.
+    """Return the maximum number of rows to fit on, for `kept` of `dimension` dimensions.
 
-    Several for each direction that is kept, as far as SAMPLE_BYTES go, but always twice as many:
-    the time that a fit takes grows with the square of their number.
+    SAMPLE_PER_DIMENSION rows per kept dimension, as far as SAMPLE_BYTES allow, but always two per
+    kept dimension: the time of a fit grows with the square of the number of rows.
     """
-    wanted = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * kept)
-    return min(wanted, max(2 * kept, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
+    target = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * kept)
+    return min(target, max(2 * kept, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
 
 
 def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
-    """Which of so many rows to learn from, at most `sample`: their numbers, ascending."""
+    """Choose at most `sample` of `available` rows; return their indices, ascending."""
     chosen = np.random.default_rng(seed).choice(
         available, size=min(sample, available), replace=False
     )
@@ -56,13 +53,13 @@ def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
 
 
 def usable_rows(rows: Rows) -> NDArray[np.bool_]:
-    """(n,) which of (n, D) rows say something of their photo: neither zero nor with a NaN."""
+    """Return the (n,) mask of the (n, D) rows that are finite and not zero."""
     lengths = np.linalg.norm(rows, axis=1)
     return np.asarray(np.isfinite(lengths) & (lengths > 0))
 
 
 class ColumnSource(Protocol):
-    """(count, dimension) float32 rows that are read by columns."""
+    """(count, dimension) float32 rows that are read in blocks of columns."""
 
     @property
     def count(self) -> int: ...
@@ -72,21 +69,22 @@ class ColumnSource(Protocol):
 
     @property
     def width(self) -> int:
-        """Of a block of columns; the last one may be narrower."""
+        """Number of columns of a block; the last one may be narrower."""
 
     def read(self, block: int) -> Rows:
-        """(count, width) of the block, the first being 0."""
+        """Return the (count, width) columns of a block, counted from 0."""
 
 
 def block_count(rows: ColumnSource) -> int:
-    """How many blocks of columns there are."""
+    """Return the number of blocks of columns."""
     return -(-rows.dimension // rows.width)
 
 
 def block_width(count: int, dimension: int, block_bytes: int = BLOCK_BYTES) -> int:
-    """How many columns of (count, dimension) rows are looked at together.
+    """Return the number of columns in a block of (count, dimension) rows.
 
-    All, where there are more rows than dimensions: the products of columns are fewer then.
+    All columns if there are more rows than dimensions: the products of columns are the smaller
+    matrix then.
     """
     if count > dimension:
         return dimension
@@ -94,7 +92,7 @@ def block_width(count: int, dimension: int, block_bytes: int = BLOCK_BYTES) -> i
 
 
 class ArrayColumns:
-    """Those of an array, which may be mapped from a file."""
+    """A ColumnSource over an array, which may be memory-mapped."""
 
     def __init__(self, rows: Rows, block_bytes: int = BLOCK_BYTES) -> None:
         self._rows = rows
@@ -107,15 +105,22 @@ class ArrayColumns:
 
 
 class StoredColumns:
-    """Rows in an object store, as objects `PREFIX<block>-<first row>.f32`: (rows, width) float32,
-    little-endian, C order. So a block of columns is read without the others.
+    """A ColumnSource in an object store, one object per block of columns and batch of rows.
+
+    Objects `PREFIX<block>-<first row>.f32` are (rows, width) float32, little-endian, C order.
     """
 
     def __init__(
         self, store: ObjectStore, prefix: str, dimension: int, width: int, count: int = 0
     ) -> None:
-        """`width`: of a block, as `block_width` gives it for as many rows as there may be; `count`:
-        rows that are there already.
+        """Open the rows under `prefix`.
+
+        Args:
+            store: The object store.
+            prefix: Key prefix of the objects.
+            dimension: Number of columns.
+            width: Number of columns of a block: `block_width` of the maximum number of rows.
+            count: Number of rows stored already.
         """
         self._store = store
         self._prefix = prefix
@@ -124,8 +129,9 @@ class StoredColumns:
         self.count = count
 
     def add(self, rows: Rows) -> None:
-        """Keep (n, dimension) more rows. Those that were added before a crash, and not counted, are
-        written again.
+        """Append (n, dimension) rows.
+
+        Rows that were written before a crash but not counted are overwritten.
         """
         for block in range(block_count(self)):
             begin = block * self.width
@@ -148,22 +154,24 @@ class StoredColumns:
         return f"{self._prefix}{block:05d}-{first:08d}.f32"
 
 
-# Of the largest one: below, float32's rounding of the rows is what would be made strong.
+# Relative to the largest variance. Below, whitening would amplify float32 rounding errors.
 MIN_VARIANCE = 1e-9
 
 Matrix = NDArray[np.float64]
 
 
 class PcaFitStage(StrEnum):
-    PRODUCTS = "products"  # between all rows
-    VARIANCES = "variances"  # the largest of them
+    """The stages of a fit, in their order."""
+
+    PRODUCTS = "products"  # Gram matrix
+    VARIANCES = "variances"  # eigenvalues
     DIRECTIONS = "directions"
     DONE = "done"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PcaBlock:
-    """A block of columns of the result."""
+    """A block of columns of the fitted whitening."""
 
     mean: Rows
     """(width,)"""
@@ -172,8 +180,10 @@ class PcaBlock:
 
 
 class PcaFit:
-    """Finds a whitening; `step` until `done`. The same for the same rows, whether or not it was
-    saved and resumed between two steps.
+    """Fits a PCA whitening: call `step` until `done`.
+
+    Deterministic: the same rows give the same whitening, whether or not the fit was saved and
+    resumed between two steps.
     """
 
     def __init__(self, rows: ColumnSource, kept: int) -> None:
@@ -184,13 +194,13 @@ class PcaFit:
         self._blocks = block_count(rows)
         self.stage = PcaFitStage.PRODUCTS
         self._block = 0
-        """Blocks of columns that the stage has seen."""
-        # Of rows (XX') or of columns (X'X), whichever are fewer.
+        """Blocks of columns done in the current stage."""
+        # The smaller one of XX' (rows) and X'X (columns).
         self._by_columns = rows.count > rows.dimension and self._blocks == 1
         size = rows.dimension if self._by_columns else rows.count
         self._products: Matrix = np.zeros((size, size))
         self._basis: Matrix = np.empty((size, 0))
-        """What a centred block is multiplied with for its directions."""
+        """Multiplied with a centred block, it gives the block's directions."""
         self._variances: Matrix = np.empty(0)
         self._total = 0.0
 
@@ -200,26 +210,30 @@ class PcaFit:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Steps done, and all of them."""
-        before = {
+        """Steps done, and the total."""
+        steps_before = {
             PcaFitStage.PRODUCTS: 0,
             PcaFitStage.VARIANCES: 0,
             PcaFitStage.DIRECTIONS: self._blocks + 1,
         }
-        most = 2 * self._blocks + 1
-        return (most if self.done else before[self.stage] + self._block), most
+        total = 2 * self._blocks + 1
+        return (total if self.done else steps_before[self.stage] + self._block), total
 
     @property
     def parts(self) -> int:
-        """Blocks of the result that there are."""
+        """Number of blocks of the result returned so far."""
         if self.done:
             return self._blocks
         return self._block if self.stage == PcaFitStage.DIRECTIONS else 0
 
     def step(self) -> PcaBlock | None:
-        """A block of columns, or the variances; of the last stage, what came of the block.
+        """Process one block of columns, or compute the variances.
 
-        Unprocessable (`pca_too_many_dimensions`) when the rows vary in too few directions.
+        Returns:
+            In the stage DIRECTIONS a block of the result, else None.
+
+        Raises:
+            Unprocessable: `pca_too_many_dimensions` if the rows vary in too few directions.
         """
         if self.stage == PcaFitStage.VARIANCES:
             self._find_variances()
@@ -229,8 +243,8 @@ class PcaFit:
         if self.stage == PcaFitStage.PRODUCTS:
             self._products += block.T @ block if self._by_columns else block @ block.T
         else:
-            found = self._basis.T if self._by_columns else self._basis.T @ block
-            part = PcaBlock(mean.astype(np.float32), found.astype(np.float32))
+            directions = self._basis.T if self._by_columns else self._basis.T @ block
+            part = PcaBlock(mean.astype(np.float32), directions.astype(np.float32))
         self._block += 1
         if self._block == self._blocks:
             if self.stage == PcaFitStage.DIRECTIONS:
@@ -240,7 +254,7 @@ class PcaFit:
         return part
 
     def whitening(self, parts: Sequence[PcaBlock]) -> PcaWhitening:
-        """What the parts of a fit that is done come to, in their order."""
+        """Join the blocks of a completed fit, in the order in which `step` returned them."""
         assert self.done
         directions = np.concatenate([part.directions for part in parts], axis=1)
         return PcaWhitening(
@@ -262,10 +276,10 @@ class PcaFit:
         self._products = np.empty((0, 0))
         self.stage, self._block = PcaFitStage.DIRECTIONS, 0
 
-    # --- between two steps ---------------------------------------------------------------------
+    # --- checkpointing -------------------------------------------------------------------------
 
     def save(self) -> bytes:
-        """All that `resume` needs beside the same rows and the parts that there are."""
+        """Encode the state; `resume` also needs the same rows, and the result the same blocks."""
         arrays: dict[str, Any] = {
             "stage": np.array(str(self.stage)),
             "block": np.array(self._block),
@@ -279,7 +293,7 @@ class PcaFit:
         return buffer.getvalue()
 
     def resume(self, data: bytes) -> None:
-        """Go on where a fit of the same rows was saved."""
+        """Restore a state saved by a fit of the same rows."""
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
             self.stage = PcaFitStage(str(saved["stage"]))
             self._block = int(saved["block"])
@@ -288,24 +302,27 @@ class PcaFit:
 
 
 def check_pca_fittable(rows: int, dimension: int, kept: int) -> None:
-    """Unprocessable: `pca_too_few_rows` unless there are more than `kept`;
-    `pca_too_many_dimensions` when they have fewer dimensions.
+    """Check that `rows` rows of `dimension` dimensions can be projected to `kept`.
+
+    Raises:
+        Unprocessable: `pca_too_many_dimensions` if `kept` exceeds `dimension`; `pca_too_few_rows`
+            unless there are more than `kept` rows.
     """
     if kept > dimension:
         raise Unprocessable(
             "pca_too_many_dimensions",
-            f"Descriptors of {dimension} dimensions can't be brought to {kept}. Take fewer.",
+            f"Descriptors of {dimension} dimensions can't be projected to {kept}. Use fewer.",
         )
     if rows <= kept:
         raise Unprocessable(
             "pca_too_few_rows",
-            f"PCA to {kept} dimensions needs more than {kept} described photos, better several "
-            f"times as many, and there are {rows}. Index more photos, or take fewer dimensions.",
+            f"PCA to {kept} dimensions needs more than {kept} described photos, preferably several "
+            f"times as many, but there are {rows}. Index more photos, or use fewer dimensions.",
         )
 
 
 def fit_pca(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhitening:
-    """The whitening of (n, D) rows, which may be mapped from a file, to `kept` dimensions.
+    """Fit a whitening of (n, D) rows, which may be memory-mapped, to `kept` dimensions.
 
     Raises as `PcaFit` does.
     """
@@ -313,51 +330,55 @@ def fit_pca(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhit
 
 
 def fit_pca_columns(
-    rows: ColumnSource, kept: int, on_progress: Callable[[int, int], None] = lambda done, most: None
+    rows: ColumnSource,
+    kept: int,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> PcaWhitening:
-    """The whitening of rows to `kept` dimensions in one go; `on_progress` hears how many steps
-    are done,
-    and of how many."""
-    finding = PcaFit(rows, kept)
+    """Fit a whitening of rows to `kept` dimensions.
+
+    `on_progress` is called with the steps done and the total. Raises as `PcaFit` does.
+    """
+    fit = PcaFit(rows, kept)
     parts = []
-    while not finding.done:
-        part = finding.step()
+    while not fit.done:
+        part = fit.step()
         if part is not None:
             parts.append(part)
-        on_progress(*finding.progress)
-    return finding.whitening(parts)
+        on_progress(*fit.progress)
+    return fit.whitening(parts)
 
 
 def _largest_eigenpairs(matrix: Matrix, kept: int) -> tuple[Matrix, Matrix]:
-    """The `kept` largest eigenvalues, largest first, and their (N, kept) unit eigenvectors."""
+    """Return the `kept` largest eigenvalues, largest first, and (N, kept) unit eigenvectors."""
     values, vectors = np.linalg.eigh(matrix)
     values, vectors = values[::-1][:kept], vectors[:, ::-1][:, :kept]
     usable = int((values > MIN_VARIANCE * max(values[0], 0)).sum())
     if usable < kept:
         raise Unprocessable(
             "pca_too_many_dimensions",
-            f"The described photos vary in {usable} directions only, and PCA to {kept} dimensions "
-            "needs as many. Index more different photos, or take fewer dimensions.",
+            f"The described photos vary in {usable} directions only, but PCA to {kept} dimensions "
+            f"needs {kept}. Index more varied photos, or use fewer dimensions.",
         )
     return values, vectors
 
 
 def _centred(block: Rows) -> tuple[Matrix, Matrix]:
-    """The columns without their means, in float64, and the means."""
-    wide = block.astype(np.float64)
-    means: Matrix = wide.mean(axis=0)
-    wide -= means
-    return wide, means
+    """Return the centred columns and their means, in float64."""
+    centred = block.astype(np.float64)
+    means: Matrix = centred.mean(axis=0)
+    centred -= means
+    return centred, means
 
 
 def _with_fixed_signs(directions: Rows) -> Rows:
-    """Of two opposite directions the one whose strongest number is positive: the same everywhere,
-    whichever way the eigenvectors came. (kept, D), C order.
+    """Flip directions (kept, D) so that the element of largest magnitude is positive.
+
+    Eigenvectors have an arbitrary sign; this makes the result deterministic. C order.
     """
     fixed = np.ascontiguousarray(directions)
     for direction in fixed:
         if direction[np.abs(direction).argmax()] < 0:
-            # Not np.negative in place: NumPy 2.4 does it wrong where rows are strided by 16 bytes.
+            # Not np.negative in place: wrong in NumPy 2.4 for rows with a stride of 16 bytes.
             direction *= -1
     return fixed
 
@@ -370,12 +391,19 @@ def fit_pca_stream(
     max_rows: int,
     dimension: int,
     kept: int,
-    on_progress: Callable[[str, int, int], None] = lambda what, done, max_rows: None,
+    on_progress: Callable[[str, int, int], None] = lambda stage, done, max_rows: None,
 ) -> PcaWhitening:
-    """The whitening to `kept` dimensions of at most `max_rows` rows, in batches of (n, dimension).
+    """Fit a whitening to batches of rows, which are stored in a temporary folder meanwhile.
 
-    Rows that say nothing of their photo are passed over. `on_progress` hears what is being done
-    (`gathering`, `reducing`), how far it is and where it ends. Raises as `PcaFit` does.
+    Args:
+        batches: (n, dimension) rows; rows that are zero or not finite are skipped.
+        max_rows: Maximum number of rows in all batches.
+        dimension: Number of columns.
+        kept: Number of dimensions after the projection.
+        on_progress: Called with the stage (`gathering`, `reducing`), the rows or steps done and
+            the total.
+
+    Raises as `PcaFit` does.
     """
     with tempfile.TemporaryDirectory(prefix="placewise-pca-") as folder:
         store = FolderStore(Path(folder))

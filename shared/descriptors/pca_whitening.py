@@ -1,18 +1,16 @@
-"""PCA whitening: descriptors made short, and equally strong in all their directions.
+"""PCA whitening of descriptors: projection, file format and validation.
 
 As in Jegou and Chum (Negative evidences and co-occurrences in image retrieval, ECCV 2012), and as
-AnyLoc's PCA rows (RA-L 2023: whitened, then L2-normalised again). Of n database rows x_i with mean
-m, centred to X (n x D), and of the d largest variances l_1 >= ... >= l_d of their covariance
-X'X / (n - 1) with the unit directions p_j:
+AnyLoc's PCA rows (RA-L 2023: whitened, then L2-normalised again). For n database rows x_i with mean
+m, centred to X (n x D), with the d largest variances l_1 >= ... >= l_d of their covariance
+X'X / (n - 1) and the unit directions p_j:
 
     y_j = <p_j, x - m> / sqrt(l_j)          row = y / |y|
 
-`shared.descriptors.pca_fit` finds mean and directions.
+`shared.descriptors.pca_fit` computes mean and directions.
 
-Files of PCA whitenings: safetensors, checked before they spoil a descriptor.
-
-The header's `__metadata__` may hold `spec`, a string of JSON: how the rows were described that it
-was fitted on (`Extractor.spec`).
+Files are safetensors. `spec` in the header's `__metadata__`, a string of JSON, is the extractor
+spec (`Extractor.spec`) of the rows that the whitening was fitted on. It is optional.
 """
 
 from __future__ import annotations
@@ -34,18 +32,18 @@ Rows = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PcaWhitening:
-    """A fitted projection."""
+    """A fitted PCA whitening from D to d dimensions."""
 
     mean: NDArray[np.float32]
-    """(D,)"""
+    """(D,) mean of the rows."""
     directions: NDArray[np.float32]
     """(d, D): each unit direction divided by its standard deviation."""
     variances: NDArray[np.float32]
-    """(d,) of the rows along the directions, largest first."""
+    """(d,) variances of the rows along the directions, largest first."""
     explained: float
-    """The share of the rows' whole variance that lies along them, 0 to 1."""
+    """Explained variance ratio of all d directions together, 0 to 1."""
     rows: int
-    """How many it was fitted on."""
+    """Number of rows that it was fitted on."""
 
     @property
     def dimension(self) -> int:
@@ -59,14 +57,14 @@ class PcaWhitening:
 
     @property
     def sha256(self) -> str:
-        """Of what decides a projected descriptor's value."""
+        """Hash of the mean and the directions, which determine the projection."""
         digest = hashlib.sha256(np.ascontiguousarray(self.mean).data)
         digest.update(np.ascontiguousarray(self.directions).data)
         return digest.hexdigest()
 
 
 class PcaProjection:
-    """A whitening on a device, at work."""
+    """Applies a whitening on a device."""
 
     def __init__(self, whitening: PcaWhitening, device: torch.device) -> None:
         self.dimension = whitening.dimension
@@ -79,63 +77,68 @@ class PcaProjection:
 
     @torch.inference_mode()
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
-        """(B, dimension) float32 rows on the device -> (B, kept) unit rows.
+        """Project (B, dimension) float32 rows on the device to (B, kept) unit rows.
 
-        A row of zeros, a photo in which there is nothing to describe, stays zero: as it was like no
-        other photo, it is not to be like those that share its distance to the mean. The mean
-        itself has no direction and becomes zero, too.
+        A zero row (a photo without structure) stays zero: it was similar to no photo, and must not
+        become similar to rows at the same distance from the mean. A row equal to the mean becomes
+        zero, too.
         """
         whitened = normalize((rows - self._mean) @ self._directions.T, dim=-1)
         return torch.where(rows.any(dim=-1, keepdim=True), whitened, 0)
 
     def project(self, rows: Rows) -> Rows:
-        """The same of stored rows."""
+        """Project NumPy rows, as `__call__` does."""
         projected: Rows = self(_tensor(rows).to(self._mean.device)).cpu().numpy()
         return projected
 
 
 def _tensor(array: Rows) -> torch.Tensor:
-    # What lies in a file's bytes is read-only, and torch wants none of that.
+    # Arrays over a file's bytes are read-only, which torch does not support.
     return torch.from_numpy(np.require(array, requirements=["C", "W"]))
 
 
 TENSOR_NAMES = ("mean", "directions", "variances", "explained", "rows")
 
-# What changes a descriptor by its last bits alone: a whitening outlives it.
+# Fields that change only the last bits of a descriptor; a whitening stays valid.
 IGNORED_SPEC_FIELDS = ("decoder", "precision")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PcaWhiteningFile:
+    """A whitening with the extractor spec of the rows that it was fitted on."""
+
     whitening: PcaWhitening
     spec: dict[str, Any] | None
-    """Of the rows that it was fitted on; None where that is unknown."""
+    """Extractor spec of those rows; None if unknown."""
 
     def encode(self) -> bytes:
-        """The bytes of a `.safetensors` file."""
+        """Encode as a `.safetensors` file."""
         from safetensors.numpy import save
 
-        found = self.whitening
+        whitening = self.whitening
         return save(
             {
-                "mean": np.ascontiguousarray(found.mean),
-                "directions": np.ascontiguousarray(found.directions),
-                "variances": np.ascontiguousarray(found.variances),
-                "explained": np.array([found.explained], dtype=np.float64),
-                "rows": np.array([found.rows], dtype=np.int64),
+                "mean": np.ascontiguousarray(whitening.mean),
+                "directions": np.ascontiguousarray(whitening.directions),
+                "variances": np.ascontiguousarray(whitening.variances),
+                "explained": np.array([whitening.explained], dtype=np.float64),
+                "rows": np.array([whitening.rows], dtype=np.int64),
             },
             None if self.spec is None else {"spec": json.dumps(self.spec, sort_keys=True)},
         )
 
     def check_compatible(self, spec: dict[str, Any]) -> None:
-        """Unprocessable (`pca_unfit`) naming what differs unless descriptors of `spec`, which are
-        not projected yet, are like the rows that it was fitted on. Of unknown rows only the
-        dimension can be compared.
+        """Check that the whitening was fitted on descriptors of the extractor spec `spec`.
+
+        `spec` is that of descriptors before projection. If the spec of the fitted rows is unknown,
+        only the dimension is compared.
+
+        Raises Unprocessable (`pca_unfit`) naming the differences.
         """
         if self.whitening.dimension != spec["dimension"]:
             raise _pca_unfit_error(
-                f"it is for descriptors of {self.whitening.dimension} dimensions, and these have "
-                f"{spec['dimension']}"
+                f"it projects descriptors of {self.whitening.dimension} dimensions, but these "
+                f"have {spec['dimension']}"
             )
         if self.spec is None:
             return
@@ -149,7 +152,10 @@ class PcaWhiteningFile:
 
 
 def decode_whitening(data: bytes) -> PcaWhiteningFile:
-    """The whitening in such bytes; Unprocessable (`pca_unfit`) says what is wrong with it."""
+    """Decode and validate a PCA file.
+
+    Raises Unprocessable (`pca_unfit`) with the reason.
+    """
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -157,13 +163,13 @@ def decode_whitening(data: bytes) -> PcaWhiteningFile:
         stored = load(data)
     except SafetensorError as error:
         raise _pca_unfit_error(
-            f"it is no safetensors file, or not a whole one ({error})"
+            f"it is not a safetensors file, or it is truncated ({error})"
         ) from error
     return PcaWhiteningFile(_whitening(stored), _spec(data))
 
 
 def _spec(data: bytes) -> dict[str, Any] | None:
-    """That of the header, which is known to be whole; None where there is none."""
+    """Return the spec of a valid file's header; None if it has none."""
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     text = header.get("__metadata__", {}).get("spec")
     if text is None:
@@ -171,9 +177,9 @@ def _spec(data: bytes) -> dict[str, Any] | None:
     try:
         spec = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _pca_unfit_error(f"the spec in it can't be read ({error})") from error
+        raise _pca_unfit_error(f"its spec can't be read ({error})") from error
     if not isinstance(spec, dict):
-        raise _pca_unfit_error("the spec in it is none")
+        raise _pca_unfit_error("its spec is not a JSON object")
     return spec
 
 
@@ -186,17 +192,17 @@ def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
     if directions.ndim != 2 or shapes != (directions.shape[1:], directions.shape[:1]):
         raise _pca_unfit_error(
             f"its mean {mean.shape}, directions {directions.shape} and variances "
-            f"{variances.shape} do not belong together: (D,), (d, D) and (d,) are expected"
+            f"{variances.shape} do not match: (D,), (d, D) and (d,) are expected"
         )
-    kept, made_for = directions.shape
-    if not 0 < kept <= made_for:
-        raise _pca_unfit_error(f"it makes {kept} dimensions of {made_for}")
+    kept, dimension = directions.shape
+    if not 0 < kept <= dimension:
+        raise _pca_unfit_error(f"it projects {dimension} dimensions to {kept}")
     if not (variances > 0).all():
         raise _pca_unfit_error("a variance is not positive")
-    # A unit direction divided by its standard deviation, as far as float32 goes.
+    # Unit directions divided by their standard deviation, within the precision of float32.
     lengths = np.linalg.norm(directions, axis=1) * np.sqrt(variances)
     if not np.allclose(lengths, 1.0, rtol=0.01):
-        raise _pca_unfit_error("its directions are not those of its variances")
+        raise _pca_unfit_error("its directions do not match its variances")
     try:
         return PcaWhitening(
             mean,
@@ -206,7 +212,7 @@ def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
             rows=int(stored["rows"].item()),
         )
     except ValueError as error:
-        raise _pca_unfit_error(f"explained and rows are one number each ({error})") from error
+        raise _pca_unfit_error(f"explained and rows must be one number each ({error})") from error
 
 
 def _floats(stored: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:

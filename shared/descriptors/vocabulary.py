@@ -1,4 +1,8 @@
-"""Cluster centres: reading them, and refusing what would silently spoil every descriptor."""
+"""Cluster centres of VLAD vocabularies: encoding, decoding and validation.
+
+Centres that are zero, duplicate or not finite are rejected: they would spoil every descriptor
+without an error.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
 
-# What reading raises for bytes that are no array, or whose header promises an impossible one.
+# Raised by NumPy for bytes that are not an array, or whose header declares an impossible one.
 ARRAY_READ_ERRORS = (
     ValueError,
     TypeError,
@@ -48,63 +52,72 @@ class ClusterCentres:
 
 
 def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> ClusterCentres:
-    """The array as centres; Unprocessable (`vocabulary_unfit`) says what is wrong with it.
+    """Validate an array as cluster centres.
 
-    `width` is the length of the local features that they are meant for.
+    Args:
+        array: (clusters, dimension) of floating point numbers.
+        width: The length of the local features that the centres are used with; None skips the
+            check.
+
+    Raises:
+        Unprocessable: `vocabulary_unfit`, with the reason.
     """
 
-    def refuse(reason: str) -> Unprocessable:
+    def unfit(reason: str) -> Unprocessable:
         return Unprocessable("vocabulary_unfit", f"This is not a usable vocabulary: {reason}.")
 
     if array.ndim != 2 or 0 in array.shape:
-        raise refuse(f"its shape is {array.shape}, not (clusters, dimension)")
+        raise unfit(f"its shape is {array.shape}, not (clusters, dimension)")
     if array.dtype.kind != "f":
-        raise refuse(f"its numbers are {array.dtype}, not floating point")
-    with np.errstate(over="ignore"):  # what float32 can't hold is infinite, and refused below
+        raise unfit(f"its numbers are {array.dtype}, not floating point")
+    with np.errstate(over="ignore"):  # overflow becomes infinite and is rejected below
         array = np.ascontiguousarray(array, dtype=np.float32)
     if width is not None and array.shape[1] != width:
-        raise refuse(
+        raise unfit(
             f"its centres have {array.shape[1]} dimensions, the extractor's local features {width}"
         )
     if not np.isfinite(array).all():
-        raise refuse("it holds NaN or infinite numbers")
+        raise unfit("it holds NaN or infinite numbers")
     zero = np.flatnonzero(np.linalg.norm(array, axis=1) < 1e-6)
     if len(zero):
-        raise refuse(f"centre {int(zero[0])} is zero")
+        raise unfit(f"centre {int(zero[0])} is zero")
     distinct = len(np.unique(array, axis=0))
     if distinct != len(array):
-        raise refuse(f"only {distinct} of its {len(array)} centres are distinct")
+        raise unfit(f"only {distinct} of its {len(array)} centres are distinct")
     return ClusterCentres(array, hashlib.sha256(array.tobytes()).hexdigest())
 
 
 def encode_centres(centres: ClusterCentres) -> bytes:
-    """The centres as the bytes of a `.npy` file."""
+    """Encode the centres as a `.npy` file."""
     return encode_array(centres.array)
 
 
 def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
-    """The centres in the bytes of a `.npy` file, checked."""
+    """Decode and validate the centres in the bytes of a `.npy` file.
+
+    Raises Unprocessable (`vocabulary_unfit`).
+    """
     try:
         array = decode_array(data)
     except ARRAY_READ_ERRORS as error:
         raise Unprocessable(
             "vocabulary_unfit",
-            "This is not a NumPy .npy file of cluster centres, or not a whole one.",
+            "This is not a NumPy .npy file of cluster centres, or it is truncated.",
         ) from error
     return parse_centres(array, width=width)
 
 
 def encode_array(array: NDArray[Any]) -> bytes:
-    """The array as the bytes of a `.npy` file."""
+    """Encode the array as a `.npy` file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
 def decode_array(data: bytes) -> NDArray[Any]:
-    """The array in the bytes of a `.npy` file; one of NO_ARRAY for anything else.
+    """Decode the array in the bytes of a `.npy` file; raises one of ARRAY_READ_ERRORS.
 
-    Nothing is unpickled, and no more is allocated than there are bytes.
+    Nothing is unpickled, and no more memory is allocated than there are bytes.
     """
     _check_array_size(data)
     array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
@@ -112,14 +125,14 @@ def decode_array(data: bytes) -> NDArray[Any]:
 
 
 def _check_array_size(data: bytes) -> None:
-    """ValueError when a `.npy` header promises other bytes than follow: none are allocated."""
+    """Raise ValueError if a `.npy` header declares another size than the data has."""
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)
-    read = (
+    read_header = (
         np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
     )
-    shape, _, dtype = read(buffer)
+    shape, _, dtype = read_header(buffer)
     if dtype.hasobject:
         raise Unprocessable("vocabulary_unfit", "This file holds pickled objects, not numbers.")
     if math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
-        raise ValueError("the header does not fit the data")
+        raise ValueError("the header does not match the size of the data")

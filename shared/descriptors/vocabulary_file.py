@@ -1,4 +1,4 @@
-"""Vocabularies as files that people keep and send.
+"""Vocabulary files for import and export, and the check that a vocabulary fits an extractor.
 
 - `.npz`, as `placewise vocabulary fit DIR --out` writes it: an uncompressed NumPy archive of
   `centres`, (clusters, dimension) float32, and `provenance`, one string of JSON.
@@ -6,11 +6,10 @@
 - `.npy`: the centres alone.
 - `.pt`: the centres alone, as one tensor: AnyLoc's `c_centers.pt`.
 
-Where a vocabulary comes from, and whether an extractor may use it.
-
-Cosines between local features and centres mean something only where both come from the same
-network, layer, facet and pixels: a vocabulary of the same width but other features would be
-accepted by every shape check, and quietly spoil every descriptor.
+The provenance names the backbone, weights, layer, facet and preprocessing of the local features
+that a vocabulary was fitted on. Cosines between local features and centres are meaningful only if
+all of these agree; a shape check would accept a vocabulary of the same width but of other features,
+and every descriptor would be wrong.
 """
 
 from __future__ import annotations
@@ -37,15 +36,14 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.storage.vocabulary_npz import CENTRES, PROVENANCE, encode_vocabulary_npz, has_provenance
 
 Provenance = dict[str, Any]
-"""JSON: what `feature_provenance` says, and of a fit `fit_provenance`. Without the former the
-vocabulary is of
-unknown origin, and `learnt_with` says `unknown`."""
+"""JSON: the fields of `feature_provenance` and, after a fit, those of `fit_provenance`. For a
+vocabulary of unknown origin it is UNKNOWN_PROVENANCE."""
 
 UNKNOWN_PROVENANCE: Provenance = {"learnt_with": "unknown"}
 
 
 def feature_provenance(extractor: Extractor) -> Provenance:
-    """What makes the local features that centres are learnt from."""
+    """Return the provenance of the extractor's local features."""
     backbone = extractor.backbone
     return {
         "backbone": backbone.name,
@@ -65,7 +63,10 @@ def fit_provenance(
     photos: int,
     seed: int,
 ) -> Provenance:
-    """How `centres` were learnt; `photos` were looked at."""
+    """Return the provenance of a fit: the features', its arguments and its results.
+
+    `photos` is the number of photos that the fit has read.
+    """
     return {
         **feature_provenance(extractor),
         "clusters": centres.clusters,
@@ -82,24 +83,27 @@ def fit_provenance(
 def check_vocabulary_fits(
     provenance: Provenance, centres: ClusterCentres, extractor: Extractor
 ) -> None:
-    """Unprocessable (`vocabulary_unfit`) naming both specs unless the vocabulary was learnt from
-    what the extractor makes. One of unknown origin only has to be as wide.
+    """Check that the vocabulary was fitted on the extractor's local features.
+
+    A vocabulary of unknown origin only needs the same width.
+
+    Raises Unprocessable (`vocabulary_unfit`) naming both specs.
     """
     if not extractor.recipe.needs_vocabulary:
         raise Unprocessable(
             "vocabulary_unfit", f"The extractor {extractor.recipe.name} uses no vocabulary."
         )
-    made = feature_provenance(extractor)
+    computed = feature_provenance(extractor)
     if has_provenance(provenance):
-        learnt = {key: provenance.get(key) for key in made}
-        if learnt != made:
+        fitted_on = {key: provenance.get(key) for key in computed}
+        if fitted_on != computed:
             raise Unprocessable(
                 "vocabulary_unfit",
-                f"The vocabulary was learnt from {_describe_features(learnt)}; the extractor "
-                f"{extractor.recipe.name} makes {_describe_features(made)}. Fit one with "
-                "this extractor.",
-                learnt_with=learnt,
-                extractor_makes=made,
+                f"The vocabulary was fitted on {_describe_features(fitted_on)}; the extractor "
+                f"{extractor.recipe.name} computes {_describe_features(computed)}. Fit a "
+                "vocabulary with this extractor.",
+                learnt_with=fitted_on,
+                extractor_makes=computed,
             )
     check_vocabulary_width(centres, extractor.recipe, extractor.backbone.width)
 
@@ -107,8 +111,12 @@ def check_vocabulary_fits(
 def check_vocabulary_width(
     centres: ClusterCentres, recipe: ExtractorConfig, width: int | None
 ) -> None:
-    """Unprocessable (`vocabulary_unfit`) unless the centres are as wide as the recipe's local
-    features; None: only the loaded network tells."""
+    """Check that the centres have the width of the recipe's local features.
+
+    `width` None skips the check: the width is known only after the network is loaded.
+
+    Raises Unprocessable (`vocabulary_unfit`).
+    """
     if width is not None and centres.dimension != width:
         raise Unprocessable(
             "vocabulary_unfit",
@@ -136,22 +144,24 @@ MAX_PROVENANCE_BYTES = 100_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VocabularyFile:
+    """Cluster centres with their provenance."""
+
     centres: ClusterCentres
     provenance: Provenance
 
     @property
     def suffix(self) -> str:
-        """`.npz`; `.npy` where the provenance is unknown."""
+        """The file's suffix: `.npz`, or `.npy` if the provenance is unknown."""
         return ".npz" if has_provenance(self.provenance) else ".npy"
 
     def encode(self) -> bytes:
-        """The bytes of a file of that kind."""
+        """Encode as a file with the suffix `suffix`."""
         centres = encode_centres(self.centres)
         return centres if self.suffix == ".npy" else encode_vocabulary_npz(centres, self.provenance)
 
 
 def decode_vocabulary(data: bytes) -> VocabularyFile:
-    """The vocabulary in the bytes of a `.npz` or `.npy` file, checked.
+    """Decode and validate the bytes of a `.npz` or `.npy` file.
 
     Raises Unprocessable (`vocabulary_unfit`).
     """
@@ -160,10 +170,10 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             infos = archive.infolist()
-            # Before one is read: many may lie over the same bytes.
+            # Checked before reading: many members may overlap in the same bytes.
             if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
                 raise _vocabulary_unfit_error(
-                    f"it holds {_some([info.filename for info in infos]) or 'nothing'}"
+                    f"it holds {_join_some([info.filename for info in infos]) or 'nothing'}"
                 )
             members = {info.filename: _read(archive, info) for info in infos}
     except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
@@ -176,7 +186,10 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
 
 
 def read_vocabulary(path: Path) -> VocabularyFile:
-    """The vocabulary in a `.npz`, `.npy` or `.pt` file, checked; Unprocessable as above."""
+    """Read and validate a `.npz`, `.npy` or `.pt` file.
+
+    Raises Unprocessable (`vocabulary_unfit`).
+    """
     if path.suffix != ".pt":
         return decode_vocabulary(path.read_bytes())
     return VocabularyFile(_read_tensor(path), UNKNOWN_PROVENANCE)
@@ -184,7 +197,7 @@ def read_vocabulary(path: Path) -> VocabularyFile:
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-        raise ValueError(f"{info.filename} is compressed")  # it could swell without end
+        raise ValueError(f"{info.filename} is compressed")  # decompression has no size limit
     return archive.read(info)
 
 
@@ -194,15 +207,15 @@ def _decode_provenance(data: bytes) -> Provenance:
     try:
         array = decode_array(data)
         text = array.item() if array.dtype.kind == "U" and array.size == 1 else ""
-        found: Any = json.loads(text)
+        provenance: Any = json.loads(text)
     except (*ARRAY_READ_ERRORS, RecursionError) as error:
         raise _vocabulary_unfit_error(f"its provenance can't be read ({error})") from error
-    if not isinstance(found, dict) or not has_provenance(found):
-        raise _vocabulary_unfit_error("its provenance does not say what it was learnt with")
-    return found
+    if not isinstance(provenance, dict) or not has_provenance(provenance):
+        raise _vocabulary_unfit_error("its provenance does not name the features it was fitted on")
+    return provenance
 
 
-def _some(names: list[str]) -> str:
+def _join_some(names: list[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(sorted(names)[:3]) + more
 
@@ -210,7 +223,7 @@ def _some(names: list[str]) -> str:
 def _vocabulary_unfit_error(reason: str) -> Unprocessable:
     return Unprocessable(
         "vocabulary_unfit",
-        f"This .npz is not a vocabulary as `placewise vocabulary fit DIR --out` writes it: "
+        f"This .npz is not a vocabulary file as written by `placewise vocabulary fit DIR --out`: "
         f"{reason}.",
     )
 
@@ -218,22 +231,27 @@ def _vocabulary_unfit_error(reason: str) -> Unprocessable:
 def _read_tensor(path: Path) -> ClusterCentres:
     import torch
 
-    from shared.descriptors.weight_files import TENSOR_READ_ERRORS, check_promise, load_tensors
+    from shared.descriptors.weight_files import (
+        TENSOR_READ_ERRORS,
+        check_declared_size,
+        load_tensors,
+    )
 
     try:
         tensor = load_tensors(path)
         if isinstance(tensor, torch.Tensor):
-            check_promise([tensor], path)
+            check_declared_size([tensor], path)
     except TENSOR_READ_ERRORS as error:
         raise Unprocessable(
-            "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
+            "vocabulary_unfit", f"{path.name} is not a PyTorch tensor file: {error}"
         ) from error
     if not isinstance(tensor, torch.Tensor):
         raise Unprocessable(
             "vocabulary_unfit",
-            f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
+            f"{path.name} holds a {type(tensor).__name__}, expected one tensor.",
         )
-    tensor = tensor.detach().to_dense().clone()  # else mapped from the file, which may change
+    # Copied: it is mapped from the file, which may change.
+    tensor = tensor.detach().to_dense().clone()
     if tensor.is_floating_point():
         tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
     return parse_centres(tensor.numpy())

@@ -1,14 +1,14 @@
-"""A fit: from patches to centres, in steps that can be interrupted between any two.
+"""Vocabulary fit: k-means from sampled patches to centres, in resumable steps.
 
-1. k-means++ on the first patches: a uniform sample, as the photos come in a random order.
-2. Mini-batch passes, each over all patches in batches of another order. Each pass counts anew, so
-   that centres forget what was assigned to where they were long ago: ten such passes describe
+1. k-means++ on the first patches, which are a uniform sample, as the photos come in random order.
+2. Mini-batch passes, each over all patches in batches of another order. The counts restart with
+   each pass, so that centres do not keep the weight of early assignments: ten such passes describe
    patches as well as a hundred of Lloyd's (`benchmarks/RESULTS.md`).
-3. Lloyd's passes, until the centres have settled: each is then the mean of its patches.
+3. Lloyd's passes, until the centres converge: each is then the mean of its patches.
 
-What is kept in memory: one batch, the sample for k-means++, and a few arrays of the centres' size.
-
-Points that are read piece by piece, and the batches that passes over them are made of.
+Memory holds one block of points, the sample for k-means++, and a few arrays of the centres' size. A
+fit can be saved and resumed between any two steps. scikit-learn's MiniBatchKMeans assigns points by
+Euclidean distance; VLAD assigns them by cosine.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 from shared.descriptors.vocabulary import ClusterCentres, parse_centres
 from shared.errors import Unprocessable
 
-BLOCK_BYTES = 16_000_000  # read at once: a store on another machine is slow for each batch alone
+BLOCK_BYTES = 16_000_000  # read at once: one request per batch is slow on a remote object store
 
 
 class PointSource(Protocol):
-    """(n, D) float32 unit vectors."""
+    """(n, D) float32 unit vectors that can be read in ranges."""
 
     width: int
     """D"""
@@ -38,14 +38,14 @@ class PointSource(Protocol):
     def __len__(self) -> int: ...
 
     def read(self, begin: int, end: int) -> torch.Tensor:
-        """(end - begin, D) on the CPU."""
+        """Return rows [begin, end) on the CPU."""
 
 
 class InMemoryPoints:
-    """Points that are few enough to be held."""
+    """A PointSource in memory."""
 
     def __init__(self, points: torch.Tensor) -> None:
-        """(n, D) float32 on the CPU."""
+        """`points`: (n, D) float32 on the CPU."""
         self._points = points
         self.width = points.shape[1]
 
@@ -57,21 +57,24 @@ class InMemoryPoints:
 
 
 class PointBatches:
-    """Points in batches of about equal size. Neighbours lie in one block, which is held."""
+    """Points in batches of about equal size, read in blocks of several batches.
+
+    The last block is cached.
+    """
 
     def __init__(self, points: PointSource, rows: int) -> None:
-        """`rows` are wanted in a batch."""
+        """`rows`: the target batch size."""
         self._points = points
         count = max(1, round(len(points) / rows))
         self._edges = np.linspace(0, len(points), count + 1).round().astype(np.int64).tolist()
         self._per_block = max(1, BLOCK_BYTES // (rows * points.width * 4))
-        self._held: tuple[int, torch.Tensor] | None = None
+        self._cached: tuple[int, torch.Tensor] | None = None
 
     def __len__(self) -> int:
         return len(self._edges) - 1
 
     def shuffled(self, seed: list[int]) -> list[int]:
-        """The batches in a random order that reads each block once."""
+        """Return the batch numbers in a random order that reads each block once."""
         rng = np.random.default_rng(seed)
         starts = np.arange(0, len(self), self._per_block)
         order: list[int] = []
@@ -80,40 +83,42 @@ class PointBatches:
         return order
 
     def read(self, batch: int) -> torch.Tensor:
-        """(n, D) points of the batch of this number."""
+        """Return the (n, D) points of a batch, by its number."""
         first = batch - batch % self._per_block
-        if self._held is None or self._held[0] != first:
+        if self._cached is None or self._cached[0] != first:
             begin, end = self._edges[first], self._edges[self._end_of_block(first)]
-            self._held = None  # not two at a time
-            self._held = first, self._points.read(begin, end)
+            self._cached = None  # released first, to hold one block at a time
+            self._cached = first, self._points.read(begin, end)
         begin = self._edges[first]
-        return self._held[1][self._edges[batch] - begin : self._edges[batch + 1] - begin]
+        return self._cached[1][self._edges[batch] - begin : self._edges[batch + 1] - begin]
 
     def _end_of_block(self, first: int) -> int:
         return min(first + self._per_block, len(self))
 
 
-PATCHES_PER_CLUSTER = 50  # fewer, and a centre is an accident of the sample
-SEEDING_BYTES = 16_000_000  # of patches for k-means++, which looks at all of them for each centre
-SEEDING_PER_CLUSTER = 32  # or so many for each centre, where that is more
+PATCHES_PER_CLUSTER = 50  # with fewer, a centre depends on single patches of the sample
+SEEDING_BYTES = 16_000_000  # of patches for k-means++, which reads all of them for each centre
+SEEDING_PER_CLUSTER = 32  # minimum of patches per centre for k-means++
 BATCH_PATCHES = 1024
-BATCH_PER_CLUSTER = 16  # or so many for each centre, where that is more
-TOLERANCE = 1e-4  # sum of squared movements of all centres at which they have settled
+BATCH_PER_CLUSTER = 16  # minimum of patches per centre in a batch
+TOLERANCE = 1e-4  # convergence: sum of the squared movements of all centres
 
 
 @dataclass(frozen=True, slots=True)
 class FitEffort:
-    """How long a fit tries."""
+    """Numbers of passes of a fit."""
 
     mini_batch_passes: int = 10
     settling_passes: int = 10
-    """At most."""
+    """Maximum of Lloyd's passes."""
 
 
 DEFAULT_EFFORT = FitEffort()
 
 
 class VocabularyFitStage(StrEnum):
+    """The stages of a fit, in their order."""
+
     SEED = "seed"
     MINI_BATCH = "mini-batch"
     SETTLE = "settle"
@@ -121,8 +126,10 @@ class VocabularyFitStage(StrEnum):
 
 
 class VocabularyFit:
-    """Finds K centres for points; `step` until `done`. The same for the same points and seed,
-    whether or not it was saved and resumed between two steps.
+    """Fits K centres to points: call `step` until `done`.
+
+    Deterministic: the same points and seed give the same centres, whether or not the fit was saved
+    and resumed between two steps.
     """
 
     def __init__(
@@ -132,15 +139,22 @@ class VocabularyFit:
         seed: int,
         effort: FitEffort = DEFAULT_EFFORT,
     ) -> None:
-        """`clusters` are asked for; so few points that a centre had less than
-        PATCHES_PER_CLUSTER of them bear fewer.
+        """Prepare a fit.
 
-        Raises Unprocessable (`no_photos`) where there are no points.
+        Args:
+            points: The points to fit on.
+            clusters: Requested number of centres, reduced so that each has at least
+                PATCHES_PER_CLUSTER points.
+            seed: Seed of k-means++ and of the batches' order.
+            effort: Numbers of passes.
+
+        Raises:
+            Unprocessable: `no_photos` if there are no points.
         """
         if not len(points):
             raise Unprocessable(
                 "no_photos",
-                "None of the photos to learn from could be decoded: nothing to learn.",
+                "None of the selected photos could be decoded, so there is nothing to fit on.",
             )
         self._points = points
         self.clusters = max(1, min(clusters, len(points) // PATCHES_PER_CLUSTER))
@@ -149,20 +163,20 @@ class VocabularyFit:
         self._batches = PointBatches(points, max(BATCH_PATCHES, BATCH_PER_CLUSTER * self.clusters))
         self.stage = VocabularyFitStage.SEED
         self.passes = 0
-        """Ended ones."""
+        """Completed passes."""
         self.similarity: float | None = None
-        """Mean cosine of the points to their centres, as the last pass saw it."""
+        """Mean cosine of the points to their centres in the last completed pass."""
         self._seeding: KMeansPlusPlus | None = None
         self._centres = torch.empty(0, points.width)
         self._pass = KMeansPass.begin(self._centres)
         self._batch = 0
-        """Batches that the pass has seen."""
+        """Batches done in the current pass."""
         self._order: list[int] = []
-        """Of the pass."""
+        """Batch numbers of the current pass, in their order."""
 
     @property
     def patches(self) -> int:
-        """Points that it learns from."""
+        """Number of points that the fit uses."""
         return len(self._points)
 
     @property
@@ -171,27 +185,27 @@ class VocabularyFit:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Steps done, and to be done at most."""
+        """Steps done, and the maximum of steps."""
         batches = len(self._batches)
         passes = self._effort.mini_batch_passes + self._effort.settling_passes
-        most = self.clusters + passes * batches
+        total = self.clusters + passes * batches
         if self.stage == VocabularyFitStage.SEED:
-            return (len(self._seeding.chosen) if self._seeding else 0), most
+            return (len(self._seeding.chosen) if self._seeding else 0), total
         if self.done:
-            return most, most
-        return self.clusters + self.passes * batches + self._batch, most
+            return total, total
+        return self.clusters + self.passes * batches + self._batch, total
 
     def step(self) -> None:
-        """One seed, or one batch of points: milliseconds."""
+        """Choose one seed, or process one batch of points; takes milliseconds."""
         if self.stage == VocabularyFitStage.SEED:
             self._choose_seed()
         else:
             self._update_centres()
 
     def centres(self) -> ClusterCentres:
-        """The centres of a fit that is done.
+        """Return the distinct centres of a completed fit.
 
-        Photos that are all alike can bear fewer than asked for: the distinct ones are kept.
+        Fewer than requested if the photos are too similar.
         """
         assert self.done
         distinct: NDArray[np.float32] = np.unique(self._centres.numpy(), axis=0)
@@ -252,10 +266,10 @@ class VocabularyFit:
         else:
             self._order = list(range(len(self._batches)))
 
-    # --- between two steps ---------------------------------------------------------------------
+    # --- checkpointing -------------------------------------------------------------------------
 
     def save(self) -> bytes:
-        """All that `resume` needs beside the same points, clusters, seed and effort."""
+        """Encode the state; `resume` also needs the same points, clusters, seed and effort."""
         arrays: dict[str, Any] = {
             "numbers": np.array([self.passes, self._batch], np.int64),
             "similarity": np.array(np.nan if self.similarity is None else self.similarity),
@@ -276,7 +290,7 @@ class VocabularyFit:
         return buffer.getvalue()
 
     def resume(self, data: bytes) -> None:
-        """Go on where a fit of the same points, clusters, seed and effort was saved."""
+        """Restore a state saved by a fit with the same points, clusters, seed and effort."""
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
             self.passes, self._batch = map(int, saved["numbers"])
             similarity = float(saved["similarity"])

@@ -1,16 +1,14 @@
-"""Downloading a large file: goes on where it broke off, and keeps only what has the right hash.
+"""Weight files: resumable verified downloads, the Hugging Face cache, safe loading of tensors.
 
-What has come lies beside the target as `NAME.part`, with the server's ETag in `NAME.part.etag`:
-the next try, of this process or of another one, asks for the rest, and begins anew where the server
-says that the file has changed (RFC 9110, 13.1.5 and 14).
+Downloads are kept beside the target as `NAME.part`, with the server's ETag in `NAME.part.etag`. The
+next attempt, of this process or of another one, requests the rest, and starts over if the file has
+changed on the server (RFC 9110, 13.1.5 and 14). Only a file with the expected hash is accepted.
 
-Files of the Hugging Face hub, in its own cache: downloads that go on, checked by their hash.
+Files of the Hugging Face hub are downloaded into the hub's own cache as a blob named by the hash
+that the hub declares; huggingface_hub finds it there and links it into the snapshot.
+huggingface_hub's own download starts over in each process and compares sizes only.
 
-huggingface_hub's own download begins anew in each process and compares sizes only. Here the file is
-brought as a blob of the cache, whose name is the hash that the hub promises; huggingface_hub finds
-it there and gives it its place in the snapshot.
-
-Files of tensors: read without running their code, or inflating more than they have bytes.
+Tensors are loaded without running code and without allocating more than the file's size.
 """
 
 from __future__ import annotations
@@ -30,13 +28,13 @@ from safetensors import SafetensorError
 
 from shared.errors import Misconfigured
 
-TIMEOUT_SECONDS = 30.0  # without a byte
-MAX_DOWNLOAD_ATTEMPTS = 5  # in a row that brought nothing
-RETRY_PAUSE_SECONDS = 1.0  # after the first; twice as long after each further one
+TIMEOUT_SECONDS = 30.0  # maximum time without a byte
+MAX_DOWNLOAD_ATTEMPTS = 5  # in a row without progress
+RETRY_PAUSE_SECONDS = 1.0  # after the first failure; doubled after each further one
 PARTIAL_CONTENT, RANGE_NOT_SATISFIABLE = 206, 416
 
 OnProgress = Callable[[int, int | None], object]
-"""Called with the bytes that are here, and with all there will be if the server says that."""
+"""Called with the bytes received and the total, which is None if the server does not declare it."""
 
 
 def download_file(
@@ -47,11 +45,20 @@ def download_file(
     headers: dict[str, str] | None = None,
     on_progress: OnProgress = lambda _done, _total: None,
 ) -> None:
-    """Bring the file at `url` to `target`, whose folder is made if need be.
+    """Download a file, resuming an earlier attempt.
 
-    `sha256` is the hexadecimal hash that it must have, or the beginning of it. Raises Misconfigured
-    (`download_corrupt`) for another one, and nothing of it is kept; httpx2.HTTPError when the
-    network or the server fails: what has come is kept for the next call; OSError.
+    Args:
+        url: The file's address.
+        target: Path of the downloaded file; its folder is created if necessary.
+        sha256: The expected hexadecimal hash, or a prefix of it.
+        headers: HTTP headers of the requests.
+        on_progress: Called after each block.
+
+    Raises:
+        Misconfigured: `download_corrupt` if the hash differs; the file is deleted.
+        httpx2.HTTPError: The network or the server failed; the part received so far is kept for
+            the next call.
+        OSError: The file can't be written.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     part = _sibling_path(target, ".part")
@@ -59,7 +66,7 @@ def download_file(
         FileLock(_sibling_path(target, ".part.lock")),
         httpx2.Client(follow_redirects=True, timeout=TIMEOUT_SECONDS, headers=headers) as client,
     ):
-        if target.exists():  # another process was first
+        if target.exists():  # another process has downloaded it
             return
         failures = 0
         while True:
@@ -78,29 +85,29 @@ def download_file(
 
 
 def file_sha256(path: Path) -> str:
-    """The hexadecimal sha256 of a file."""
+    """Return the hexadecimal sha256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
-    """One answer of the server appended to `part`, from where it ends; all of it, or an error."""
+    """Append one response to `part`, from its end on; raise if it is incomplete."""
     etag = _sibling_path(part, ".etag")
     begun = _size(part) if etag.exists() else 0
-    asked = {"Accept-Encoding": "identity"}
+    request_headers = {"Accept-Encoding": "identity"}
     if begun:
-        asked |= {"Range": f"bytes={begun}-", "If-Range": etag.read_text()}
-    with client.stream("GET", url, headers=asked) as answer:
+        request_headers |= {"Range": f"bytes={begun}-", "If-Range": etag.read_text()}
+    with client.stream("GET", url, headers=request_headers) as answer:
         if answer.status_code == RANGE_NOT_SATISFIABLE and begun:
             if answer.headers.get("Content-Range") == f"bytes */{begun}":
-                return  # it was complete, and its process died before it could say so
+                return  # complete; the process that downloaded it ended before the rename
             part.unlink()
             etag.unlink()
-            raise httpx2.RemoteProtocolError(f"{url} has nothing from byte {begun} on")
+            raise httpx2.RemoteProtocolError(f"{url} has no bytes from {begun} on")
         answer.raise_for_status()
         resumed = answer.status_code == PARTIAL_CONTENT and begun > 0
         if resumed and not answer.headers.get("Content-Range", "").startswith(f"bytes {begun}-"):
-            raise httpx2.RemoteProtocolError(f"{url} sent another range than was asked for")
+            raise httpx2.RemoteProtocolError(f"{url} returned another range than requested")
         done = begun if resumed else 0
         length = answer.headers.get("Content-Length")
         total = done + int(length) if length is not None else None
@@ -117,7 +124,7 @@ def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: O
 
 
 def _store_etag(path: Path, etag: str | None) -> None:
-    """Only a strong ETag says that two answers are of the same bytes."""
+    """Store a strong ETag; a weak one does not guarantee identical bytes."""
     if etag is None or etag.startswith("W/"):
         path.unlink(missing_ok=True)
     else:
@@ -125,7 +132,7 @@ def _store_etag(path: Path, etag: str | None) -> None:
 
 
 def _is_transient(error: httpx2.HTTPError) -> bool:
-    """Whether the same call may work a moment later."""
+    """Whether a retry may succeed."""
     if isinstance(error, httpx2.HTTPStatusError):
         return error.response.status_code >= 500 or error.response.status_code == 429
     return not isinstance(error, httpx2.UnsupportedProtocol)
@@ -134,16 +141,16 @@ def _is_transient(error: httpx2.HTTPError) -> bool:
 def _check_hash(url: str, part: Path, sha256: str | None) -> None:
     if sha256 is None:
         return
-    found = file_sha256(part)
-    if found.startswith(sha256.lower()):
+    actual = file_sha256(part)
+    if actual.startswith(sha256.lower()):
         return
     part.unlink()
     _sibling_path(part, ".etag").unlink(missing_ok=True)
     raise Misconfigured(
         "download_corrupt",
-        f"{url} is not the file that it should be: its sha256 is {found[:16]}..., expected "
-        f"{sha256[:16]}.... Nothing of it was kept. Try again; if it stays so, a proxy changes "
-        "files on their way, or the file was replaced: bring it from another machine.",
+        f"{url} is not the expected file: its sha256 is {actual[:16]}..., expected "
+        f"{sha256[:16]}.... The download was deleted. Try again; if the error persists, a proxy "
+        "changes files in transit, or the file was replaced: copy it from another machine.",
     )
 
 
@@ -156,10 +163,13 @@ def _sibling_path(path: Path, suffix: str) -> Path:
 
 
 def download_hub_file(repository: str, filename: str, on_progress: OnProgress) -> Path:
-    """The file in the cache of this machine, the newest that the hub has.
+    """Download the newest version of a file of the hub and return its path in the cache.
 
-    Misconfigured (`download_corrupt`) when it has another hash; OSError, RuntimeError or
-    httpx2.HTTPError when it can't be had. HF_ENDPOINT, HF_TOKEN and HF_HOME are honoured.
+    HF_ENDPOINT, HF_TOKEN and HF_HOME are honoured.
+
+    Raises:
+        Misconfigured: `download_corrupt` if the hash differs.
+        OSError, RuntimeError, httpx2.HTTPError: The file can't be downloaded.
     """
     import huggingface_hub
     from huggingface_hub import constants
@@ -171,7 +181,7 @@ def download_hub_file(repository: str, filename: str, on_progress: OnProgress) -
     if metadata.etag is None:
         raise OSError(f"{url} has no ETag")
     folder = repo_folder_name(repo_id=repository, repo_type="model")
-    # Small files have git's hash, which is of more than their content.
+    # Small files have a git hash, which is not the sha256 of their content.
     sha256 = metadata.etag if re.fullmatch(r"[0-9a-f]{64}", metadata.etag) else None
     download_file(
         url,
@@ -194,43 +204,44 @@ TENSOR_READ_ERRORS = (
     SafetensorError,
     pickle.UnpicklingError,
 )
-"""What `load_tensors` and safetensors raise for damaged and for other files."""
+"""Raised by `load_tensors` and safetensors for damaged files and files of other kinds."""
 
-ZIP = b"PK\x03\x04"  # how a file of PyTorch 1.6 or newer begins
+ZIP = b"PK\x03\x04"  # magic bytes of files of PyTorch 1.6 or newer
 
 
 def load_tensors(path: Path) -> Any:
-    """What a file of `torch.save` holds: tensors and plain values, on the CPU.
+    """Load a file of `torch.save`: tensors and plain values, on the CPU.
 
-    Tensors are mapped from the file, so copy those that are to outlive a change of it. Nothing is
-    executed. Of an archive, no entry is read before the sizes that all of them declare were
-    compared with the file's: PyTorch does not compress them, so they are never larger.
+    Tensors are mapped from the file; copy those that must outlive a change of the file. No code is
+    executed. Before an archive's entries are read, their declared sizes are compared with the
+    file's: PyTorch does not compress entries, so together they are never larger.
 
     Raises:
-        One of UNREADABLE.
+        One of TENSOR_READ_ERRORS.
     """
     with path.open("rb") as file:
         is_archive = file.read(len(ZIP)) == ZIP
     if is_archive:
         _check_entries(path)
-    # Files of older releases hold storages one after the other, uncompressed, and can't be mapped.
+    # Files of older releases are not archives: uncompressed, and they can't be mapped.
     return torch.load(path, map_location="cpu", weights_only=True, mmap=is_archive)
 
 
-def check_promise(tensors: Iterable[torch.Tensor], path: Path) -> None:
-    """ValueError when the tensors have more bytes than their file.
+def check_declared_size(tensors: Iterable[torch.Tensor], path: Path) -> None:
+    """Raise ValueError if the tensors' shapes declare more bytes than their file has.
 
-    Tensors of any shape can be made of a few bytes: repeated views, sparse and empty ones.
+    A few bytes can declare tensors of any shape: repeated views, sparse and empty tensors.
     """
-    promised, size = sum(one.numel() * one.element_size() for one in tensors), path.stat().st_size
-    if promised > size:
+    declared = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+    size = path.stat().st_size
+    if declared > size:
         raise ValueError(
-            f"its tensors have {promised} bytes by their shapes, and the file has {size}"
+            f"its tensors have {declared} bytes by their shapes, and the file has {size}"
         )
 
 
 def _check_entries(path: Path) -> None:
-    # PyTorch's own reader: what another one finds in a hostile archive may be other entries.
+    # PyTorch's own reader: another one may find other entries in a hostile archive.
     archive = torch._C.PyTorchFileReader(str(path))
     declared = sum(archive.get_record_size(name) for name in archive.get_all_records())
     size = path.stat().st_size
@@ -242,5 +253,5 @@ def _check_entries(path: Path) -> None:
 
 
 def first_error_line(error: BaseException) -> str:
-    """What an error says, in one line; its name where it says nothing."""
+    """Return the first line of an error's message, or its class name if it has none."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,12 +1,13 @@
-"""Decoding one photo: the only place where pixels are read from untrusted bytes.
+"""Decoding of untrusted photos to RGB pixels, upright or as stored.
 
-Runs in child processes with a memory limit (`services.extractor.decoder_pool`), so that a poisonous
-photo harms nothing but its own job. Imports no torch.
+`decode_photo` runs in child processes with a memory limit (`services.extractor.decoder_pool`), so
+that a malicious photo only fails its own job.
 
-A photo decoded for a network that sees it small, as training does thousands of times a minute.
+`decode_resized` is the fast path of training, where thousands of photos a minute are decoded to a
+small size: it decodes a JPEG at the smallest eighth that still covers the requested size
+(`Image.draft`), which costs a fraction and differs from a full decode by less than one
+augmentation does.
 
-A JPEG is decoded at the smallest of its eighths that still covers the wanted size (`Image.draft`):
-a large photo costs a fraction, and differs from a full decoding by less than one augmentation does.
 Imports no torch.
 """
 
@@ -32,11 +33,12 @@ from shared.imaging.file_formats import (
     detect_media_type,
     open_photo,
 )
+from shared.imaging.photo_header import ROTATED_ORIENTATIONS
 from shared.imaging.preprocessing import Pixels, Preprocessing
 
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
-EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright already
+EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -49,23 +51,33 @@ EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright already
 
 @dataclass(frozen=True, slots=True)
 class DecodedPhoto:
+    """Preprocessed pixels and thumbnail of a photo."""
+
     pixels: Pixels
-    """(height, width, 3) RGB as the preprocessing left it."""
+    """(height, width, 3) RGB after preprocessing."""
     thumbnail: bytes
     """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
 
 
 def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> DecodedPhoto:
-    """The photo in RGB as the preprocessing brings it, and its thumbnail, which is upright.
+    """Decode and preprocess a photo, and make its upright thumbnail.
 
-    Only the first frame is read. Transparent parts show black, samples of 16 bits keep their upper
-    eight. Raises Unprocessable (`undecodable_photo` with the decoder's own reason,
-    `too_many_pixels`, `photo_too_small`, `no_heic_decoder`).
+    Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
+    eight bits.
+
+    Args:
+        data: The file's bytes.
+        preprocessing: Resizes the pixels for the backbone.
+        max_pixels: Maximum of width x height.
+
+    Raises:
+        Unprocessable: `undecodable_photo` with the decoder's reason, `too_many_pixels`,
+            `photo_too_small`, `no_heic_decoder`.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
-            with _open_checked(data) as image:
+            warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
+            with _open_image(data) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
                 image.load()
                 as_stored = to_rgb(image)
@@ -85,15 +97,15 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     except MemoryError as error:
         raise Unprocessable(
             "undecodable_photo",
-            "The photo needs more memory to decode than one photo may have.",
+            "Decoding the photo needs more memory than the limit for one photo.",
         ) from error
 
 
-def _open_checked(data: bytes) -> Image.Image:
+def _open_image(data: bytes) -> Image.Image:
     if detect_media_type(data[:PHOTO_SIGNATURE_BYTES]) != HEIC_MEDIA_TYPE:
         return open_photo(io.BytesIO(data))
     try:
-        import pillow_heif  # an extra: its wheels bring libraries under licences of their own
+        import pillow_heif  # optional: its wheels include libraries under other licences
     except ImportError as error:
         raise Unprocessable(
             "no_heic_decoder",
@@ -106,19 +118,20 @@ def _open_checked(data: bytes) -> Image.Image:
 
 
 def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
-    """`rgb` turned as the EXIF of `image` says. Not Pillow's `exif_transpose`: that also writes
-    the EXIF anew, and fails where any other tag of it is broken.
+    """Transpose `rgb` by the EXIF orientation of `image`.
+
+    Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
     """
     try:
         orientation = image.getexif().get(Base.Orientation)
     except PHOTO_READ_ERRORS:
-        return rgb  # broken EXIF is no reason to refuse the pixels
+        return rgb  # broken EXIF does not affect the pixels
     method = EXIF_TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
     return rgb if method is None else rgb.transpose(method)
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
-    """Three channels of 8 bits, on black; ValueError for samples without a brightness range."""
+    """Convert to 8-bit RGB on black; ValueError for modes without a defined brightness range."""
     if image.mode.startswith("I;16"):
         # Pillow would clip 16-bit samples at 255 and make the photo white.
         samples = np.asarray(image, dtype=np.uint16)
@@ -127,39 +140,41 @@ def to_rgb(image: Image.Image) -> Image.Image:
         raise ValueError(f"samples of mode {image.mode!r} have no defined brightness range")
     if not image.has_transparency_data:
         return image.convert("RGB")
-    # What lies under full transparency is up to the program that wrote the file: mostly black.
-    seen = image.convert("RGBA")
+    # The colour under full transparency depends on the program that wrote the file; mostly black.
+    rgba = image.convert("RGBA")
     on_black = Image.new("RGB", image.size)
-    on_black.paste(seen, mask=seen.getchannel("A"))
+    on_black.paste(rgba, mask=rgba.getchannel("A"))
     return on_black
 
 
 def _thumbnail(rgb: Image.Image) -> bytes:
     small = rgb.copy()
-    # Averaged over whole pixels first: a fifth of the time, and no one sees it at this size.
+    # Averaged over integer blocks first: a fifth of the time, no visible difference at this size.
     small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), reducing_gap=1.0)
-    small.info.clear()  # what the camera wrote (where, when, whose) stays with the original
+    small.info.clear()  # removes the camera's metadata (location, time, owner)
     buffer = io.BytesIO()
     small.save(buffer, "JPEG", quality=85)
     return buffer.getvalue()
 
 
-SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)
-"""EXIF orientations whose upright photo is as wide as the stored one is high"""
 MAX_TRAINING_PIXELS = 100_000_000
 
 
 def decode_resized(
     path: Path, size: tuple[int, int], max_pixels: int = MAX_TRAINING_PIXELS
 ) -> Image.Image:
-    """The photo in RGB, upright, squeezed to `size` (height, width) by antialiased bilinear.
+    """Decode a photo to upright RGB of `size` (height, width), ignoring the aspect ratio.
 
-    Raises Unprocessable (`undecodable_photo`, `too_many_pixels`), which says why, not which.
+    The resize is antialiased bilinear.
+
+    Raises:
+        Unprocessable: `undecodable_photo`, `too_many_pixels`; the message has the reason but not
+            the path.
     """
     height, width = size
     try:
         with warnings.catch_warnings(), path.open("rb") as file:
-            warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
+            warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
             with open_photo(file) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
@@ -176,6 +191,6 @@ def decode_resized(
 
 def _is_sideways(image: Image.Image) -> bool:
     try:
-        return image.getexif().get(Base.Orientation) in SIDEWAYS_ORIENTATIONS
+        return image.getexif().get(Base.Orientation) in ROTATED_ORIENTATIONS
     except PHOTO_READ_ERRORS:
-        return False  # broken EXIF is no reason to refuse the pixels
+        return False  # broken EXIF does not affect the pixels

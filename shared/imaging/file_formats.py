@@ -1,7 +1,4 @@
-"""Which archives are accepted: recognised by their first bytes, not by their names.
-
-Which photos are accepted: recognised by their content, limited by their header.
-"""
+"""File formats of photos and archives: detection by content, limits by the header."""
 
 from __future__ import annotations
 
@@ -16,20 +13,20 @@ from shared.errors import Unprocessable
 ARCHIVE_SIGNATURE_BYTES = 512  # a tar's first header
 ACCEPTED_ARCHIVES = "a zip, a tar or a gzipped tar"
 
-TAR_CHECKSUM_FIELD = slice(
-    148, 156
-)  # of a tar's header: where the sum of its other bytes stands, in octal
+TAR_CHECKSUM_FIELD = slice(148, 156)  # of a tar header: the octal sum of its other bytes
 
 
 class ArchiveFormat(StrEnum):
+    """Accepted archive formats."""
+
     ZIP = "zip"
     TAR = "tar"
-    GZIP = "gzip"  # of a tar, one hopes: only unpacking tells
+    GZIP = "gzip"  # expected to contain a tar; known only after decompression
 
 
 def detect_archive_format(first_bytes: bytes) -> ArchiveFormat | None:
-    """The format by the first SNIFFED_ARCHIVE_BYTES; None for anything not accepted."""
-    if first_bytes.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # the second one: an empty zip
+    """Detect the format from the first ARCHIVE_SIGNATURE_BYTES; None if not accepted."""
+    if first_bytes.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # the second is an empty zip
         return ArchiveFormat.ZIP
     if first_bytes.startswith(b"\x1f\x8b\x08"):
         return ArchiveFormat.GZIP
@@ -37,24 +34,24 @@ def detect_archive_format(first_bytes: bytes) -> ArchiveFormat | None:
 
 
 def is_tar_header(block: bytes) -> bool:
-    """Is it a tar's header of 512 bytes, by its checksum? Not every tar has the word `ustar`."""
+    """Whether a block of 512 bytes is a tar header, by its checksum; `ustar` is optional."""
     if len(block) != ARCHIVE_SIGNATURE_BYTES:
         return False
     try:
-        said = int(block[TAR_CHECKSUM_FIELD].strip(b"\0 ") or b"-1", 8)
+        checksum = int(block[TAR_CHECKSUM_FIELD].strip(b"\0 ") or b"-1", 8)
     except ValueError:
         return False
-    return said == sum(block) - sum(block[TAR_CHECKSUM_FIELD]) + 8 * ord(" ")
+    return checksum == sum(block) - sum(block[TAR_CHECKSUM_FIELD]) + 8 * ord(" ")
 
 
-# MPO, which many phones write under the name JPEG (a JPEG with a second picture behind it), is
-# opened by Pillow as JPEG: naming it here is a KeyError for everything but a JPEG.
+# Pillow opens MPO (a JPEG followed by a second picture, which many phones write as .jpg) as JPEG;
+# listing MPO here raises KeyError for all other formats.
 PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
 ACCEPTED_PHOTOS = "JPEG, PNG, WebP, BMP, TIFF or HEIC"
 HEIC_MEDIA_TYPE = "image/heic"
-# The first brand of files of HEVC pictures: `mif1` may hold others, which their header tells.
+# Major brands of HEVC images; `mif1` may contain other codecs, which the header shows.
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
-# What Pillow raises for damaged photos and EXIF; UnidentifiedImageError is an OSError.
+# Raised by Pillow for damaged photos and EXIF; UnidentifiedImageError is an OSError.
 PHOTO_READ_ERRORS = (
     OSError,
     SyntaxError,
@@ -64,16 +61,16 @@ PHOTO_READ_ERRORS = (
     EOFError,
     struct.error,
 )
-# Of files that are looked for in folders and archives; what they are is told by their content.
+# Suffixes searched for in folders and archives; the format is detected from the content.
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"}
-PHOTO_SIGNATURE_BYTES = 16  # enough to tell every accepted format
+PHOTO_SIGNATURE_BYTES = 16  # enough to detect every accepted format
 
-# Our own limit is checked from the header before anything is decoded.
+# Disabled: check_pixel_count checks our own limit before anything is decoded.
 Image.MAX_IMAGE_PIXELS = None
 
 
 def detect_media_type(first_bytes: bytes) -> str | None:
-    """The media type by the first SNIFFED_BYTES of a file; None for anything not accepted."""
+    """Detect the media type from the first PHOTO_SIGNATURE_BYTES; None if not accepted."""
     if first_bytes.startswith(b"\xff\xd8\xff"):
         return "image/jpeg"
     if first_bytes.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -82,7 +79,7 @@ def detect_media_type(first_bytes: bytes) -> str | None:
         return "image/webp"
     if first_bytes.startswith((b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")):
         return "image/tiff"
-    # "BM" alone begins many texts: a bitmap has two reserved fields, which are zero.
+    # Texts may begin with "BM", too; a bitmap also has two reserved fields that are zero.
     if first_bytes.startswith(b"BM") and first_bytes[6:10] == b"\x00\x00\x00\x00":
         return "image/bmp"
     if first_bytes[4:8] == b"ftyp" and first_bytes[8:12] in HEIC_BRANDS:
@@ -91,15 +88,15 @@ def detect_media_type(first_bytes: bytes) -> str | None:
 
 
 def open_photo(file: BinaryIO) -> Image.Image:
-    """The photo with its header read and its pixels not yet decoded."""
+    """Open a photo with Pillow; reads the header and decodes no pixels."""
     return Image.open(file, formats=PILLOW_FORMATS)
 
 
 def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
-    """Unprocessable (`too_many_pixels`) when the header promises more than the limit."""
+    """Raise Unprocessable (`too_many_pixels`) if width x height exceeds `max_pixels`."""
     if width * height > max_pixels:
         raise Unprocessable(
             "too_many_pixels",
             f"The photo has {width} x {height} pixels; "
-            f"the limit is {max_pixels} in all (MAX_IMAGE_PIXELS).",
+            f"the limit is {max_pixels} pixels in total (MAX_IMAGE_PIXELS).",
         )

@@ -1,13 +1,11 @@
-"""What the header of a HEIC photo says, read without its decoder.
+"""Photo headers: size, location and capture time, read without decoding pixels.
 
-A HEIC file is a tree of boxes (ISO/IEC 14496-12): each has a length, a name of four letters and
-content. `meta` lists the items (ISO/IEC 23008-12): the picture, its tiles, its EXIF; properties in
-`iprp` say how large each is and how far it is turned. Everything is bounded before it is believed;
-what contradicts itself is a ValueError.
+EXIF is untrusted: fields that are missing, broken or out of range become None.
 
-What a photo's header says, read without decoding a pixel: size, and where and when it was taken.
-
-EXIF is a hint from a stranger: whatever is missing, broken or out of range is left out.
+HEIC is parsed here, without its decoder, which is optional. A HEIC file is a tree of boxes (ISO/IEC
+14496-12): each has a length, a name of four letters and content. `meta` lists the items (ISO/IEC
+23008-12): the image, its tiles, its EXIF; properties in `iprp` give the size and the rotation. All
+lengths and counts are bounded before they are used; inconsistent files raise ValueError.
 """
 
 from __future__ import annotations
@@ -37,17 +35,19 @@ from shared.imaging.file_formats import (
 MAX_META_BYTES = 4 * 1024 * 1024
 MAX_EXIF_BYTES = 1024 * 1024
 MAX_BOXES = 100_000
-HEVC = (b"hvc1", b"grid")  # a picture, or one put together of tiles: what phones write
+HEVC = (b"hvc1", b"grid")  # a single image, or a grid of tiles as phones write it
 QUARTER_TURNS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class HeicHeader:
+    """Size and EXIF of a HEIC photo."""
+
     width: int
     """pixels, upright"""
     height: int
     exif: bytes | None
-    """The TIFF block, as Pillow's `Exif.load` takes it."""
+    """TIFF block for Pillow's `Exif.load`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,10 @@ class _Box:
 
 
 def read_heic_header(file: BinaryIO) -> HeicHeader:
-    """Size and EXIF of the primary picture. Raises ValueError where there is none, or where it is
-    not HEVC (an AVIF, say)."""
+    """Read size and EXIF of the primary image.
+
+    Raises ValueError if there is none, or if it is not HEVC (AVIF, for example).
+    """
     boxes = {box.name: box.content for box in _boxes(_meta(file))}
     primary = _primary(boxes[b"pitm"])
     kinds = dict(_kinds(boxes[b"iinf"]))
@@ -71,7 +73,7 @@ def read_heic_header(file: BinaryIO) -> HeicHeader:
 
 
 def _meta(file: BinaryIO) -> bytes:
-    """The content of the box `meta`, which is looked for among the outermost ones."""
+    """Return the content of the top-level box `meta`."""
     offset = 0
     for _ in range(MAX_BOXES):
         file.seek(offset)
@@ -86,9 +88,9 @@ def _meta(file: BinaryIO) -> bytes:
             if not begin + 4 <= size <= MAX_META_BYTES:
                 raise ValueError("the box meta is too large")
             file.seek(offset + begin + 4)  # version and flags
-            return _whole(file, size - begin - 4)
+            return _read_exactly(file, size - begin - 4)
         if size < begin:
-            break  # 0: the last box; less: broken
+            break  # 0: last box; otherwise broken
         offset += size
     raise ValueError("there is no box meta")
 
@@ -109,7 +111,7 @@ def _primary(data: bytes) -> int:
 
 
 def _kinds(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(item, kind) of each entry of `iinf`."""
+    """Yield (item, item type) of each entry of `iinf`."""
     for box in _boxes(data[6 if data[0] == 0 else 8 :]):
         version = box.content[0]
         if box.name == b"infe" and version >= 2:
@@ -118,34 +120,34 @@ def _kinds(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _upright_size(data: bytes, item: int) -> tuple[int, int]:
-    """Width and height of the item as it is seen, from its properties `ispe` and `irot`."""
+    """Return width and height of an item after rotation, from `ispe` and `irot`."""
     parts = {box.name: box.content for box in _boxes(data)}
     properties = list(_boxes(parts[b"ipco"]))
     size: tuple[int, int] | None = None
-    turned = 0
+    quarter_turns = 0
     for index in _properties_of(parts[b"ipma"], item):
         if not 1 <= index <= len(properties):
             raise ValueError("a property is missing")
-        one = properties[index - 1]
-        if one.name == b"ispe":
-            width, height = struct.unpack_from(">II", one.content, 4)
+        box = properties[index - 1]
+        if box.name == b"ispe":
+            width, height = struct.unpack_from(">II", box.content, 4)
             size = (width, height)
-        elif one.name == b"irot":
-            turned += one.content[0] % QUARTER_TURNS
+        elif box.name == b"irot":
+            quarter_turns += box.content[0] % QUARTER_TURNS
     if size is None or 0 in size:
         raise ValueError("the picture has no size")
-    return size if turned % 2 == 0 else (size[1], size[0])
+    return size if quarter_turns % 2 == 0 else (size[1], size[0])
 
 
 def _properties_of(data: bytes, item: int) -> Iterator[int]:
-    """The numbers (from 1) of an item's properties, by `ipma`; 0 stands for none."""
+    """Yield an item's property numbers, from 1, by `ipma`; 0 stands for none."""
     version, wide = data[0], data[3] & 1
     (entries,) = struct.unpack_from(">I", data, 4)
     offset = 8
     for _ in range(min(entries, MAX_BOXES)):
-        of, count = struct.unpack_from(">HB" if version == 0 else ">IB", data, offset)
+        entry, count = struct.unpack_from(">HB" if version == 0 else ">IB", data, offset)
         offset += 3 if version == 0 else 5
-        if of == item:
+        if entry == item:
             for number in range(count):
                 if wide:
                     index = struct.unpack_from(">H", data, offset + 2 * number)[0] & 0x7FFF
@@ -157,20 +159,20 @@ def _properties_of(data: bytes, item: int) -> Iterator[int]:
 
 
 def _exif(file: BinaryIO, data: bytes, item: int) -> bytes | None:
-    """The EXIF item's TIFF block; None where it is not in one piece of this file."""
-    place = _place(data, item)
-    if place is None or not 4 < place[1] <= MAX_EXIF_BYTES:
+    """Return the TIFF block of the EXIF item; None unless it is one extent of this file."""
+    extent = _extent(data, item)
+    if extent is None or not 4 < extent[1] <= MAX_EXIF_BYTES:
         return None
-    file.seek(place[0])
-    block = file.read(place[1])
+    file.seek(extent[0])
+    block = file.read(extent[1])
     if len(block) < 4:
         return None
     begin = 4 + struct.unpack_from(">I", block)[0]
     return block[begin:] or None
 
 
-def _place(data: bytes, item: int) -> tuple[int, int] | None:
-    """(offset, bytes) of an item in the file, by `iloc`."""
+def _extent(data: bytes, item: int) -> tuple[int, int] | None:
+    """Return (offset, length) of an item in the file, by `iloc`."""
     if len(data) < 8:
         return None
     version = data[0]
@@ -178,30 +180,30 @@ def _place(data: bytes, item: int) -> tuple[int, int] | None:
     base_size, index_size = data[5] >> 4, data[5] & 15 if version else 0
     wide = version == 2
     (entries,) = struct.unpack_from(">I" if wide else ">H", data, 6)
-    at = 10 if wide else 8
+    position = 10 if wide else 8
 
     def number(size: int) -> int:
-        nonlocal at
-        if at + size > len(data):
+        nonlocal position
+        if position + size > len(data):
             raise ValueError("the box iloc is cut off")
-        value = int.from_bytes(data[at : at + size], "big")
-        at += size
+        value = int.from_bytes(data[position : position + size], "big")
+        position += size
         return value
 
     for _ in range(min(entries, MAX_BOXES)):
-        of = number(4 if wide else 2)
+        entry = number(4 if wide else 2)
         method = number(2) & 15 if version else 0
         source, base, extents = number(2), number(base_size), number(2)
-        found = None
+        extent = None
         for _ in range(extents):
             number(index_size)
-            found = base + number(offset_size), number(length_size)
-        if of == item:
-            return found if method == 0 and source == 0 and extents == 1 else None
+            extent = base + number(offset_size), number(length_size)
+        if entry == item:
+            return extent if method == 0 and source == 0 and extents == 1 else None
     return None
 
 
-def _whole(file: BinaryIO, size: int) -> bytes:
+def _read_exactly(file: BinaryIO, size: int) -> bytes:
     data = file.read(size)
     if len(data) < size:
         raise ValueError("the file is cut off")
@@ -213,6 +215,8 @@ ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and hei
 
 @dataclass(frozen=True, slots=True)
 class PhotoHeader:
+    """Size, location and capture time of a photo; None for unknown values."""
+
     width: int
     """pixels, upright"""
     height: int
@@ -222,13 +226,17 @@ class PhotoHeader:
     heading: float | None = None
     """degrees clockwise from north, in [0, 360)"""
     captured_at: datetime | None = None
+    """UTC"""
 
 
 def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
-    """Unprocessable (`undecodable_photo`, `too_many_pixels`) when the header can't be used."""
+    """Read a photo's header from its beginning.
+
+    Raises Unprocessable: `undecodable_photo`, `too_many_pixels`.
+    """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # strange EXIF is no reason to refuse a photo
+            warnings.simplefilter("ignore")  # about unusual EXIF, which does not affect the pixels
             begin = file.read(PHOTO_SIGNATURE_BYTES)
             file.seek(0)
             if detect_media_type(begin) == HEIC_MEDIA_TYPE:
@@ -238,28 +246,28 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
                 return _header(image)
     except PHOTO_READ_ERRORS as error:
         raise Unprocessable(
-            "undecodable_photo", "The photo's header is broken: it can't be decoded."
+            "undecodable_photo", "The photo can't be decoded: its header is damaged."
         ) from error
 
 
 def _header(image: Image.Image) -> PhotoHeader:
     width, height = image.size
     exif = _exif_of_photo_header(image)
-    # Pillow gives the size of a TIFF as it stands upright, that of all others as stored.
+    # Pillow returns the upright size of a TIFF, but the stored size of all other formats.
     if image.format != "TIFF" and _orientation(exif) in ROTATED_ORIENTATIONS:
         width, height = height, width
     return _with_exif(width, height, exif)
 
 
 def _heic_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
-    """Its size is that of the boxes: EXIF's orientation does not count in HEIC."""
-    found = read_heic_header(file)
-    check_pixel_count(found.width, found.height, max_pixels)
+    """Read a HEIC header; the boxes have the size, and EXIF's orientation is ignored in HEIC."""
+    header = read_heic_header(file)
+    check_pixel_count(header.width, header.height, max_pixels)
     exif = Image.Exif()
-    if found.exif:
+    if header.exif:
         with contextlib.suppress(*PHOTO_READ_ERRORS):
-            exif.load(found.exif)
-    return _with_exif(found.width, found.height, exif)
+            exif.load(header.exif)
+    return _with_exif(header.width, header.height, exif)
 
 
 def _with_exif(width: int, height: int, exif: Image.Exif) -> PhotoHeader:
@@ -280,7 +288,7 @@ def _with_exif(width: int, height: int, exif: Image.Exif) -> PhotoHeader:
 
 
 def _exif_of_photo_header(image: Image.Image) -> Image.Exif:
-    """The EXIF block; for PNG only if it stands before the pixels, which are not decoded here."""
+    """Return the EXIF; for PNG only if it precedes the pixels, which are not decoded here."""
     exif = Image.Exif()
     try:
         if image.format == "TIFF":
@@ -300,7 +308,7 @@ def _orientation(exif: Image.Exif) -> Any:
 
 
 def _directory(exif: Image.Exif, tag: int) -> dict[int, Any]:
-    """One of EXIF's inner directories; empty when it is broken."""
+    """Return one of EXIF's sub-directories; empty if it is broken."""
     try:
         return dict(exif.get_ifd(tag))
     except PHOTO_READ_ERRORS:
@@ -316,9 +324,9 @@ def _number(value: Any) -> float | None:
 
 
 def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | None:
-    """EXIF's (degrees, minutes, seconds) as one number; `signs` are the letters of + and -.
+    """Convert EXIF's (degrees, minutes, seconds); `signs` are the letters of + and -.
 
-    Without either letter it is left out: the other hemisphere is no small error.
+    Returns None without a valid letter, because the hemisphere is unknown.
     """
     if not isinstance(parts, tuple) or len(parts) != 3 or not isinstance(reference, str):
         return None
@@ -336,7 +344,7 @@ def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | No
 
 
 def _captured_at(gps: dict[int, Any], exif: dict[int, Any]) -> datetime | None:
-    """GPS time, which is UTC; else the camera's clock with its offset (none given: UTC)."""
+    """Return the GPS time, which is UTC; else the camera's clock with its offset (default UTC)."""
     day, clock = gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)
     if isinstance(day, str) and isinstance(clock, tuple) and len(clock) == 3:
         parts = [_number(part) for part in clock]

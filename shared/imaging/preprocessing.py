@@ -1,24 +1,23 @@
-"""Resizing without rounding, as PyTorch's `interpolate` does it on a float tensor, in NumPy.
+"""Preprocessings: named, versioned ways to resize a photo for a backbone, and the NumPy resampler.
 
-Each output sample is a weighted sum of input samples around its place, first along one axis and
-then along the other (the weights of Keys 1981 for the cubic, a = -0.75):
+Name and version are part of the extractor spec, so that one generation never mixes two of them.
 
-    place(i)  = (i + 0.5) * size / onto - 0.5
-    value(i)  = sum over j of kernel(|j - place(i)| / stretch) * sample(j)
+AnyLoc is published with several preprocessings, and each published result belongs to one of them.
+AnyLoc scales to [0, 1], normalises by channel and then resizes. Here pixels are resized on the
+scale from 0 to 255, without rounding or clipping, and normalised once, by the backbone: the
+weights of a resize have sum 1, so the order makes no difference.
 
-`stretch` is 1 without antialiasing, where samples beyond the border repeat the last one; with it,
-it is size / onto where that shrinks, and the weights inside the border are brought to a sum of 1.
-Pillow offers neither: it rounds to whole numbers and antialiases always. Imports no torch: the
-decoding children resize.
+`resample` resizes without rounding, as PyTorch's `interpolate` does on a float tensor. Pillow can't
+do this: it rounds to integers and always antialiases. torch is not imported, because the decoding
+child processes resize. Each output sample is a weighted sum of input samples around its position,
+first along one axis and then along the other (the weights of Keys 1981 for the cubic, a = -0.75):
 
-Named, versioned ways of bringing a photo to the size that a backbone sees.
+    position(i)  = (i + 0.5) * size / output_size - 0.5
+    value(i)     = sum over j of kernel(|j - position(i)| / stretch) * sample(j)
 
-The name and the version are part of the extractor spec: two ways never mix in one generation.
-
-AnyLoc is published with more than one of them, and its figures belong to the one they were measured
-with. Those scale to [0, 1], normalise by channel and then resize the normalised numbers. Here the
-numbers are resized on the scale from 0 to 255, without rounding or clipping, and normalised once,
-by the backbone: resizing weighs samples with weights of sum 1, so the order makes no difference.
+Without antialiasing, `stretch` is 1 and samples beyond the border repeat the last one. With it,
+`stretch` is size / output_size if that shrinks, and the weights inside the border are normalised
+to a sum of 1.
 """
 
 from __future__ import annotations
@@ -40,10 +39,12 @@ Weights = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
+    """Interpolation kernel."""
+
     weigh: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-    """Weights by the distance, in samples, which is not negative."""
+    """Maps distances in samples, not negative, to weights."""
     radius: int
-    """The distance from which on the weight is 0."""
+    """Distance in samples at and beyond which the weight is 0."""
 
 
 def _triangle(distance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -64,14 +65,14 @@ BICUBIC = Kernel(_cubic, radius=2)
 
 
 def resample(pixels: Pixels, height: int, width: int, kernel: Kernel, *, antialias: bool) -> Pixels:
-    """(H, W, C) -> (height, width, C) float32, on the same scale and not clipped to it.
+    """Resize (H, W, C) pixels to (height, width, C) float32, without rounding or clipping.
 
-    What has the size already comes back as it is.
+    Pixels that have the size already are returned unchanged.
     """
-    had_height, had_width = pixels.shape[:2]
-    # The axis first that leaves less to do, and less to hold.
+    input_height, input_width = pixels.shape[:2]
+    # The axis first that leaves the smaller intermediate result.
     sizes = {0: height, 1: width}
-    order = (0, 1) if height * had_width <= had_height * width else (1, 0)
+    order = (0, 1) if height * input_width <= input_height * width else (1, 0)
     for axis in order:
         if pixels.shape[axis] != sizes[axis]:
             pixels = _resample_axis(pixels, axis, sizes[axis], kernel, antialias)
@@ -79,28 +80,29 @@ def resample(pixels: Pixels, height: int, width: int, kernel: Kernel, *, antiali
 
 
 def _resample_axis(
-    pixels: Pixels, axis: int, onto: int, kernel: Kernel, antialias: bool
+    pixels: Pixels, axis: int, output_size: int, kernel: Kernel, antialias: bool
 ) -> NDArray[np.float32]:
-    taken, weights = _axis_weights(pixels.shape[axis], onto, kernel, antialias)
+    indices, weights = _axis_weights(pixels.shape[axis], output_size, kernel, antialias)
     shape = [1] * pixels.ndim
-    shape[axis] = onto
-    total = np.zeros((*pixels.shape[:axis], onto, *pixels.shape[axis + 1 :]), np.float32)
-    for tap in range(taken.shape[1]):
-        total += weights[:, tap].reshape(shape) * pixels.take(taken[:, tap], axis=axis)
+    shape[axis] = output_size
+    total = np.zeros((*pixels.shape[:axis], output_size, *pixels.shape[axis + 1 :]), np.float32)
+    for tap in range(indices.shape[1]):
+        total += weights[:, tap].reshape(shape) * pixels.take(indices[:, tap], axis=axis)
     return total
 
 
 def _axis_weights(
-    size: int, onto: int, kernel: Kernel, antialias: bool
+    size: int, output_size: int, kernel: Kernel, antialias: bool
 ) -> tuple[NDArray[np.intp], Weights]:
-    """(onto, taps) indices of the samples that each output sample is made of, and their weights."""
-    # In float32, as PyTorch: at a thousand pixels its places are off by up to 1e-4.
-    scale = np.float32(size) / np.float32(onto)
+    """Return (output_size, taps) indices of the input samples, and their weights."""
+    # In float32, as PyTorch: at a thousand pixels its positions are off by up to 1e-4.
+    scale = np.float32(size) / np.float32(output_size)
     stretch = max(scale, np.float32(1)) if antialias else np.float32(1)
-    places = (np.arange(onto, dtype=np.float32) + np.float32(0.5)) * scale - np.float32(0.5)
-    first = np.floor(places - kernel.radius * stretch).astype(np.intp) + 1
+    half = np.float32(0.5)
+    positions = (np.arange(output_size, dtype=np.float32) + half) * scale - half
+    first = np.floor(positions - kernel.radius * stretch).astype(np.intp) + 1
     taps = first[:, np.newaxis] + np.arange(int(np.ceil(2 * kernel.radius * stretch)))
-    weights = kernel.weigh(np.abs(taps - places[:, np.newaxis]) / stretch)
+    weights = kernel.weigh(np.abs(taps - positions[:, np.newaxis]) / stretch)
     if antialias:
         weights = np.where((taps < 0) | (taps >= size), 0.0, weights)
         weights /= weights.sum(axis=1, keepdims=True)
@@ -108,48 +110,54 @@ def _axis_weights(
 
 
 PATCH = 14  # pixels; of DINOv2
-ROUND14_MAX_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches, which all attend to each other
+ROUND14_MAX_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches with quadratic attention
 
 
 @dataclass(frozen=True, slots=True)
 class Preprocessing:
+    """A named, versioned resize."""
+
     name: str
     version: int
     upright: bool
-    """Whether the photo is turned as its EXIF says. The published ways don't look at EXIF."""
-    most_pixels: int
-    """height x width of what comes out, at most"""
+    """Whether EXIF orientation is applied first. The published preprocessings ignore it."""
+    max_pixels: int
+    """Maximum of height x width of the result"""
     typical_size: tuple[int, int]
-    """Height and width of what comes out of most photos: those of 4 : 3 where they keep theirs."""
+    """Height and width of the usual result; for a 4 : 3 photo if the aspect ratio is kept."""
     resize: Callable[[Image.Image], Pixels]
-    """A function of a module: it travels to the decoding children."""
+    """A module-level function, because it is pickled for the decoding child processes."""
 
     def apply(self, image: Image.Image) -> Pixels:
-        """An RGB image -> (H, W, 3), 0 to 255.
+        """Resize an RGB image.
 
-        uint8; or float32 where interpolated numbers are kept as they are, which for the cubic may
-        lie a little outside. Photos of different sizes may come out with different H and W.
+        Returns:
+            (H, W, 3) in 0 to 255: uint8, or float32 if interpolated numbers are not rounded;
+            bicubic ones may be slightly outside of the range. H and W may depend on the photo.
 
-        Unprocessable: `photo_too_small` where not one patch is left of it, `too_many_pixels` where
-        it keeps its size and that is too much for a network in which every patch sees every other.
+        Raises:
+            Unprocessable: `photo_too_small` if less than one patch is left; `too_many_pixels` if
+                the preprocessing keeps the photo's size and that is too large for attention
+                between all patches.
         """
         return self.resize(image)
 
     def as_spec(self) -> dict[str, str | int]:
+        """Return the field `preprocessing` of the extractor spec."""
         return {"name": self.name, "version": self.version}
 
 
 def _squeeze(image: Image.Image, height: int, width: int) -> Pixels:
-    """Aspect not kept: bilinear, antialiased when it shrinks, rounded to whole numbers."""
+    """Resize ignoring the aspect ratio: bilinear, antialiased when shrinking, rounded."""
     return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
 
 
 def _demo1024(image: Image.Image) -> Pixels:
-    """As AnyLoc's demo/anyloc_vlad_generate.py: where the longer side has more than 1024 pixels it
-    becomes 1024, the other one is rounded down; then the middle, in whole patches.
+    """Resize as AnyLoc's demo/anyloc_vlad_generate.py does.
 
-    Bicubic. Not antialiased: torchvision's default for tensors until release 0.17, and AnyLoc's
-    environment names 0.14.1.
+    A longer side of more than 1024 pixels becomes 1024, the other one is rounded down; then a
+    centre crop to whole patches. Bicubic, not antialiased: torchvision's default for tensors until
+    release 0.17, and AnyLoc's environment names 0.14.1.
     """
     width, height = image.size
     longest = max(width, height)
@@ -160,23 +168,26 @@ def _demo1024(image: Image.Image) -> Pixels:
 
 
 def _paper480x640(image: Image.Image) -> Pixels:
-    """As AnyLoc's scripts/dino_v2_vlad.py on its data sets: 480 x 640 whatever the aspect, bilinear
-    and, as above, not antialiased; of these the middle 476 x 630, which are 34 x 45 patches.
+    """Resize as AnyLoc's scripts/dino_v2_vlad.py does on its data sets.
+
+    480 x 640 ignoring the aspect ratio, bilinear, not antialiased as in `_demo1024`; then a centre
+    crop to 476 x 630, which is 34 x 45 patches.
     """
     return _centre_crop(resample(np.asarray(image), 480, 640, BILINEAR, antialias=False))
 
 
 def _round14(image: Image.Image) -> Pixels:
-    """As AnyLoc is run by VPR-methods-evaluation: each side to the nearest multiple of 14, of two
-    as near ones the even multiple; bilinear, antialiased.
+    """Resize as VPR-methods-evaluation does for AnyLoc.
+
+    Each side to the nearest multiple of 14, ties to the even multiple; bilinear, antialiased.
     """
     height, width = (round(side / PATCH) * PATCH for side in (image.height, image.width))
     _check_patches(image, height, width, "round14")
     if height * width > ROUND14_MAX_PIXELS:
         raise Unprocessable(
             "too_many_pixels",
-            f"The photo has {image.width} x {image.height} pixels, and round14 keeps its size; it "
-            f"takes up to {ROUND14_MAX_PIXELS} in all. Make it smaller, or use demo1024.",
+            f"The photo has {image.width} x {image.height} pixels; round14 keeps the size and "
+            f"accepts up to {ROUND14_MAX_PIXELS} pixels. Make the photo smaller, or use demo1024.",
         )
     return resample(np.asarray(image), height, width, BILINEAR, antialias=True)
 
@@ -185,17 +196,17 @@ def _check_patches(image: Image.Image, height: int, width: int, name: str) -> No
     if min(height, width) < PATCH:
         raise Unprocessable(
             "photo_too_small",
-            f"The photo has {image.width} x {image.height} pixels, of which {name} makes {width} x "
-            f"{height}: less than one patch of {PATCH} x {PATCH}. Crop it, or use square224.",
+            f"The photo has {image.width} x {image.height} pixels, which {name} resizes to {width} "
+            f"x {height}: less than one patch of {PATCH} x {PATCH}. Crop it, or use square224.",
         )
 
 
 def _centre_crop(pixels: Pixels) -> Pixels:
-    """The middle of the pixels in whole patches; where it lies between two pixels, the even one."""
+    """Crop to whole patches around the centre; half-pixel offsets round to even."""
     height, width = (side // PATCH * PATCH for side in pixels.shape[:2])
     top, left = round((pixels.shape[0] - height) / 2), round((pixels.shape[1] - width) / 2)
-    middle: Pixels = pixels[top : top + height, left : left + width].copy()
-    return middle
+    cropped: Pixels = pixels[top : top + height, left : left + width].copy()
+    return cropped
 
 
 PREPROCESSINGS = {
@@ -215,9 +226,9 @@ PREPROCESSINGS = {
 
 
 def get_preprocessing(name: str) -> Preprocessing:
-    """The preprocessing of that name; `resizeHEIGHTxWIDTH` is one for each size.
+    """Return the preprocessing `name`; `resizeHEIGHTxWIDTH` exists for every size.
 
-    Misconfigured: `unknown_preprocessing`.
+    Raises Misconfigured (`unknown_preprocessing`).
     """
     if name in PREPROCESSINGS:
         return PREPROCESSINGS[name]
@@ -225,7 +236,7 @@ def get_preprocessing(name: str) -> Preprocessing:
     if size is None:
         raise Misconfigured(
             "unknown_preprocessing",
-            f"There is no preprocessing {name!r}. Known: {', '.join(sorted(PREPROCESSINGS))}, "
+            f"Unknown preprocessing {name!r}. Valid names: {', '.join(sorted(PREPROCESSINGS))}, "
             "resizeHEIGHTxWIDTH.",
         )
     height, width = int(size[1]), int(size[2])

@@ -1,11 +1,10 @@
-"""A made-up city that is drawn: streets in real metres, one catalogue of parts, sessions of days.
+"""Synthetic city generator: renders labelled datasets for tests, benchmarks and demos.
 
-The way through it: `streets` lays out quarters, `places` finds spots along them and `plan` decides
-which photos are taken there and when; `catalogue` draws the parts that all houses share, `house`
-arranges them and `facade` draws the arrangement; `camera` casts rays, `scene` places what stands in
-the street, `render` paints one view on a `canvas` and `develop` gives it its session's light.
-`write` does this on all cores and leaves a data set.
+The pipeline: `streets` lays out quarters and view points, `plan` decides which photos are taken and
+when; `catalogue` draws the parts that all houses share, `houses` arranges them into facades;
+`camera` casts rays, `scene` places street objects, `render` renders one view, and `postprocess`
+applies the light and weather of its session. `write` renders on all cores and writes a dataset.
 
-A place is known by the ARRANGEMENT of parts, never by its palette: that is what makes it hard for
-descriptors of colour, and possible for those that see structure.
+Places differ in the arrangement of parts, not in their palette. So colour statistics don't identify
+a place, and descriptors have to recognise structure.
 """

@@ -1,21 +1,18 @@
-"""A pinhole camera that stands upright in the street, and its rays against vertical planes.
+"""Camera, ray casting, the mipmapped texture cache, and texture sampling.
 
-A point at `depth` metres along the optical axis, `lateral` metres to its right and `z` metres above
-the ground is seen at
+The camera is an upright pinhole camera. A point at `depth` metres along the optical axis, `lateral`
+metres to its right and `z` metres above the ground is projected to
 
     x = width / 2 + f * lateral / depth            y = horizon + f * (eye - z) / depth
 
 with f = width / 2 / tan(fov / 2). A camera that rolls by r adds tan(r) * (x - width / 2) to y.
 
-All textures of a drawing process in one flat array, each with its smaller copies.
+All textures of a rendering process are in one flat array, with their mipmaps, so that one gather
+reads a different texture at a different size for every column of a photo. Textures are stored
+column by column, so that a photo's column reads contiguous memory.
 
-One flat array lets a single gather read, for every column of a photo, from another texture at
-another size. Textures lie column by column, so that a photo's column reads neighbouring memory.
-
-The canvas that one photo is painted on, and reading textures onto its columns.
-
-It is twice as fine as the photo and lies column by column (the first axis is x): a vertical plane
-is linear in a column, so that one multiply and one gather fill all columns at once.
+The canvas of a photo has twice its resolution and is stored column by column (the first axis is x):
+a vertical plane is linear in a column, so one multiply and one gather fill all columns at once.
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Metres, degrees and pixels."""
+    """A pinhole camera; metres, degrees and pixels."""
 
     x: float
     """east"""
@@ -48,44 +45,47 @@ class Camera:
     width: int = 320
     height: int = 240
     horizon: float = 0.60
-    """its row, as a share of the height"""
+    """Row of the horizon, as a fraction of the height"""
     roll: float = 0.0
     """degrees"""
 
     @property
     def focal(self) -> float:
-        """pixels"""
+        """Focal length in pixels."""
         return self.width / 2 / math.tan(math.radians(self.fov) / 2)
 
     @property
     def forward(self) -> Floats:
+        """(2,) unit vector of the optical axis."""
         yaw = math.radians(self.yaw)
         return np.array([math.sin(yaw), math.cos(yaw)])
 
     @property
     def right(self) -> Floats:
+        """(2,) unit vector to the right of the optical axis."""
         yaw = math.radians(self.yaw)
         return np.array([math.cos(yaw), -math.sin(yaw)])
 
     @property
     def position(self) -> Floats:
+        """(2,) east and north in metres."""
         return np.array([self.x, self.y])
 
     def slopes(self, supersampling: int) -> Floats:
-        """(columns,) lateral metres per metre of depth, at the middle of each column."""
+        """Return the (columns,) lateral metres per metre of depth at the centre of each column."""
         columns = (np.arange(self.width * supersampling) + 0.5) / supersampling
         return (columns - self.width / 2) / self.focal
 
     def horizons(self, supersampling: int) -> Floats:
-        """(columns,) the row of the horizon in each column, in whole pixels."""
+        """Return the (columns,) row of the horizon in each column, in photo pixels."""
         lean = math.tan(math.radians(self.roll)) * self.focal
         return self.horizon * self.height + lean * self.slopes(supersampling)
 
     def project(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """(n, 3) metres (east, north, up) -> x and y in pixels, depth in metres."""
-        away = points[:, :2] - self.position
-        depth = away @ self.forward
-        x = self.width / 2 + self.focal * (away @ self.right) / depth
+        """Project (n, 3) metres (east, north, up) to x and y in pixels and depth in metres."""
+        relative = points[:, :2] - self.position
+        depth = relative @ self.forward
+        x = self.width / 2 + self.focal * (relative @ self.right) / depth
         lean = math.tan(math.radians(self.roll)) * (x - self.width / 2)
         y = self.horizon * self.height + self.focal * (self.eye - points[:, 2]) / depth + lean
         return x, y, depth
@@ -93,34 +93,41 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class RayHits:
-    """For each column the nearest plane: depth is infinite where there is none."""
+    """The nearest plane for each column; depth is infinite if there is none."""
 
     depth: Floats
     plane: NDArray[np.int64]
-    """index into the planes that were cast against"""
+    """Index into the planes that were passed"""
     along: Floats
-    """metres from the plane's start"""
+    """Metres from the plane's start"""
     facing: Floats
-    """metres towards the plane's normal per metre of depth"""
+    """Metres along the plane's normal per metre of depth"""
 
 
 def cast_rays(
     camera: Camera, slopes: Floats, starts: Floats, directions: Floats, lengths: Floats
 ) -> RayHits:
-    """Rays of the given slopes against vertical planes that are seen from their right side.
+    """Cast rays against one-sided vertical planes and return the nearest hits.
 
-    starts and directions are (planes, 2), lengths (planes,). A plane that runs left to right as
-    the camera sees it is seen; from behind it is not there.
+    A plane is visible if its direction runs from left to right in the image, and invisible from
+    behind.
+
+    Args:
+        camera: The camera.
+        slopes: (columns,) lateral metres per metre of depth of each ray.
+        starts: (planes, 2) start points in metres.
+        directions: (planes, 2) unit vectors.
+        lengths: (planes,) metres.
     """
     rays = camera.forward + slopes[:, None] * camera.right  # (columns, 2)
-    away = starts - camera.position
+    relative = starts - camera.position
     across = rays[:, :1] * directions[:, 1] - rays[:, 1:] * directions[:, 0]  # (columns, planes)
     # The normal to the right of the direction is (d_y, -d_x): its product with the ray is `across`.
-    seen = across < -1e-9
-    safe = np.where(seen, across, -1.0)
-    depth = (away[:, 0] * directions[:, 1] - away[:, 1] * directions[:, 0]) / safe
-    along = (away[:, 0] * rays[:, 1:] - away[:, 1] * rays[:, :1]) / safe
-    depth = np.where(seen & (depth > 0.3) & (along >= 0) & (along <= lengths), depth, np.inf)
+    visible = across < -1e-9
+    divisor = np.where(visible, across, -1.0)
+    depth = (relative[:, 0] * directions[:, 1] - relative[:, 1] * directions[:, 0]) / divisor
+    along = (relative[:, 0] * rays[:, 1:] - relative[:, 1] * rays[:, :1]) / divisor
+    depth = np.where(visible & (depth > 0.3) & (along >= 0) & (along <= lengths), depth, np.inf)
     plane = depth.argmin(axis=1)
     rows = np.arange(len(slopes))
     return RayHits(
@@ -132,60 +139,60 @@ def cast_rays(
 
 
 MIP_LEVELS = 6
-"""each half as fine as the one before"""
+"""Each with half the resolution of the one before"""
 MIP_SIZE_FACTOR = 1.36
-"""pixels of all levels per pixel of the first: 4 / 3, and what rounding up adds"""
+"""Pixels of all levels per pixel of the first: 4 / 3, plus rounding"""
 SPARE_PIXELS = 6_000_000
-"""more than all trees, vehicles and tiles of a catalogue take together"""
+"""More than all trees, vehicles and tiles of a catalogue together"""
 
 Packed = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True)
 class MipmappedTexture:
-    """Where one texture lies: one entry per level."""
+    """Location of a texture and its mipmaps in the cache, one entry per level."""
 
     offsets: NDArray[np.int64]
     widths: NDArray[np.int64]
-    """columns"""
+    """Columns"""
     heights: NDArray[np.int64]
-    """rows, which is also the distance between two columns"""
+    """Rows, which is also the stride between columns"""
 
 
 class TextureCache:
-    """Textures by key; when it is full it forgets all of them and they are drawn again."""
+    """Cache of textures by key; when it is full, it is cleared and textures are drawn again."""
 
     def __init__(self, capacity: int = 36_000_000) -> None:
-        """`capacity` in pixels of 4 bytes; memory is taken as it is used."""
+        """`capacity`: pixels of 4 bytes; memory is committed only when used."""
         self.pixels: Packed = np.zeros(capacity, np.uint32)
         self._used = 0
-        self._kept: dict[Hashable, MipmappedTexture] = {}
+        self._textures: dict[Hashable, MipmappedTexture] = {}
 
     def reserve(self, textures: Mapping[Hashable, int]) -> None:
-        """Forget everything unless the textures, by key with their pixels, fit beside the kept.
+        """Clear the cache if textures, given by key with their pixels, would not fit.
 
-        Besides these, SPARE_PIXELS stay free for what is met later in the same photo: nothing may
-        be forgotten while it is being read.
+        SPARE_PIXELS are left free for textures that the same photo needs later, because textures
+        must not be evicted while they are in use.
         """
-        missing = sum(pixels for key, pixels in textures.items() if key not in self._kept)
+        missing = sum(pixels for key, pixels in textures.items() if key not in self._textures)
         if self._used + missing * MIP_SIZE_FACTOR + SPARE_PIXELS > len(self.pixels):
             self._used = 0
-            self._kept.clear()
+            self._textures.clear()
 
     def get(self, key: Hashable, draw: Callable[[], Image.Image], *, rim: bool) -> MipmappedTexture:
-        """The texture called `key`, drawn now if it is not kept.
+        """Return a texture, drawing it if it is not cached.
 
-        `rim` gives every level a see-through edge of one pixel, for what is seen on all sides.
+        `rim` adds a transparent border of one pixel to every level, for sprites.
         """
-        if key not in self._kept:
-            self._kept[key] = self._store(np.asarray(draw()), rim)
-        return self._kept[key]
+        if key not in self._textures:
+            self._textures[key] = self._store(np.asarray(draw()), rim)
+        return self._textures[key]
 
     def _store(self, picture: NDArray[np.uint8], rim: bool) -> MipmappedTexture:
         offsets, widths, heights = [], [], []
         for level in range(MIP_LEVELS):
             if level:
-                picture = downsample(picture, careful=rim)
+                picture = downsample(picture, ignore_transparent=rim)
             stored = np.pad(picture, ((1, 1), (1, 1), (0, 0))) if rim else picture
             packed = np.ascontiguousarray(stored.transpose(1, 0, 2)).view(np.uint32).ravel()
             self.pixels[self._used : self._used + len(packed)] = packed
@@ -196,14 +203,14 @@ class TextureCache:
         return MipmappedTexture(np.array(offsets), np.array(widths), np.array(heights))
 
 
-def downsample(picture: NDArray[np.uint8], *, careful: bool) -> NDArray[np.uint8]:
-    """(h, w, 4) -> (ceil(h / 2), ceil(w / 2), 4): mean colours, and one of the four codes.
+def downsample(picture: NDArray[np.uint8], *, ignore_transparent: bool) -> NDArray[np.uint8]:
+    """Halve (h, w, 4) to (ceil(h / 2), ceil(w / 2), 4): mean colours, and one of four codes.
 
-    `careful` leaves see-through pixels out of the mean, as outlines against the sky need it.
+    `ignore_transparent` excludes transparent pixels from the mean, for outlines against the sky.
     """
-    if not careful:
+    if not ignore_transparent:
         high, wide = picture.shape[:2]
-        # As RGBX, so that Pillow takes the four bytes for four channels of equal rank.
+        # As RGBX, so that Pillow treats all four bytes as equal channels, without alpha.
         whole = Image.frombuffer("RGBX", (wide, high), picture.tobytes(), "raw", "RGBX", 0, 1)
         half = np.array(whole.reduce(2))
         half[..., 3] = picture[::2, ::2, 3]
@@ -221,25 +228,25 @@ def downsample(picture: NDArray[np.uint8], *, careful: bool) -> NDArray[np.uint8
 
 
 SUPERSAMPLING = 2
-"""canvas pixels per photo pixel, each way"""
+"""Canvas pixels per photo pixel and axis"""
 
 
 @dataclass(slots=True)
 class RenderBuffers:
-    """What the lens sees before any light falls on it; (x, y) arrays."""
+    """Unlit rendering of a view; all arrays are indexed (x, y)."""
 
     canvas: Packed
-    """(FINE * width, FINE * height) colours and codes, 0 where only sky is"""
+    """(SUPERSAMPLING * width, SUPERSAMPLING * height) colours and codes, 0 for sky"""
     depth: NDArray[np.float32]
-    """(width, height) metres, infinite for the sky"""
+    """(width, height) metres, infinite for sky"""
     sun: NDArray[np.float32]
-    """(width, height) share of the sun's light that arrives"""
+    """(width, height) fraction of direct sunlight"""
     lamp: NDArray[np.float32]
-    """(width,) share of the street lamps' light, by night"""
+    """(width,) fraction of street lamp light"""
 
 
 def sample_texture(
-    memory: TextureCache,
+    cache: TextureCache,
     camera: Camera,
     columns: NDArray[np.int64],
     depth: Floats,
@@ -251,7 +258,11 @@ def sample_texture(
     last: int,
     rim: int = 0,
 ) -> Packed:
-    """(columns, last - first) texels; `top` is the height of the texture's upper edge."""
+    """Sample (columns, last - first) texels of canvas rows `first` to `last`.
+
+    `top`: height of the texture's upper edge in metres; `scale`: texels per metre; `offset` and
+    `rows`: position and height of each texture column in the cache.
+    """
     per_row = (scale * depth / camera.focal).astype(np.float32)
     horizon = camera.horizons(SUPERSAMPLING)[columns]
     start = (scale * (top - camera.eye) - per_row * horizon).astype(np.float32) + rim
@@ -261,18 +272,18 @@ def sample_texture(
     np.clip(v, 0, (rows - 1)[:, None], out=v)
     index = v.astype(np.int32)
     index += offset.astype(np.int32)[:, None]
-    return memory.pixels.take(index)
+    return cache.pixels.take(index)
 
 
 def choose_mip_level(
     finest: float, depth: NDArray[np.floating], camera: Camera, bias: float = 0.25
 ) -> NDArray[np.int64]:
-    """Which smaller copy to read, so that about one texel falls on one canvas pixel."""
+    """Choose the mipmap level with about one texel per canvas pixel."""
     texels = finest * depth / (camera.focal * SUPERSAMPLING)
     return np.asarray(np.clip(np.log2(np.maximum(texels, 1.0)) + bias, 0, MIP_LEVELS - 1), np.int64)
 
 
 def project_row(camera: Camera, z: float, depth: Floats, columns: NDArray[np.int64]) -> Floats:
-    """Canvas row of the height z at the columns' depths."""
+    """Return the canvas row of the height `z` at each column's depth."""
     horizon = camera.horizons(SUPERSAMPLING)[columns]
     return np.asarray((horizon + camera.focal * (camera.eye - z) / depth) * SUPERSAMPLING)

@@ -1,7 +1,7 @@
-"""The one catalogue that all houses and streets of a city are made of.
+"""Catalogue: the parts that all houses and streets of a city share.
 
-A catalogue is a city's style: another seed has other walls, colours, window types and trees. Its
-sizes are small on purpose: a thousand places share them, so that no single part tells a place.
+A catalogue is a city's style: another seed gives other walls, colours, window types and trees. It
+is small on purpose: a thousand places share its parts, so that no single part identifies a place.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ DOORS = 5
 SHOPS = 16
 TREES = 6
 ACCENTS = 6
-"""colours of doors, signs and awnings"""
+"""Colours of doors, signs and awnings"""
 TRIMS = 4
 ROOFS = 3
 SYLLABLES = (
@@ -62,40 +62,40 @@ VEHICLE_PAINTS: tuple[Colour, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """Parts, drawn once. All RGBA pictures carry the codes of `codes` in their fourth channel."""
+    """The drawn parts. The fourth channel of RGBA images holds the material codes of `textures`."""
 
     walls: tuple[Image.Image, ...]
     """RGB tiles"""
     wall_colours: tuple[Colour, ...]
     windows: tuple[tuple[Image.Image, ...], ...]
-    """by type, then by variant"""
+    """By type, then by variant"""
     window_types: tuple[WindowType, ...]
     doors: tuple[Image.Image, ...]
     signs: tuple[Image.Image, ...]
-    """shop boards with names"""
+    """Shop signs with names"""
     blades: tuple[Sprite, ...]
-    """boards that stand out from a facade"""
+    """Projecting shop signs"""
     awnings: tuple[tuple[Colour, Colour], ...]
     trims: tuple[Colour, ...]
     roofs: tuple[Colour, ...]
     trees: dict[str, tuple[Sprite, ...]]
-    """by foliage"""
+    """By foliage"""
     vehicle_sides: tuple[Sprite, ...]
     vehicle_fronts: tuple[Sprite, ...]
     vehicle_rears: tuple[Sprite, ...]
     vehicle_screens: tuple[Sprite, ...]
-    """the cabin's front and back"""
+    """The cabin's front and back"""
     cabins: tuple[tuple[float, float], ...]
-    """metres from the nose to the cabin's front and to its back"""
+    """Metres from the vehicle's front to the cabin's front and back"""
     lamps: tuple[Sprite, ...]
     posts: tuple[Sprite, ...]
     boxes: tuple[Sprite, ...]
 
 
 def make_catalogue(seed: int) -> Catalogue:
-    """The style of the city with that catalogue seed."""
+    """Draw the catalogue of a seed."""
     rng = random_stream(seed, "catalogue")
-    hue = rng.uniform(0.04, 0.16)  # the city's stone: from pink through ochre to straw
+    hue = rng.uniform(0.04, 0.16)  # hue of the city's stone, from pink through ochre to straw
     kinds = [WALL_KINDS[i] for i in rng.permutation(len(WALL_KINDS))]
     colours = [_wall_colour(rng, hue) for _ in range(WALLS)]
     walls = tuple(
@@ -196,7 +196,7 @@ def _window_type(rng: np.random.Generator, trims: tuple[Colour, ...]) -> WindowT
 
 
 def _sign(name: str, colour: Colour, style: int) -> Image.Image:
-    """A board of 20 pixels' height as long as its name."""
+    """Draw a shop sign of 20 pixels height, as wide as its name."""
     font = ImageFont.load_default(size=15)
     width = int(font.getlength(name)) + 16
     ground, ink = (colour, (244, 240, 228)) if style != 1 else ((238, 234, 222), colour)

@@ -1,9 +1,4 @@
-"""One house: the arrangement of the catalogue's parts that makes it this house.
-
-Roofs and eaves: what a house has against the sky.
-
-A house's facade as a texture: walls, openings and shops, from the eaves to the pavement.
-"""
+"""Houses: the arrangement of catalogue parts, and the facade texture drawn from it."""
 
 from __future__ import annotations
 
@@ -37,30 +32,30 @@ from shared.synthetic_city.textures import (
 )
 
 HEADROOM = 3.6
-"""metres above the eaves for roof, gable and chimneys; also the see-through rim of the texture"""
+"""Metres above the eaves for roof, gable and chimneys; partly transparent in the texture"""
 
 
 @dataclass(frozen=True, slots=True)
 class House:
-    """The arrangement of one house, metres; indices are those of the catalogue."""
+    """The arrangement of one house; metres, and indices into the catalogue."""
 
     width: float
     floors: int
     ground_floor: float
-    """height of the ground floor"""
+    """Height of the ground floor"""
     storey: float
-    """height of every floor above it"""
+    """Height of every floor above it"""
     wall: int
     base_wall: int
     window: int
     upper_window: int
     bays: int
     blank_bays: tuple[int, ...]
-    """bays without windows"""
+    """Bays without windows"""
     door_bay: int
     door: int
     shops: tuple[int, ...]
-    """sign of each bay's shop, -1 for none"""
+    """Sign of each bay's shop, -1 for none"""
     awning: int
     trim: int
     roof: str
@@ -73,7 +68,7 @@ class House:
 
     @property
     def eaves(self) -> float:
-        """Height of the wall's top."""
+        """Height of the eaves."""
         return self.ground_floor + (self.floors - 1) * self.storey
 
     @property
@@ -83,16 +78,19 @@ class House:
 
     @property
     def pixels(self) -> int:
-        """Of its texture."""
+        """Number of pixels of the texture."""
         return metres_to_pixels(self.width) * metres_to_pixels(self.top)
 
 
 def arrange_house(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
-    """A house for a plot `width` metres wide; `shopping` is the share of bays with a shop."""
+    """Arrange a random house for a plot `width` metres wide.
+
+    `shopping`: probability that the house has shops; `floors`: typical number of floors.
+    """
     bays = max(1, round(width / rng.uniform(2.3, 3.3)))
-    trade = rng.uniform() < shopping
+    has_shops = rng.uniform() < shopping
     shops = tuple(
-        int(rng.integers(SHOPS)) if trade and rng.uniform() < 0.8 else -1 for _ in range(bays)
+        int(rng.integers(SHOPS)) if has_shops and rng.uniform() < 0.8 else -1 for _ in range(bays)
     )
     window = int(rng.integers(WINDOW_TYPES))
     blank = tuple(int(b) for b in range(bays) if bays > 2 and rng.uniform() < 0.10)
@@ -123,11 +121,12 @@ def arrange_house(rng: np.random.Generator, width: float, shopping: float, floor
 
 
 def bay_centre_column(house: House, bay: int) -> int:
-    """The column of the facade's texture that is the middle of a bay."""
+    """Return the texture column of the centre of a bay."""
     return round((bay + 0.5) * house.width / house.bays * PIXELS_PER_METRE)
 
 
 def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: int) -> None:
+    """Draw the roof and chimneys above row `eaves`."""
     draw = ImageDraw.Draw(picture)
     width = picture.width
     colour = catalogue.roofs[house.roof_colour]
@@ -176,6 +175,7 @@ def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: i
 def draw_eaves(
     draw: ImageDraw.ImageDraw, house: House, width: int, eaves: int, trim: Colour
 ) -> None:
+    """Draw the cornice or parapet at row `eaves`."""
     if house.roof == "gable":
         return
     if house.roof == "parapet":
@@ -199,11 +199,11 @@ def draw_eaves(
 
 
 ANY_CODE = [0] + [255] * 255
-"""a table for `point`: 255 wherever something is"""
+"""Lookup table for `Image.point`: 255 for all codes but transparent"""
 
 
 def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
-    """The facade from `top` down to the pavement, RGBA with codes, PIXELS_PER_METRE."""
+    """Draw the facade from `top` to the pavement, RGBA with material codes."""
     rng = np.random.default_rng(house.detail_seed)
     width, height = metres_to_pixels(house.width), metres_to_pixels(house.top)
     eaves = height - metres_to_pixels(house.eaves)
@@ -314,7 +314,7 @@ def _street_level(
 
 
 def _door(picture: Image.Image, house: House, catalogue: Catalogue) -> None:
-    """The door reaches the pavement: it goes over the plinth."""
+    """Draw the door over the plinth, down to the pavement."""
     door = catalogue.doors[house.door]
     x = bay_centre_column(house, house.door_bay) - door.width // 2
     picture.paste(door, (x, picture.height - door.height), _solid(door))
@@ -340,5 +340,5 @@ def _quoins(draw: ImageDraw.ImageDraw, width: int, top: int, bottom: int, trim: 
 
 
 def _solid(sprite: Image.Image) -> Image.Image:
-    """The mask of a part: everything that is not see-through."""
+    """Return the mask of the pixels that are not transparent."""
     return sprite.getchannel("A").point(ANY_CODE)

@@ -1,8 +1,8 @@
-"""Which photos are taken: where, when, with which camera, and what each is for.
+"""City plan: which photos are taken, where, when, with which camera, and for which purpose.
 
-The city has three quarters of one style, far from each other: the map, whose photos are the
-database and most queries; the outskirts, where the queries come from that no photo of the database
-answers; and the school, whose photos a trainer learns from, so that nothing it sees is asked later.
+The city has three quarters of one style, far from each other: `map`, with the database photos and
+most queries; `outskirts`, with queries that no database photo matches; and `school`, with the
+training photos, so that no place of the evaluation is in the training set.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from shared.synthetic_city.textures import random_stream
 
 ZONE_NUMBER, ZONE_LETTER = 32, "T"
 ORIGIN_M = (480_000.0, 4_880_000.0)
-"""open sea south of Genoa: nobody mistakes it for a real city"""
+"""In the sea south of Genoa, so that it can't be confused with a real city"""
 QUARTER_DISTANCE_M = 400.0
-"""between two quarters: more than the 200 m that "out of map" promises"""
+"""Between two quarters; `out_of_map` queries are at least 200 m from the database"""
 LANE_M = 1.6
-"""by which a camera drives to the right of the street's middle; it looks to the left"""
+"""Offset of the camera to the right of the street's centre; it looks to the left"""
 DATABASE_FOV = 72.0
 QUERY_FOV = (58.0, 86.0)
 STEP_M = 3.0
-"""a place's views are taken from up to this far before and behind it"""
+"""Maximum distance of a database view from its place along the street"""
 QUERY_ALONG_M = 7.0
 QUERY_ACROSS_M = 1.5
 QUERY_YAW = 20.0
 OTHER_WAY_SHARE = 0.08
-"""of the queries on the map"""
+"""Fraction of the in-map queries that look the other way"""
 SECONDS_PER_PHOTO = 4
 
 
 @dataclass(frozen=True, slots=True)
 class CityOptions:
-    """Every argument that decides a pixel."""
+    """All arguments that determine the generated dataset."""
 
     places: int
     views: int
@@ -53,80 +53,82 @@ class CityOptions:
     seed: int
     catalogue_seed: int
     out_of_map: float
-    """share of the queries"""
+    """Fraction of the queries"""
     width: int
     height: int
     train: bool = True
-    """whether a training set is drawn as well"""
+    """Whether to generate a training set, too"""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedPhoto:
-    """One photo to be taken."""
+    """One photo to be rendered."""
 
     role: str
     """`database`, `query` or `train`"""
     kind: str
-    """`in_map`, `out_of_map` or `other_way`; always `in_map` for what is no query"""
+    """`in_map`, `out_of_map` or `other_way`; always `in_map` for photos that are not queries"""
     quarter: str
     place: int
     camera: Camera
     session: CaptureSession
     number: int
-    """among the shots of its role"""
+    """Number among the photos of its role"""
     folder: str
-    """below the data set's root"""
+    """Relative to the dataset's root"""
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class CityPlan:
+    """The quarters and photos of a city."""
+
     options: CityOptions
     quarters: dict[str, Quarter]
     photos: list[PlannedPhoto]
-    """neighbours in a street follow each other"""
+    """Sorted so that neighbours in a street follow each other"""
 
 
 def city_name(options: CityOptions) -> str:
-    """The lowercase name by which gsv_xs knows the city."""
+    """Return the lowercase name of the city, as used in gsv_xs."""
     return f"synth{options.catalogue_seed}x{options.seed}"
 
 
 def make_plan(options: CityOptions) -> CityPlan:
-    """All photos of the city with those options."""
+    """Plan all photos of a city."""
     outside = round(options.queries * options.out_of_map)
     inside = options.queries - outside
     origin = ORIGIN_M
     quarters, places = {}, {}
-    for name, wanted in (
+    for name, place_count in (
         ("map", options.places),
         ("outskirts", max(1, min(outside, options.places))),
         ("school", options.places),
     ):
-        quarter, found = make_quarter(options.seed, name, wanted, origin)
-        quarters[name], places[name] = quarter, found
+        quarter, view_points = make_quarter(options.seed, name, place_count, origin)
+        quarters[name], places[name] = quarter, view_points
         origin = (quarter.far_east + QUARTER_DISTANCE_M, origin[1])
-    shots = _database_shots(options, places["map"])
+    photos = _database_photos(options, places["map"])
     rng = random_stream(options.seed, "queries")
-    turned = round(inside * OTHER_WAY_SHARE)
+    other_way = round(inside * OTHER_WAY_SHARE)
     order = np.resize(rng.permutation(len(places["map"])), inside)
     for number in range(options.queries):
         if number < inside:
-            kind = "other_way" if number < turned else "in_map"
+            kind = "other_way" if number < other_way else "in_map"
             place, quarter_name = places["map"][int(order[number])], "map"
         else:
             kind, quarter_name = "out_of_map", "outskirts"
             place = places["outskirts"][(number - inside) % len(places["outskirts"])]
-        shots.append(_query_shot(options, place, quarter_name, kind, number))
+        photos.append(_query_photo(options, place, quarter_name, kind, number))
     if options.train:
-        shots += _train_shots(options, places["school"])
-    shots.sort(key=lambda shot: (shot.quarter, shot.place, shot.role, shot.number))
-    return CityPlan(options, quarters, shots)
+        photos += _train_photos(options, places["school"])
+    photos.sort(key=lambda photo: (photo.quarter, photo.place, photo.role, photo.number))
+    return CityPlan(options, quarters, photos)
 
 
-def _database_shots(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
-    """`views` shots of each place: sessions in turn, a step apart, a little turned."""
-    shots = []
+def _database_photos(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
+    """Plan `views` photos of each place, in alternating sessions, shifted and rotated slightly."""
+    photos = []
     steps = math.ceil(options.views / len(DATABASE_SESSIONS))
     for place in places:
         for view in range(options.views):
@@ -144,13 +146,13 @@ def _database_shots(options: CityOptions, places: list[ViewPoint]) -> list[Plann
                 rng=rng,
             )
             number = place.number * options.views + view
-            shots.append(
+            photos.append(
                 _plan_photo(options, "database", "in_map", "map", place, camera, session, number)
             )
-    return shots
+    return photos
 
 
-def _query_shot(
+def _query_photo(
     options: CityOptions, place: ViewPoint, quarter: str, kind: str, number: int
 ) -> PlannedPhoto:
     rng = random_stream(options.seed, "query", number)
@@ -167,9 +169,9 @@ def _query_shot(
     return _plan_photo(options, "query", kind, quarter, place, camera, session, number)
 
 
-def _train_shots(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
-    """At least four shots of each place of the school, each in another session."""
-    shots = []
+def _train_photos(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
+    """Plan at least four photos of each training place, each in a different session."""
+    photos = []
     views = min(max(4, options.views), len(SESSIONS))
     for place in places:
         order = random_stream(options.seed, "train", place.number).permutation(len(SESSIONS))
@@ -186,10 +188,10 @@ def _train_shots(options: CityOptions, places: list[ViewPoint]) -> list[PlannedP
             )
             number = place.number * views + view
             session = SESSIONS[int(order[view])]
-            shots.append(
+            photos.append(
                 _plan_photo(options, "train", "in_map", "school", place, camera, session, number)
             )
-    return shots
+    return photos
 
 
 def _camera(
@@ -202,16 +204,16 @@ def _camera(
     fov: float,
     rng: np.random.Generator,
 ) -> Camera:
-    """A camera that much farther along the street, across it, and turned from the place's view.
+    """Create a camera displaced and rotated from the place's view point.
 
-    Its position is rounded to the centimetre that file names hold, so that both are one.
+    The position is rounded to centimetres as in file names, so that both agree.
     """
     street = place.street
-    spot = street.start + street.direction * (place.along + along)
-    spot = spot + street.left * (across - LANE_M)
+    position = street.start + street.direction * (place.along + along)
+    position = position + street.left * (across - LANE_M)
     return Camera(
-        x=round(float(spot[0]), 2),
-        y=round(float(spot[1]), 2),
+        x=round(float(position[0]), 2),
+        y=round(float(position[1]), 2),
         yaw=round((place.yaw + yaw) % 360, 2),
         fov=fov,
         eye=rng.uniform(1.55, 2.3),
@@ -234,7 +236,7 @@ def _plan_photo(
 ) -> PlannedPhoto:
     city = city_name(options)
     folder = {"database": "database", "query": "queries"}.get(role, f"gsv_xs/train/{city}")
-    # gsv_xs reads the place from the note; elsewhere the note is the session's name.
+    # gsv_xs stores the place in the note; other photos store the session's name there.
     note = f"{place.number:05d}_{city}" if role == "train" else session.name
     name = UtmFileName(
         east=camera.x,
@@ -250,5 +252,5 @@ def _plan_photo(
 
 
 def _capture_time(session: CaptureSession, number: int) -> datetime:
-    """A drive takes hours: its photos follow each other within the session's day."""
+    """Return the time of a photo: they follow each other within the session's day."""
     return session.starts_at + timedelta(seconds=SECONDS_PER_PHOTO * (number % 2000))

@@ -1,4 +1,4 @@
-"""From a view to a photo: the session's light, weather, sky, camera and JPEG."""
+"""Postprocessing of a rendered view: the session's light, weather, sky and camera effects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shared.synthetic_city.textures import (
 
 CLOUD_SHAPE = (256, 1024)
 GRAIN_SPARE = 256
-"""pixels each way by which the grain is larger than a photo: so each gets another cut of it"""
+"""Pixels per axis by which the grain exceeds a photo, so that each photo has another crop"""
 SKY_COARSE = 4
 LAMPLIGHT = (0.62, 0.46, 0.24)
 GLOW = (1.5, 1.2, 0.75)
@@ -32,7 +32,7 @@ Light = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class SkyAndGrain:
-    """What every photo of a city shares: clouds to cut from, and grain."""
+    """Cloud and grain textures that all photos of a city are cropped from."""
 
     clouds: GreyImage
     grain: Light
@@ -40,7 +40,7 @@ class SkyAndGrain:
 
     @classmethod
     def generate(cls, seed: int, width: int, height: int) -> SkyAndGrain:
-        """For photos of that many pixels."""
+        """Generate textures for photos of `width` x `height` pixels."""
         rng = random_stream(seed, "film")
         clouds = (
             0.6 * smooth_noise(rng, CLOUD_SHAPE, 64)
@@ -56,12 +56,15 @@ def postprocess(
     view: RenderBuffers,
     camera: Camera,
     session: CaptureSession,
-    film: SkyAndGrain,
+    sky_and_grain: SkyAndGrain,
     rng: np.random.Generator,
 ) -> Image.Image:
-    """The RGB photo; `rng` is the photo's own."""
+    """Apply light, weather, sky and camera effects; returns the RGB photo.
+
+    `rng`: the random stream of this photo.
+    """
     light = _light(view, session)
-    colours = _mean_colours(view)  # three planes: far faster than pixels of three
+    colours = _mean_colours(view)  # one plane per channel: much faster than interleaved channels
     solid = (view.canvas >= 1 << 24).view(np.uint8)
     cover = _mean(solid).astype(np.float32)
     if session.snow or session.wet:
@@ -69,19 +72,19 @@ def postprocess(
     through = np.exp(-session.haze_per_m * np.minimum(view.depth, 1000.0)).astype(np.float32)
     veil = cover * (1 - through)
     gap = None if cover.all() else 1 - cover
-    sky = None if gap is None else _sky(camera, session, film, rng)
+    sky = None if gap is None else _sky(camera, session, sky_and_grain, rng)
     for plane in range(3):
-        # Where only sky is, cover is 0; a rim pixel takes its share of both.
+        # cover is 0 for sky; pixels on edges mix both.
         colours[plane] *= light[plane]
         colours[plane] *= through
         colours[plane] += veil * np.float32(session.haze[plane])
         if sky is not None:
             colours[plane] += gap * sky[plane]
-    return _expose(colours, session, film, rng)
+    return _expose(colours, session, sky_and_grain, rng)
 
 
 def _mean(fine: NDArray[np.uint8] | Light) -> Light:
-    """(FINE * w, FINE * h) -> (w, h) means."""
+    """(SUPERSAMPLING * w, SUPERSAMPLING * h) -> (w, h) means."""
     total = fine[::SUPERSAMPLING, ::SUPERSAMPLING].astype(np.float32)
     for i, j in ((0, 1), (1, 0), (1, 1)):
         total += fine[i::SUPERSAMPLING, j::SUPERSAMPLING]
@@ -89,7 +92,7 @@ def _mean(fine: NDArray[np.uint8] | Light) -> Light:
 
 
 def _mean_colours(view: RenderBuffers) -> Light:
-    """(3, width, height) shares of full brightness; what is see-through counts as black."""
+    """Return (3, width, height) fractions of full brightness; transparent pixels are black."""
     wide, high = view.canvas.shape
     packed = Image.frombuffer("RGBX", (high, wide), view.canvas, "raw", "RGBX", 0, 1)
     small = np.asarray(packed.reduce(SUPERSAMPLING))
@@ -100,7 +103,7 @@ def _mean_colours(view: RenderBuffers) -> Light:
 
 
 def _light(view: RenderBuffers, session: CaptureSession) -> Light:
-    """(3, width, height) what falls on each pixel, and what it gives by itself."""
+    """Return (3, width, height): the light on each pixel plus its emission."""
     light = np.empty((3, *view.sun.shape), np.float32)
     shine = None
     if session.glow:
@@ -117,7 +120,7 @@ def _light(view: RenderBuffers, session: CaptureSession) -> Light:
 
 
 def _weather(colours: Light, view: RenderBuffers, camera: Camera, session: CaptureSession) -> None:
-    """Snow whitens what lies open to the sky; rain darkens the ground and lets it mirror."""
+    """Apply snow to surfaces open to the sky, and rain to the ground, which reflects the sky."""
     flat = (view.canvas[::SUPERSAMPLING, ::SUPERSAMPLING] >> 24) == CODE_FLAT
     if session.snow:
         share = flat * np.float32(session.snow)
@@ -131,9 +134,9 @@ def _weather(colours: Light, view: RenderBuffers, camera: Camera, session: Captu
 
 
 def _sky(
-    camera: Camera, session: CaptureSession, film: SkyAndGrain, rng: np.random.Generator
+    camera: Camera, session: CaptureSession, sky_and_grain: SkyAndGrain, rng: np.random.Generator
 ) -> Light:
-    """(3, width, height): a gradient by elevation, with clouds; coarse, then made smooth."""
+    """Return (3, width, height): a gradient by elevation with clouds, upsampled."""
     width, height = camera.width // SKY_COARSE, camera.height // SKY_COARSE
     rows = np.arange(height, dtype=np.float32) * SKY_COARSE
     elevation = np.clip((camera.horizon * camera.height - rows) / camera.focal, 0, 1.2)
@@ -142,7 +145,7 @@ def _sky(
     x0 = int(camera.yaw / 360 * CLOUD_SHAPE[1] / 2) + int(rng.integers(64))
     x0 %= CLOUD_SHAPE[1] - wide
     y0 = int(rng.integers(CLOUD_SHAPE[0] - 128))
-    clouds = Image.fromarray(film.clouds).resize(
+    clouds = Image.fromarray(sky_and_grain.clouds).resize(
         (width, height), Image.Resampling.BILINEAR, box=(x0, y0, x0 + wide, y0 + 128)
     )
     mask = np.clip((np.asarray(clouds) + 2 * session.clouds - 0.9) * 2.0, 0, 1)
@@ -158,9 +161,9 @@ def _sky(
 
 
 def _expose(
-    colours: Light, session: CaptureSession, film: SkyAndGrain, rng: np.random.Generator
+    colours: Light, session: CaptureSession, sky_and_grain: SkyAndGrain, rng: np.random.Generator
 ) -> Image.Image:
-    """Exposure, white balance, contrast, vignette, blur and grain."""
+    """Apply exposure, white balance, contrast, vignette, blur and grain."""
     exposure = math.exp(rng.normal(0, session.exposure_spread))
     balance = np.asarray(session.gain) * rng.normal(1, 0.01, 3) * exposure * 255
     _, width, height = colours.shape
@@ -171,27 +174,27 @@ def _expose(
         grey = (colours[0] + colours[1] + colours[2]) * np.float32(session.mixing / 3)
         colours *= np.float32(1 - session.mixing)
         colours += grey
-    x, y = (int(at) for at in rng.integers(GRAIN_SPARE, size=2))
+    x, y = (int(offset) for offset in rng.integers(GRAIN_SPARE, size=2))
     photo = np.empty((height, width, 3), np.uint8)
     for plane in range(3):
         colours[plane] *= vignette * np.float32(balance[plane])
         colours[plane] += np.float32(118 * (1 - session.contrast))
         if not session.blur:
-            grain = film.grain[plane, x : x + width, y : y + height]
+            grain = sky_and_grain.grain[plane, x : x + width, y : y + height]
             colours[plane] += np.float32(session.noise) * grain
         np.clip(colours[plane], 0, 255, out=colours[plane])
         photo[..., plane] = colours[plane].T
     image = Image.fromarray(photo)
-    if session.blur:  # the lens comes before the sensor: grain is not blurred
+    if session.blur:  # blur is of the lens, grain of the sensor: grain is not blurred
         image = image.filter(ImageFilter.BoxBlur(session.blur))
-        grain = film.grain[:, x : x + width, y : y + height].transpose(2, 1, 0)
+        grain = sky_and_grain.grain[:, x : x + width, y : y + height].transpose(2, 1, 0)
         noisy = np.asarray(image) + np.float32(session.noise) * grain
         image = Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8))
     return image
 
 
 def encode_jpeg(photo: Image.Image, session: CaptureSession) -> bytes:
-    """The photo as the bytes of a JPEG file."""
+    """Encode the photo as JPEG with the session's quality."""
     buffer = io.BytesIO()
     photo.save(buffer, "JPEG", quality=session.quality)
     return buffer.getvalue()

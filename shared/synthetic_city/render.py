@@ -1,6 +1,6 @@
-"""One photo's scene: rays against facade rows, the ground below, things in front, by depth.
+"""Renderer: facades by ray casting, the ground, and sprites in front of them, sorted by depth.
 
-The ground: asphalt and paving slabs as tiles that repeat over the whole city, in perspective.
+The ground is asphalt and paving tiles that repeat over the whole city, in perspective.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ KERB_STONE = np.uint32(CODE_FLAT << 24 | 0x8E9498)
 
 
 def draw_asphalt(seed: int) -> Image.Image:
-    """A square tile of TILE_M metres that wraps around."""
+    """Draw a seamless square tile of TILE_M metres."""
     rng = random_stream(seed, "asphalt")
     light = 0.42 + 0.012 * rng.normal(0, 1, (TILE_PIXELS, TILE_PIXELS)).astype(np.float32)
     light += 0.03 * smooth_noise(rng, light.shape, 64) + 0.015 * smooth_noise(rng, light.shape, 16)
-    for _ in range(5):  # patches where it was mended
+    for _ in range(5):  # repaired patches
         x, y = rng.integers(0, TILE_PIXELS - 90, 2)
         wide, high = rng.integers(24, 90, 2)
         light[y : y + high, x : x + wide] += rng.uniform(-0.05, 0.02)
@@ -61,7 +61,7 @@ def draw_asphalt(seed: int) -> Image.Image:
 
 
 def draw_paving(seed: int) -> Image.Image:
-    """A square tile of TILE_M metres that wraps around: slabs of half a metre."""
+    """Draw a seamless square tile of TILE_M metres: slabs of half a metre."""
     rng = random_stream(seed, "paving")
     rows, columns = np.mgrid[0:TILE_PIXELS, 0:TILE_PIXELS]
     slab = TILE_PIXELS // 32
@@ -86,9 +86,12 @@ def paint_ground(
     hits: RayHits,
     quarter: Quarter,
     sides: NDArray[np.int64],
-    memory: TextureCache,
+    cache: TextureCache,
 ) -> None:
-    """Paint what lies below the houses' feet; `hits` are those against the quarter's `sides`."""
+    """Paint the ground in front of the facades.
+
+    `hits`: the ray hits on the facade rows `sides` of the quarter.
+    """
     fine_height = view.canvas.shape[1]
     columns = np.arange(view.canvas.shape[0])
     horizon = camera.horizons(SUPERSAMPLING)
@@ -114,14 +117,14 @@ def paint_ground(
     hit = np.isfinite(hits.depth)
     facing = np.where(hit, np.maximum(hits.facing, 1e-3), 1.0).astype(np.float32)
     wall = np.where(hit, hits.depth, 1e4).astype(np.float32)
-    to_wall = (wall[:, None] - depth) * facing[:, None]  # metres before the facade
-    asphalt = memory.get("asphalt", lambda: draw_asphalt(quarter.seed), rim=False)
-    paving = memory.get("paving", lambda: draw_paving(quarter.seed), rim=False)
+    to_wall = (wall[:, None] - depth) * facing[:, None]  # metres in front of the facade
+    asphalt = cache.get("asphalt", lambda: draw_asphalt(quarter.seed), rim=False)
+    paving = cache.get("paving", lambda: draw_paving(quarter.seed), rim=False)
     road = to_wall > PAVEMENT_M
     base = np.where(
         road, asphalt.offsets[level].astype(np.int32), paving.offsets[level].astype(np.int32)
     )
-    texels = memory.pixels.take(cell + base)
+    texels = cache.pixels.take(cell + base)
     kerb = np.abs(to_wall - PAVEMENT_M) < KERB_M / 2
     texels[kerb] = KERB_STONE
     middles = np.array([quarter.sides[s].half_width for s in sides], np.float32)
@@ -150,19 +153,19 @@ LAMP_SPACING_M = 25.0
 
 
 class QuarterRenderer:
-    """Paints views of one quarter; keeps the textures and the things it has met."""
+    """Renders views of one quarter; caches textures and street objects."""
 
-    def __init__(self, quarter: Quarter, catalogue: Catalogue, memory: TextureCache) -> None:
+    def __init__(self, quarter: Quarter, catalogue: Catalogue, cache: TextureCache) -> None:
         self.quarter = quarter
         self.catalogue = catalogue
-        self.memory = memory
-        self._things = VisibleObjects(quarter, catalogue)
+        self.cache = cache
+        self._objects = VisibleObjects(quarter, catalogue)
         self._side_middles = (
             quarter.side_starts + quarter.side_directions * quarter.side_lengths[:, None] / 2
         )
 
     def view(self, camera: Camera, session: CaptureSession) -> RenderBuffers:
-        """What the camera sees on the session's day."""
+        """Render the view of a camera on the day of a session, without lighting."""
         width, height = camera.width, camera.height
         view = RenderBuffers(
             canvas=np.zeros((width * SUPERSAMPLING, height * SUPERSAMPLING), np.uint32),
@@ -181,9 +184,9 @@ class QuarterRenderer:
             self.quarter.side_lengths[sides],
         )
         self._paint_facades(view, camera, session, hits, sides)
-        paint_ground(view, camera, hits, self.quarter, sides, self.memory)
+        paint_ground(view, camera, hits, self.quarter, sides, self.cache)
         for item in sorted(
-            self._things.items(camera, session, sides[near[sides] < OBJECT_RANGE_M], slopes),
+            self._objects.items(camera, session, sides[near[sides] < OBJECT_RANGE_M], slopes),
             key=lambda item: -item.depth,
         ):
             self._paint_item(view, camera, item, hits.depth)
@@ -204,36 +207,36 @@ class QuarterRenderer:
         side = sides[hits.plane[columns]]
         plot = np.empty(len(columns), np.int64)
         for number in np.unique(side):
-            here = side == number
+            rows_of_side = side == number
             cuts = self.quarter.sides[number].cuts
-            found = np.searchsorted(cuts, along[here], side="right") - 1
-            plot[here] = np.clip(found, 0, len(cuts) - 2)
+            plots = np.searchsorted(cuts, along[rows_of_side], side="right") - 1
+            plot[rows_of_side] = np.clip(plots, 0, len(cuts) - 2)
         level = choose_mip_level(PIXELS_PER_METRE, depth, camera)
         offset = np.empty(len(columns), np.int64)
         rows = np.empty(len(columns), np.int64)
         top = np.empty(len(columns))
         houses = sorted(set(zip(side.tolist(), plot.tolist(), strict=True)))
-        self.memory.reserve(
+        self.cache.reserve(
             {self._key(*house): self.quarter.house(*house).pixels for house in houses}
         )
         for number, lot in houses:
-            here = np.flatnonzero((side == number) & (plot == lot))
+            house_columns = np.flatnonzero((side == number) & (plot == lot))
             house = self.quarter.house(number, lot)
-            texture = self.memory.get(
+            texture = self.cache.get(
                 self._key(number, lot), partial(draw_house, house, self.catalogue), rim=False
             )
-            at = level[here]
-            scale = PIXELS_PER_METRE / 2.0**at
-            across = (along[here] - self.quarter.sides[number].cuts[lot]) * scale
-            column = np.clip(across.astype(np.int64), 0, texture.widths[at] - 1)
-            offset[here] = texture.offsets[at] + column * texture.heights[at]
-            rows[here] = texture.heights[at]
-            top[here] = house.top
+            levels = level[house_columns]
+            scale = PIXELS_PER_METRE / 2.0**levels
+            across = (along[house_columns] - self.quarter.sides[number].cuts[lot]) * scale
+            column = np.clip(across.astype(np.int64), 0, texture.widths[levels] - 1)
+            offset[house_columns] = texture.offsets[levels] + column * texture.heights[levels]
+            rows[house_columns] = texture.heights[levels]
+            top[house_columns] = house.top
         bottom = project_row(camera, 0.0, depth, columns)
         last = min(view.canvas.shape[1], int(bottom.max()) + 1)
         scale = PIXELS_PER_METRE / 2.0**level
         block = sample_texture(
-            self.memory, camera, columns, depth, top, scale, offset, rows, 0, last
+            self.cache, camera, columns, depth, top, scale, offset, rows, 0, last
         )
         block *= block >= 1 << 24
         view.canvas[columns, :last] = block
@@ -258,12 +261,12 @@ class QuarterRenderer:
     def _paint_item(
         self, view: RenderBuffers, camera: Camera, item: VisibleSprite, walls: Floats
     ) -> None:
-        """Paint one picture over what is there; `walls` are the depths of the houses by column."""
+        """Paint a sprite over the view; `walls` are the depths of the facades by column."""
         columns = np.arange(item.first, item.first + len(item.depths))
         if not (item.depths < walls[columns] + 0.05).any():
             return
         image = item.picture.image
-        texture = self.memory.get(item.key, lambda: image, rim=True)
+        texture = self.cache.get(item.key, lambda: image, rim=True)
         finest = image.height / item.picture.height
         level = choose_mip_level(finest, item.depths, camera)
         scale = finest / 2.0**level
@@ -279,7 +282,7 @@ class QuarterRenderer:
         scales = np.asarray(scale, np.float64)
         tops = np.full(len(columns), top)
         texels = sample_texture(
-            self.memory,
+            self.cache,
             camera,
             columns,
             item.depths,
@@ -292,7 +295,7 @@ class QuarterRenderer:
             rim=1,
         )
         solid = texels >= 1 << 24
-        solid &= (item.depths < walls[columns] + 0.05)[:, None]  # else a house stands before it
+        solid &= (item.depths < walls[columns] + 0.05)[:, None]  # else a house hides it
         region = view.canvas[item.first : item.first + len(columns), first:last]
         np.copyto(region, texels, where=solid)
         odd_x, odd_y = item.first % SUPERSAMPLING, first % SUPERSAMPLING

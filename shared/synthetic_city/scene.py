@@ -1,7 +1,6 @@
-"""What stands in the streets of a quarter: trees, lamps, posts and bins for ever, vehicles for a
-day.
+"""Scene: objects and vehicles in the streets, and the sprites of them that a camera sees.
 
-What of the street's things a camera sees: flat pictures, each with its columns and depths.
+Trees, lamps, signs and boxes are the same in all sessions; vehicles differ between sessions.
 """
 
 from __future__ import annotations
@@ -20,36 +19,36 @@ from shared.synthetic_city.streets import PAVEMENT_M, Metres, Quarter, Street
 from shared.synthetic_city.textures import random_stream
 
 KERB_CLEARANCE_M = 1.05
-"""from the kerb to the middle of a parked vehicle"""
+"""From the kerb to the centre of a parked vehicle"""
 CORNER_M = 9.0
-"""kept free of parked vehicles at both ends of a street"""
+"""No-parking zone at both ends of a street"""
 BLADE_REACH_M = 0.85
 
 
 @dataclass(frozen=True, slots=True)
 class StreetObject:
-    """Something that is seen from every side as the same flat picture."""
+    """A permanent object, drawn as a billboard: the same sprite from every side."""
 
     position: Metres
     kind: str
-    """`tree`, or the picture's tuple in the catalogue: lamps, posts, boxes"""
+    """`tree`, or a field of the catalogue: lamps, posts, boxes"""
     index: int
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A box: its sides and its ends are flat pictures."""
+    """A vehicle: a box whose sides and ends are sprites."""
 
     position: Metres
-    """of its middle"""
+    """Of its centre"""
     heading: Metres
-    """unit vector towards its nose"""
+    """Unit vector towards its front"""
     index: int
 
 
 @dataclass(frozen=True, slots=True)
 class VehiclePanel:
-    """A vertical picture in the city that runs left to right as it is seen."""
+    """A vertical sprite fixed in the city; its direction runs left to right as seen."""
 
     start: Metres
     direction: Metres
@@ -61,9 +60,9 @@ class VehiclePanel:
 def place_street_objects(
     quarter: Quarter, street: Street, catalogue: Catalogue
 ) -> list[StreetObject]:
-    """What stands on the street's pavements on every day."""
+    """Place the permanent objects on the pavements of a street."""
     rng = random_stream(quarter.seed, quarter.name, "standing", street.number)
-    things = []
+    objects = []
     kerb = street.half_width - PAVEMENT_M
     for side in (-1.0, 1.0):
 
@@ -76,22 +75,22 @@ def place_street_objects(
             while along < street.length - 14.0:
                 index = int(rng.integers(len(catalogue.trees["summer"])))
                 if rng.uniform() < 0.85:
-                    things.append(StreetObject(on_pavement(along, 0.7), "tree", index))
+                    objects.append(StreetObject(on_pavement(along, 0.7), "tree", index))
                 along += street.trees * rng.uniform(0.8, 1.25)
         along = 10.0 + rng.uniform(0, 22)
         while along < street.length - 8.0:
-            things.append(StreetObject(on_pavement(along, 0.35), "lamps", 0))
+            objects.append(StreetObject(on_pavement(along, 0.35), "lamps", 0))
             along += rng.uniform(22, 30)
         for kind, count in (("posts", rng.poisson(1.6)), ("boxes", rng.poisson(1.4))):
             for _ in range(int(count)):
                 along = rng.uniform(10, max(11.0, street.length - 10))
                 index = int(rng.integers(len(getattr(catalogue, kind))))
-                things.append(StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
-    return things
+                objects.append(StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
+    return objects
 
 
 def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
-    """The vehicles of one day: parked at both kerbs, and a few on the move."""
+    """Place the vehicles of one day: parked at both kerbs, and a few driving."""
     rng = random_stream(quarter.seed, quarter.name, "vehicles", street.number, day)
     vehicles = []
     lane = street.half_width - PAVEMENT_M - KERB_CLEARANCE_M
@@ -99,7 +98,7 @@ def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
         along = CORNER_M + rng.uniform(0, 6) + street.half_width
         while along < street.length - CORNER_M - street.half_width:
             if rng.uniform() < street.parking:
-                index = _any_vehicle(rng)
+                index = _choose_vehicle(rng)
                 middle = street.start + street.direction * along
                 vehicles.append(
                     Vehicle(middle + street.left * side * lane, street.direction * -side, index)
@@ -112,20 +111,20 @@ def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
             Vehicle(
                 middle + street.left * side * lane * 0.4,
                 street.direction * -side,
-                _any_vehicle(rng),
+                _choose_vehicle(rng),
             )
         )
     return vehicles
 
 
-def _any_vehicle(rng: np.random.Generator) -> int:
-    """Its index in the catalogue, where all paints of one shape follow each other."""
+def _choose_vehicle(rng: np.random.Generator) -> int:
+    """Return a random index of the catalogue, which is ordered by shape, then paint."""
     shape = int(rng.choice(len(VEHICLE_SHARES), p=VEHICLE_SHARES))
     return shape * len(VEHICLE_PAINTS) + int(rng.integers(len(VEHICLE_PAINTS)))
 
 
 def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[VehiclePanel]:
-    """The side and the end of the vehicle that are seen from a point."""
+    """Return the panels of a vehicle (side, end, windscreen) that are visible from a point."""
     side = catalogue.vehicle_sides[vehicle.index]
     front = catalogue.vehicle_fronts[vehicle.index]
     ahead = vehicle.heading
@@ -133,7 +132,7 @@ def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) ->
     away = seen_from - vehicle.position
     half_length, half_width = side.width / 2, front.width / 2
     panels = []
-    if away @ left > half_width:  # from its left its nose is on the left
+    if away @ left > half_width:  # seen from the left, its front is on the left
         start = vehicle.position + left * half_width + ahead * half_length
         panels.append(VehiclePanel(start, -ahead, side, ("side", vehicle.index)))
     elif away @ left < -half_width:
@@ -158,7 +157,7 @@ def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) ->
 def shop_blades(
     quarter: Quarter, side: int, catalogue: Catalogue
 ) -> list[tuple[Metres, Metres, int]]:
-    """Boards that stand out from the shops of a facade row: foot, outward direction, index."""
+    """Return the projecting shop signs of a facade row: foot, outward direction, index."""
     row = quarter.sides[side]
     outwards = np.array([row.direction[1], -row.direction[0]])
     blades = []
@@ -175,33 +174,33 @@ def shop_blades(
 OBJECT_RANGE_M = 75.0
 BLADE_RANGE_M = 45.0
 NEAREST_M = 1.3
-"""what is nearer to the lens is left out"""
+"""Closer objects are not rendered"""
 LARGEST_REACH_M = 4.0
-"""half of the longest vehicle, and some more"""
+"""Half of the longest vehicle, with a margin"""
 
 
 @dataclass(slots=True)
 class VisibleSprite:
-    """A flat picture and the canvas columns that it fills."""
+    """A sprite and the canvas columns that it covers."""
 
     depth: float
-    """of its middle, metres: farther ones are painted first"""
+    """Of its centre, metres; farther sprites are painted first"""
     first: int
-    """column"""
+    """First canvas column"""
     depths: Floats
     alongs: Floats
-    """metres from the picture's left edge, per column"""
+    """Metres from the sprite's left edge, per column"""
     picture: Sprite
     key: tuple[str, int]
 
 
 class VisibleObjects:
-    """Looks around in one quarter; remembers what it has met."""
+    """Finds the sprites in view of a camera in one quarter; caches street objects."""
 
     def __init__(self, quarter: Quarter, catalogue: Catalogue) -> None:
         self.quarter = quarter
         self.catalogue = catalogue
-        self._standing: dict[int, list[StreetObject]] = {}
+        self._objects: dict[int, list[StreetObject]] = {}
         self._vehicles: dict[tuple[int, str], list[Vehicle]] = {}
         self._blades: dict[int, list[tuple[Metres, Metres, int]]] = {}
         self._middles = np.stack(
@@ -211,15 +210,15 @@ class VisibleObjects:
     def items(
         self, camera: Camera, session: CaptureSession, sides: NDArray[np.int64], slopes: Floats
     ) -> Iterator[VisibleSprite]:
-        """The pictures in sight on the session's day, before anything hides them; in no order.
+        """Yield the sprites in view on the session's day, unordered, before occlusion.
 
-        `sides` are the facade rows whose shops' boards are looked at, `slopes` the columns' rays.
+        `sides`: the facade rows whose shop signs are included; `slopes`: the columns' rays.
         """
         away = np.hypot(*(self._middles - camera.position).T)
         for number in np.flatnonzero(away < OBJECT_RANGE_M + 60.0).tolist():
-            things = self._standing_at(number)
-            for i in _is_visible(camera, [thing.position for thing in things], OBJECT_RANGE_M):
-                item = self._billboard(camera, session, things[i])
+            objects = self._objects_at(number)
+            for i in _is_visible(camera, [item.position for item in objects], OBJECT_RANGE_M):
+                item = self._billboard(camera, session, objects[i])
                 if item:
                     yield item
             vehicles = self._vehicles_at(number, session.name)
@@ -233,7 +232,7 @@ class VisibleObjects:
             for i in _is_visible(camera, [foot for foot, _, _ in blades], BLADE_RANGE_M):
                 foot, outwards, index = blades[i]
                 away = camera.position - foot
-                # Only one of its two faces is turned towards the camera.
+                # Only one of its two faces is visible.
                 from_right = away[0] * outwards[1] - away[1] * outwards[0] > 0
                 start = foot if from_right else foot + outwards * BLADE_REACH_M
                 direction = outwards if from_right else -outwards
@@ -244,11 +243,11 @@ class VisibleObjects:
                 if item:
                     yield item
 
-    def _standing_at(self, number: int) -> list[StreetObject]:
-        if number not in self._standing:
+    def _objects_at(self, number: int) -> list[StreetObject]:
+        if number not in self._objects:
             street = self.quarter.streets[number]
-            self._standing[number] = place_street_objects(self.quarter, street, self.catalogue)
-        return self._standing[number]
+            self._objects[number] = place_street_objects(self.quarter, street, self.catalogue)
+        return self._objects[number]
 
     def _vehicles_at(self, number: int, day: str) -> list[Vehicle]:
         key = (number, day)
@@ -263,18 +262,18 @@ class VisibleObjects:
         return self._blades[side]
 
     def _billboard(
-        self, camera: Camera, session: CaptureSession, thing: StreetObject
+        self, camera: Camera, session: CaptureSession, street_object: StreetObject
     ) -> VisibleSprite | None:
-        away = thing.position - camera.position
+        away = street_object.position - camera.position
         depth = float(away @ camera.forward)
         if not NEAREST_M < depth < OBJECT_RANGE_M:
             return None
-        if thing.kind == "tree":
-            picture = self.catalogue.trees[session.foliage][thing.index]
-            key = (f"tree {session.foliage}", thing.index)
+        if street_object.kind == "tree":
+            picture = self.catalogue.trees[session.foliage][street_object.index]
+            key = (f"tree {session.foliage}", street_object.index)
         else:
-            picture = getattr(self.catalogue, thing.kind)[thing.index]
-            key = (thing.kind, thing.index)
+            picture = getattr(self.catalogue, street_object.kind)[street_object.index]
+            key = (street_object.kind, street_object.index)
         left = float(away @ camera.right) - picture.width / 2
         scale = SUPERSAMPLING * camera.focal / depth
         middle = SUPERSAMPLING * camera.width / 2
@@ -291,7 +290,7 @@ class VisibleObjects:
 
 
 def _is_visible(camera: Camera, positions: list[Metres], within: float) -> list[int]:
-    """Which of the positions lie before the camera, not far off, and about in its view."""
+    """Return the indices of positions in front of the camera, within range and field of view."""
     if not positions:
         return []
     away = np.stack(positions) - camera.position
@@ -302,7 +301,7 @@ def _is_visible(camera: Camera, positions: list[Metres], within: float) -> list[
 
 
 def _panel_item(camera: Camera, panel: VehiclePanel, slopes: Floats) -> VisibleSprite | None:
-    """The panel's columns; None when it is out of sight."""
+    """Project a panel to canvas columns; None if it is not visible."""
     width = panel.picture.width
     ends = np.stack([panel.start, panel.start + panel.direction * width]) - camera.position
     depths, laterals = ends @ camera.forward, ends @ camera.right

@@ -1,4 +1,4 @@
-"""Sessions: the days on which photos are taken, with their light, weather and camera."""
+"""Capture sessions: the days on which photos are taken, with their light, weather and camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class CaptureSession:
-    """One drive through the city. Colours are shares of full brightness."""
+    """One capture drive through the city. Colours are fractions of full brightness."""
 
     name: str
     starts_at: datetime
@@ -18,7 +18,7 @@ class CaptureSession:
     sky_top: Rgb
     sky_horizon: Rgb
     clouds: float
-    """how much of the sky is cloud, 0 to 1"""
+    """Cloud cover, 0 to 1"""
     sun_azimuth: float
     """degrees clockwise from north"""
     sun: Rgb
@@ -28,9 +28,9 @@ class CaptureSession:
     haze: Rgb
     haze_per_m: float
     lit_panes: tuple[int, ...] = ()
-    """which of the eight kinds of panes are lit"""
+    """Pane codes (0 to 7) that are lit"""
     glow: float = 0.0
-    """strength of lit windows, signs and lamps"""
+    """Emission of lit windows, signs and lamps"""
     lamps: float = 0.0
     """strength of the street lamps"""
     snow: float = 0.0
@@ -38,10 +38,10 @@ class CaptureSession:
     gain: Rgb = (1.0, 1.0, 1.0)
     """white balance of the camera"""
     mixing: float = 0.0
-    """share of grey mixed into every colour"""
+    """Desaturation: fraction of grey mixed into every colour"""
     contrast: float = 1.0
     exposure_spread: float = 0.06
-    """standard deviation of a photo's exposure, in natural logarithm"""
+    """Standard deviation of the natural logarithm of the exposure"""
     noise: float = 2.0
     """standard deviation, of 255"""
     blur: float = 0.0

@@ -1,7 +1,4 @@
-"""What stands in a street: trees, lamps, posts and boxes, as RGBA pictures with codes.
-
-Vehicles: bodies and paints that a city repeats, from the side, the end and above the bonnet.
-"""
+"""Sprites of street objects and vehicles: RGBA images with material codes in the fourth channel."""
 
 from __future__ import annotations
 
@@ -13,14 +10,14 @@ from PIL import Image, ImageDraw
 from shared.synthetic_city.textures import CODE_FLAT, CODE_LAMP, CODE_SOLID, Colour, darken
 
 OBJECT_PIXELS_PER_METRE = 40
-"""finer than facades: these come nearer"""
+"""Finer than facades, because these come closer to the camera"""
 
 FOLIAGE = ("spring", "summer", "autumn", "bare")
 
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """A flat picture with its size in metres; its lower edge is `bottom` above the ground."""
+    """A flat image with its size in metres; its lower edge is `bottom` above the ground."""
 
     image: Image.Image
     width: float
@@ -29,19 +26,19 @@ class Sprite:
 
 
 def object_pixels(metres: float) -> int:
-    """Metres as whole pixels of a thing's picture."""
+    """Convert metres to pixels of a sprite."""
     return round(metres * OBJECT_PIXELS_PER_METRE)
 
 
 def draw_tree(
     height: float, crown: float, trunk: float, leaves: Colour, foliage: str, shape_seed: int
 ) -> Sprite:
-    """A tree of `height` metres whose crown is `crown` wide and begins `trunk` above the ground.
+    """Draw a tree of `height` metres; its crown is `crown` wide and begins at height `trunk`.
 
     The same `shape_seed` gives the same tree in every foliage.
     """
     rng = np.random.default_rng(shape_seed)
-    scale = OBJECT_PIXELS_PER_METRE * 3 // 4  # leaves need no finer picture
+    scale = OBJECT_PIXELS_PER_METRE * 3 // 4  # leaves need less resolution
     width, tall = round(crown * scale), round(height * scale)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -95,7 +92,7 @@ def draw_tree(
 
 
 def draw_lamp(colour: Colour, height: float) -> Sprite:
-    """A street lamp: a post with an arm on each side."""
+    """Draw a street lamp: a post with an arm on each side."""
     width, tall = object_pixels(1.6), object_pixels(height)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -112,7 +109,7 @@ def draw_lamp(colour: Colour, height: float) -> Sprite:
 
 
 def draw_post_sign(kind: int, rng: np.random.Generator) -> Sprite:
-    """A traffic sign on its post."""
+    """Draw a traffic sign on its post."""
     width, tall = object_pixels(0.66), object_pixels(2.6)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -139,7 +136,7 @@ def draw_post_sign(kind: int, rng: np.random.Generator) -> Sprite:
 
 
 def draw_box(colour: Colour, width: float, height: float) -> Sprite:
-    """A bin, a cabinet or a letter box."""
+    """Draw a bin, a cabinet or a letter box."""
     picture = Image.new(
         "RGBA", (object_pixels(width), object_pixels(height)), (*colour, CODE_SOLID)
     )
@@ -155,21 +152,21 @@ def draw_box(colour: Colour, width: float, height: float) -> Sprite:
 
 @dataclass(frozen=True, slots=True)
 class VehicleShape:
-    """One body, metres; the cabin runs between two shares of the length."""
+    """A vehicle body, in metres; `cabin` is a range in fractions of the length."""
 
     length: float
     height: float
     width: float
     bonnet: float
-    """height of the bonnet"""
+    """Height of the bonnet"""
     cabin: tuple[float, float]
     slope: float
-    """share of the length that a windscreen leans"""
+    """Horizontal extent of a windscreen, as a fraction of the length"""
     windows: int
 
 
 VEHICLE_SHARES = (0.30, 0.25, 0.25, 0.15, 0.05)
-"""of the shapes in traffic"""
+"""Frequencies of the shapes"""
 VEHICLE_SHAPES = (
     VehicleShape(4.1, 1.48, 1.75, 0.92, (0.20, 0.96), 0.10, 2),  # hatchback
     VehicleShape(4.6, 1.44, 1.80, 0.90, (0.22, 0.84), 0.11, 2),  # saloon
@@ -180,7 +177,7 @@ VEHICLE_SHAPES = (
 
 
 def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
-    """The vehicle from its side, nose to the left."""
+    """Draw a vehicle from its left side, front to the left."""
     width, tall = object_pixels(shape.length), object_pixels(shape.height)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -238,7 +235,7 @@ def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
 
 
 def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
-    """The body's nose or tail, up to the bonnet."""
+    """Draw the front or rear of the body, up to the bonnet."""
     width, tall = object_pixels(shape.width), object_pixels(shape.bonnet)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -266,7 +263,7 @@ def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
 
 
 def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Sprite:
-    """The cabin's front or back above the bonnet; a little lower, so that no gap shows."""
+    """Draw the cabin's front or back above the bonnet, with an overlap to avoid a gap."""
     overlap = 0.14
     width, tall = object_pixels(shape.width), object_pixels(shape.height - shape.bonnet + overlap)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))

@@ -1,9 +1,7 @@
-"""Street networks: quarters of blocks in metres, their facade rows, and what lines each street.
+"""Street networks: quarters of blocks, their facade rows, and view points along the streets.
 
 A quarter is a warped grid. Between the streets lie blocks; every side of a block is one vertical
-plane, cut into plots with one house each. x is east and y is north, in UTM metres.
-
-Places: the spots along a quarter's streets that photos are taken of.
+plane, divided into plots with one house each. x is east and y is north, in UTM metres.
 """
 
 from __future__ import annotations
@@ -19,11 +17,11 @@ from shared.synthetic_city.houses import House, arrange_house
 from shared.synthetic_city.textures import random_stream
 
 SPACING_M = (88.0, 132.0)
-"""between crossings"""
+"""Between crossings"""
 WARP_M = 9.0
-"""by which a crossing lies off its grid"""
+"""Maximum offset of a crossing from the grid"""
 HALF_WIDTHS_M = (6.5, 7.5, 8.5, 10.0)
-"""from a street's middle to its facades"""
+"""From a street's centre line to its facades"""
 PAVEMENT_M = 2.7
 PLOT_M = (6.5, 16.0)
 
@@ -32,18 +30,18 @@ Metres = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Street:
-    """The stretch between two crossings."""
+    """The street between two crossings."""
 
     number: int
     start: Metres
     direction: Metres
-    """unit vector"""
+    """Unit vector"""
     length: float
     half_width: float
     trees: float
-    """metres between the trees on each side; 0 for none"""
+    """Metres between the trees on each side; 0 for none"""
     parking: float
-    """share of the kerb taken by parked vehicles"""
+    """Fraction of the kerb with parked vehicles"""
 
     @property
     def left(self) -> Metres:
@@ -53,15 +51,15 @@ class Street:
 
 @dataclass(frozen=True, slots=True)
 class FacadeRow:
-    """One facade row: the outer side of a block. Seen from the street it runs left to right."""
+    """The outer side of a block; seen from the street it runs left to right."""
 
     start: Metres
     direction: Metres
     length: float
     half_width: float
-    """of the street in front of it"""
+    """Of the street in front of it"""
     cuts: Metres
-    """where one plot ends and the next begins, from 0 to `length`"""
+    """Boundaries of the plots, from 0 to `length`"""
     shopping: float
     floors: int
 
@@ -70,11 +68,11 @@ class Quarter:
     """One connected street network and the houses along it."""
 
     def __init__(self, seed: int, name: str, size: int, origin: tuple[float, float]) -> None:
-        """`size` streets each way; `origin` is the south-west corner in UTM metres."""
+        """`size`: streets per axis; `origin`: south-west corner in UTM metres."""
         self.seed = seed
         self.name = name
         rng = random_stream(seed, name, "streets")
-        count = size + 2  # the outermost lines bound the outer blocks and carry no street
+        count = size + 2  # the outermost grid lines bound the outer blocks and have no street
         xs = np.concatenate([[0.0], rng.uniform(*SPACING_M, count - 1).cumsum()])
         ys = np.concatenate([[0.0], rng.uniform(*SPACING_M, count - 1).cumsum()])
         grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1)
@@ -88,7 +86,7 @@ class Quarter:
 
     @property
     def far_east(self) -> float:
-        """The easternmost coordinate in use, metres."""
+        """The easternmost coordinate, metres."""
         return float(self.nodes[..., 0].max())
 
     def _lay_streets(self, rng: np.random.Generator, count: int) -> list[Street]:
@@ -150,21 +148,21 @@ class Quarter:
 
     @cached_property
     def side_starts(self) -> Metres:
-        """(sides, 2)"""
+        """(sides, 2) start points of the facade rows."""
         return np.stack([side.start for side in self.sides])
 
     @cached_property
     def side_directions(self) -> Metres:
-        """(sides, 2)"""
+        """(sides, 2) unit vectors of the facade rows."""
         return np.stack([side.direction for side in self.sides])
 
     @cached_property
     def side_lengths(self) -> Metres:
-        """(sides,)"""
+        """(sides,) lengths of the facade rows."""
         return np.array([side.length for side in self.sides])
 
     def house(self, side: int, plot: int) -> House:
-        """The house on a plot: arranged when first asked for, the same in any order."""
+        """Return the house on a plot; created on first access, independently of the order."""
         key = (side, plot)
         if key not in self._houses:
             row = self.sides[side]
@@ -175,7 +173,7 @@ class Quarter:
 
 
 def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:
-    """The polygon (counter-clockwise) with side k moved inwards by insets[k] metres."""
+    """Return a counter-clockwise quadrilateral with side k moved inwards by insets[k] metres."""
     lines = []
     for k in range(4):
         direction = corners[(k + 1) % 4] - corners[k]
@@ -191,7 +189,7 @@ def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:
 
 
 def _cut_plots(rng: np.random.Generator, length: float) -> Metres:
-    """Plots of PLOT_M that fill the length."""
+    """Return the boundaries of plots of PLOT_M, scaled to fill the length."""
     widths: list[float] = []
     while sum(widths) < length:
         widths.append(rng.uniform(*PLOT_M))
@@ -203,31 +201,31 @@ def _cut_plots(rng: np.random.Generator, length: float) -> Metres:
 PLACE_SPACING_M = (15.0, 25.0)
 FROM_CROSSING_M = 14.0
 LOOK_M = (42.0, 64.0)
-"""degrees between the driving direction and a street's viewing direction"""
+"""Degrees between the driving direction and a street's viewing direction"""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewPoint:
-    """A spot in a street that the camera passes, and where it looks from there."""
+    """A position in a street and the viewing direction there: one place."""
 
     number: int
     street: Street
     along: float
-    """metres from the street's start"""
+    """Metres from the street's start"""
     yaw: float
     """degrees clockwise from north"""
 
 
 def make_quarter(
-    seed: int, name: str, wanted: int, origin: tuple[float, float]
+    seed: int, name: str, place_count: int, origin: tuple[float, float]
 ) -> tuple[Quarter, list[ViewPoint]]:
-    """The smallest quarter with that many places, and its first ones."""
+    """Create the smallest quarter with `place_count` places; return both."""
     size = 2
     while True:
         quarter = Quarter(seed, name, size, origin)
         places = _find_places(quarter)
-        if len(places) >= wanted:
-            return quarter, places[:wanted]
+        if len(places) >= place_count:
+            return quarter, places[:place_count]
         size += 1
 
 

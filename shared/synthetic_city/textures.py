@@ -1,13 +1,11 @@
-"""Wall surfaces: tiles of plaster, brick, stone, panels and boards, at PIXELS_PER_METRE.
+"""Textures of facades: walls, windows, doors; material codes; named random streams.
 
-Independent random streams by name, so that nothing depends on the order of drawing.
+The fourth byte of a texture's pixel is a material code: transparent, solid, or emissive. The three
+colours of a pixel are its paint by day; the code selects what emits light at night, and which
+surfaces carry snow. It is one byte, so that all copies of a texture carry it with the colours.
 
-What the fourth byte of a texture's pixel means: see-through, solid, or something that shines.
-
-The three colours of a pixel are its paint by day; the code says which of them shine at night, and
-which surfaces carry snow. One byte, so that it travels through every copy with the colours.
-
-Windows and doors: types that a city repeats, each in a few variants of curtains and panes.
+`random_stream` returns independent random streams by name, so that no result depends on the order
+of drawing.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ from PIL import Image, ImageDraw
 
 PIXELS_PER_METRE = 24
 TILE_WIDTH = 512
-"""pixels: wider than the widest house"""
+"""Pixels; wider than the widest house"""
 TILE_HEIGHT = 576
-"""pixels: higher than the highest house"""
+"""Pixels; higher than the highest house"""
 
 WALL_KINDS = ("plaster", "brick", "stone", "panel", "board", "rustic")
 
@@ -32,7 +30,7 @@ GreyImage = NDArray[np.float32]
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: int) -> GreyImage:
-    """(height, width) float32 of about [-1, 1] that varies over `cell` pixels; wraps around."""
+    """Return seamless (height, width) float32 noise of about [-1, 1] in cells of `cell` pixels."""
     height, width = shape
     coarse = rng.uniform(-1, 1, (max(2, height // cell), max(2, width // cell)))
     image = Image.fromarray(np.pad(coarse.astype(np.float32), 1, mode="wrap"))
@@ -42,7 +40,7 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: int) ->
 
 
 def draw_wall(kind: str, colour: Colour, rng: np.random.Generator) -> Image.Image:
-    """One RGB tile of TILE_WIDTH x TILE_HEIGHT pixels."""
+    """Draw an RGB tile of TILE_WIDTH x TILE_HEIGHT pixels; `kind` is one of WALL_KINDS."""
     shape = (TILE_HEIGHT, TILE_WIDTH)
     grain = rng.normal(0, 1, shape).astype(np.float32)
     light = 1 + 0.05 * smooth_noise(rng, shape, 96) + 0.03 * smooth_noise(rng, shape, 24)
@@ -65,7 +63,7 @@ def draw_wall(kind: str, colour: Colour, rng: np.random.Generator) -> Image.Imag
     elif kind == "board":
         light += -0.16 * (rows % 6 == 0) + 0.04 * (rows % 6 / 6) + 0.015 * grain
     else:
-        raise ValueError(f"no such wall: {kind}")
+        raise ValueError(f"unknown wall kind {kind!r}")
     painted = light[..., None] * np.asarray(colour, np.float32)
     return Image.fromarray(np.clip(painted, 0, 255).astype(np.uint8))
 
@@ -80,7 +78,7 @@ def _courses(
     joint: int,
     spread: float,
 ) -> GreyImage:
-    """Bricks or ashlars in running bond: each with its own lightness, dark joints between."""
+    """Return the lightness of bricks or ashlars in running bond with dark joints."""
     course = rows // height
     shifted = columns + (course % 2) * (length // 2)
     unit = shifted // length
@@ -90,29 +88,29 @@ def _courses(
 
 
 def random_stream(*key: int | str) -> np.random.Generator:
-    """The generator that belongs to the key: the same in every process and in any order."""
+    """Return the random generator of a key: the same in every process and in any order."""
     return np.random.default_rng(
         [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     )
 
 
 CODE_TRANSPARENT = 0
-"""nothing is here: what is behind shows"""
+"""Transparent"""
 CODE_FIRST_PANE = 1
 PANE_CODES = 8
-"""codes 1 to 8: the panes of a window; each session lights some of the eight"""
+"""Codes 1 to 8: window panes; each session lights some of them"""
 CODE_SHOP = 20
-"""a shop's window: shines in the evening"""
+"""Shop windows, lit in the evening"""
 CODE_SIGN = 21
 CODE_LAMP = 22
-"""lamps and headlights"""
+"""Lamps and headlights"""
 CODE_FLAT = 30
-"""lies open to the sky: snow stays on it"""
+"""Surfaces open to the sky, which carry snow"""
 CODE_SOLID = 255
 
 
 def emission_table(lit_panes: tuple[int, ...], strength: float) -> NDArray[np.float32]:
-    """(256,) float32: how strongly a pixel of each code shines by itself, 0 by day."""
+    """Return the (256,) float32 emission of each code; 0 by day."""
     table = np.zeros(256, np.float32)
     for pane in lit_panes:
         table[CODE_FIRST_PANE + pane] = 0.9 * strength
@@ -128,14 +126,14 @@ CURTAINS: tuple[Colour, ...] = ((214, 208, 196), (196, 184, 160), (224, 224, 222
 
 @dataclass(frozen=True, slots=True)
 class WindowType:
-    """How one type of window is built; metres."""
+    """A type of window; metres."""
 
     width: float
     height: float
     mullions: int
-    """upright bars between the panes"""
+    """Vertical bars between the panes"""
     transoms: int
-    """level bars between the panes"""
+    """Horizontal bars between the panes"""
     frame: Colour
     surround: Colour
     surround_width: float
@@ -146,18 +144,18 @@ class WindowType:
 
 
 def metres_to_pixels(metres: float) -> int:
-    """Metres as whole pixels of a facade's texture."""
+    """Convert metres to pixels of a facade's texture."""
     return round(metres * PIXELS_PER_METRE)
 
 
 def darken(colour: Colour, factor: float) -> Colour:
-    """The colour times the factor, within range."""
+    """Multiply a colour by a factor, clipped to 255."""
     red, green, blue = (min(255, int(c * factor)) for c in colour)
     return red, green, blue
 
 
 def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Image.Image:
-    """An RGBA picture with the codes of `codes` as its fourth channel; `variant` below PANES."""
+    """Draw a window as RGBA with material codes; `variant` is below PANE_CODES."""
     width, height, edge = (
         metres_to_pixels(kind.width),
         metres_to_pixels(kind.height),
@@ -183,7 +181,7 @@ def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Ima
         (left - edge, top if kind.arched else top - edge, right + edge, bottom + edge), fill=trim
     )
     draw.rectangle((left, top, right, bottom), fill=glass)
-    # The sky mirrored in the upper half, and the shadow of the reveal above and on the left.
+    # Reflection of the sky in the upper half.
     for row in range(top, top + height // 2):
         mirrored = darken(glass[:3], 1.32 - 0.32 * (row - top) / max(1, height // 2))
         draw.line((left, row, right, row), fill=(*mirrored, glass[3]))
@@ -226,12 +224,12 @@ def _curtain(
     fill = (*cloth, code)
     width, height = right - left, bottom - top
     style = variant % 5
-    if style == 1:  # drawn to both sides
+    if style == 1:  # open curtains
         draw.rectangle((left, top, left + width // 4, bottom), fill=fill)
         draw.rectangle((right - width // 4, top, right, bottom), fill=fill)
-    elif style == 2:  # a blind, let down some way
+    elif style == 2:  # a partly lowered blind
         draw.rectangle((left, top, right, top + int(height * rng.uniform(0.3, 0.7))), fill=fill)
-    elif style == 3:  # half a net curtain
+    elif style == 3:  # half-height net curtain
         draw.rectangle((left, top + height // 2, right, bottom), fill=fill)
     elif style == 4 and variant > 4:  # closed
         draw.rectangle(box, fill=fill)
@@ -264,7 +262,7 @@ def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
 
 
 def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generator) -> Image.Image:
-    """A house door of about 1.3 x 2.6 m with its frame and steps, RGBA with codes."""
+    """Draw a door of about 1.3 x 2.6 m with frame and steps, RGBA with material codes."""
     width, height = metres_to_pixels(1.3), metres_to_pixels(2.6)
     picture = Image.new("RGBA", (width + 8, height + 4), (168, 162, 150, CODE_SOLID))
     draw = ImageDraw.Draw(picture)
@@ -291,7 +289,7 @@ def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generato
 
 
 def draw_shop_glass(width: int, height: int, rng: np.random.Generator) -> Image.Image:
-    """A display window of that many pixels, with things standing in it."""
+    """Draw a shop window of `width` x `height` pixels with goods on display."""
     picture = Image.new("RGBA", (width, height), (*darken(GLASS[2], 0.9), CODE_SHOP))
     draw = ImageDraw.Draw(picture)
     for row in range(height // 2):

@@ -1,8 +1,6 @@
-"""Draws a planned city on all cores and leaves it as a data set on disk.
+"""Renders a planned city on all cores and writes it as a dataset.
 
-The city's training photos in the layout that a trainer asks for, and the table beside them.
-
-`plan` puts them into gsv_xs; the same photos can be laid out as the original GSV-Cities.
+Training photos are written in the layout gsv_xs, or in that of the original GSV-Cities.
 """
 
 from __future__ import annotations
@@ -37,30 +35,30 @@ GSV_CITIES_COLUMNS = (
 
 
 class TrainingLayoutName(StrEnum):
-    """How the photos to learn from are laid out."""
+    """Layout of the training photos."""
 
     GSV_XS = "gsv_xs"
     GSV_CITIES = "gsv-cities"
 
 
 def with_training_layout(plan: CityPlan, layout: TrainingLayoutName) -> CityPlan:
-    """The same photos, those to learn from under the layout's folders and names."""
+    """Return the plan with the training photos in the folders and names of a layout."""
     if layout == TrainingLayoutName.GSV_XS:
         return plan
     folder = f"{layout}/Images/{city_name(plan.options)}"
-    shots = [
-        replace(shot, folder=folder, name=f"{'_'.join(_gsv_cities_fields(plan, shot))}.jpg")
-        if shot.role == "train"
-        else shot
-        for shot in plan.photos
+    photos = [
+        replace(photo, folder=folder, name=f"{'_'.join(_gsv_cities_fields(plan, photo))}.jpg")
+        if photo.role == "train"
+        else photo
+        for photo in plan.photos
     ]
-    return CityPlan(plan.options, plan.quarters, shots)
+    return CityPlan(plan.options, plan.quarters, photos)
 
 
 def write_training_table(plan: CityPlan, out: Path) -> None:
-    """The CSV of the training photos, in the layout that their folder says."""
+    """Write the CSV table of the training photos, in the layout of their folder."""
     city = city_name(plan.options)
-    train = sorted((s for s in plan.photos if s.role == "train"), key=lambda shot: shot.number)
+    train = sorted((s for s in plan.photos if s.role == "train"), key=lambda photo: photo.number)
     if not train or train[0].folder.startswith(TrainingLayoutName.GSV_XS):
         path = out / TrainingLayoutName.GSV_XS / "dataframes" / f"{city}.csv"
         _write(path, GSV_XS_COLUMNS, _gsv_xs_rows(city, train))
@@ -70,28 +68,28 @@ def write_training_table(plan: CityPlan, out: Path) -> None:
 
 
 def _gsv_xs_rows(city: str, train: Sequence[PlannedPhoto]) -> Iterator[tuple[object, ...]]:
-    for shot in train:
-        yield shot.place, city, f"{shot.camera.x:.2f}", f"{shot.camera.y:.2f}", shot.name
+    for photo in train:
+        yield photo.place, city, f"{photo.camera.x:.2f}", f"{photo.camera.y:.2f}", photo.name
 
 
 def _gsv_cities_rows(plan: CityPlan, train: Sequence[PlannedPhoto]) -> Iterator[tuple[object, ...]]:
-    for shot in train:
-        city, _, year, month, heading, *rest = _gsv_cities_fields(plan, shot)
-        yield shot.place, int(year), int(month), int(heading), city, *rest
+    for photo in train:
+        city, _, year, month, heading, *rest = _gsv_cities_fields(plan, photo)
+        yield photo.place, int(year), int(month), int(heading), city, *rest
 
 
-def _gsv_cities_fields(plan: CityPlan, shot: PlannedPhoto) -> tuple[str, ...]:
-    """city, place, year, month, heading, latitude, longitude, panorama: as its name has them."""
-    latitude, longitude = utm.to_latlon(shot.camera.x, shot.camera.y, ZONE_NUMBER, ZONE_LETTER)
+def _gsv_cities_fields(plan: CityPlan, photo: PlannedPhoto) -> tuple[str, ...]:
+    """Return city, place, year, month, heading, latitude, longitude and panorama id."""
+    latitude, longitude = utm.to_latlon(photo.camera.x, photo.camera.y, ZONE_NUMBER, ZONE_LETTER)
     return (
         city_name(plan.options),
-        f"{shot.place:07d}",
-        f"{shot.session.starts_at:%Y}",
-        f"{shot.session.starts_at:%m}",
-        f"{round(shot.camera.yaw) % 360:03d}",
+        f"{photo.place:07d}",
+        f"{photo.session.starts_at:%Y}",
+        f"{photo.session.starts_at:%m}",
+        f"{round(photo.camera.yaw) % 360:03d}",
         f"{float(latitude):.6f}",
         f"{float(longitude):.6f}",
-        f"{shot.quarter}{shot.place:05d}-{shot.session.name}-{shot.number:06d}",
+        f"{photo.quarter}{photo.place:05d}-{photo.session.name}-{photo.number:06d}",
     )
 
 
@@ -104,19 +102,19 @@ def _write(path: Path, columns: Sequence[str], rows: Iterator[tuple[object, ...]
 
 
 PHOTOS_PER_TASK = 160
-"""a few streets: their houses are drawn once for all photos of a task"""
+"""A few streets; their houses are drawn once for all photos of a task"""
 MAX_WORKERS = 16
-"""each keeps about 300 MB: textures, and a photo at work"""
+"""Each worker needs about 300 MB for textures and the current photo"""
 NOT_COMPARABLE = "generated: not comparable with published figures"
 
 
 def check_output_empty(out: Path) -> None:
-    """Conflict (`out_not_empty`) when the folder holds anything."""
+    """Raise Conflict (`out_not_empty`) if the folder is not empty."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise Conflict(
             "out_not_empty",
-            f"{out} is not an empty folder. Name a folder that does not exist yet, or empty it "
-            "(an interrupted drawing leaves its photos there, without a city.json).",
+            f"{out} is not an empty folder. Use a folder that does not exist yet, or empty it "
+            "(an interrupted run leaves photos without a city.json).",
         )
 
 
@@ -125,34 +123,36 @@ def write_city(
 ) -> None:
     """Write `database/`, `queries/`, `gsv_xs/` (or `gsv-cities/`) and `city.json` below `out`.
 
-    The photos to learn from are drawn for themselves, in a quarter of their own. `on_progress`
-    is told
-    how many photos are ready. Raises Conflict when `out` is not empty, Misconfigured
-    (`out_unwritable`) when it can't be written.
+    Training photos are of a separate quarter. `on_progress` is called with the number of photos
+    written since the last call.
+
+    Raises:
+        Conflict: `out_not_empty`.
+        Misconfigured: `out_unwritable`.
     """
     check_output_empty(out)
     try:
-        for folder in sorted({shot.folder for shot in plan.photos} | {"database", "queries"}):
+        for folder in sorted({photo.folder for photo in plan.photos} | {"database", "queries"}):
             (out / folder).mkdir(parents=True, exist_ok=True)
-        _draw_all(plan, out, on_progress)
+        _render_all(plan, out, on_progress)
         if plan.options.train:
             write_training_table(plan, out)
         (out / "city.json").write_text(json.dumps(describe_city(plan), indent=1) + "\n")
     except OSError as error:
-        raise Misconfigured("out_unwritable", f"Can't write below {out}: {error}.") from error
+        raise Misconfigured("out_unwritable", f"Can't write to {out}: {error}.") from error
 
 
-def _draw_all(plan: CityPlan, out: Path, drawn: Callable[[int], None]) -> None:
+def _render_all(plan: CityPlan, out: Path, on_progress: Callable[[int], None]) -> None:
     tasks = [
         (start, start + PHOTOS_PER_TASK) for start in range(0, len(plan.photos), PHOTOS_PER_TASK)
     ]
     workers = min(len(tasks), os.cpu_count() or 1, MAX_WORKERS)
-    if workers <= 1:  # not worth a process
-        workshop = _RenderWorker(plan, out)
+    if workers <= 1:  # no process pool needed
+        worker = _RenderWorker(plan, out)
         for task in tasks:
-            drawn(workshop.draw(*task))
+            on_progress(worker.render(*task))
         return
-    # Spawned, not forked: the parent may hold threads, and a fork of those can hang.
+    # Spawned, not forked: forking a parent with threads can deadlock.
     with ProcessPoolExecutor(
         workers,
         mp_context=multiprocessing.get_context("spawn"),
@@ -160,23 +160,23 @@ def _draw_all(plan: CityPlan, out: Path, drawn: Callable[[int], None]) -> None:
         initargs=(plan, out),
     ) as pool:
         try:
-            for done in as_completed([pool.submit(_draw, *task) for task in tasks]):
-                drawn(done.result())
+            for done in as_completed([pool.submit(_render, *task) for task in tasks]):
+                on_progress(done.result())
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
 def describe_city(plan: CityPlan) -> dict[str, Any]:
-    """What `city.json` holds: every argument, what was made, and the kind of each query."""
-    queries = [shot for shot in plan.photos if shot.role == "query"]
+    """Return the content of `city.json`: arguments, counts, and the kind of each query."""
+    queries = [photo for photo in plan.photos if photo.role == "query"]
     return {
         "made_by": "placewise datasets synth",
         "note": NOT_COMPARABLE,
         "arguments": asdict(plan.options),
         "city": city_name(plan.options),
-        "counts": dict(sorted(Counter(shot.role for shot in plan.photos).items())),
-        "query_kinds": dict(sorted(Counter(shot.kind for shot in queries).items())),
+        "counts": dict(sorted(Counter(photo.role for photo in plan.photos).items())),
+        "query_kinds": dict(sorted(Counter(photo.kind for photo in queries).items())),
         "sessions": {
             role: dict(
                 sorted(Counter(s.session.name for s in plan.photos if s.role == role).items())
@@ -184,53 +184,54 @@ def describe_city(plan: CityPlan) -> dict[str, Any]:
             for role in ("database", "query", "train")
         },
         "queries": {
-            shot.name: {"kind": shot.kind, "session": shot.session.name}
-            for shot in sorted(queries, key=lambda shot: shot.number)
+            photo.name: {"kind": photo.kind, "session": photo.session.name}
+            for photo in sorted(queries, key=lambda photo: photo.number)
         },
     }
 
 
 class _RenderWorker:
-    """What one drawing process keeps between tasks: catalogue, film, textures."""
+    """State of a rendering process: catalogue, sky and grain, texture cache."""
 
     def __init__(self, plan: CityPlan, out: Path) -> None:
         self.plan = plan
         self.out = out
         self.catalogue = make_catalogue(plan.options.catalogue_seed)
-        self.film = SkyAndGrain.generate(
+        self.sky_and_grain = SkyAndGrain.generate(
             plan.options.catalogue_seed, plan.options.width, plan.options.height
         )
-        memory = TextureCache()
-        self.painters = {
-            name: QuarterRenderer(quarter, self.catalogue, memory)
+        cache = TextureCache()
+        self.renderers = {
+            name: QuarterRenderer(quarter, self.catalogue, cache)
             for name, quarter in plan.quarters.items()
         }
 
-    def draw(self, start: int, stop: int) -> int:
-        """Draw and write the plan's shots from `start` to before `stop`; how many they are."""
-        shots = self.plan.photos[start:stop]
-        for shot in shots:
-            (self.out / shot.folder / shot.name).write_bytes(self.photo(shot))
-        return len(shots)
+    def render(self, start: int, stop: int) -> int:
+        """Render and write the photos [start, stop) of the plan; return their number."""
+        photos = self.plan.photos[start:stop]
+        for photo in photos:
+            (self.out / photo.folder / photo.name).write_bytes(self.render_photo(photo))
+        return len(photos)
 
-    def photo(self, shot: PlannedPhoto) -> bytes:
-        view = self.painters[shot.quarter].view(shot.camera, shot.session)
-        rng = random_stream(self.plan.options.seed, "photo", shot.role, shot.number)
+    def render_photo(self, photo: PlannedPhoto) -> bytes:
+        """Render one photo to JPEG bytes."""
+        view = self.renderers[photo.quarter].view(photo.camera, photo.session)
+        rng = random_stream(self.plan.options.seed, "photo", photo.role, photo.number)
         return encode_jpeg(
-            postprocess(view, shot.camera, shot.session, self.film, rng), shot.session
+            postprocess(view, photo.camera, photo.session, self.sky_and_grain, rng), photo.session
         )
 
 
-_render_worker: _RenderWorker | None = None  # of this drawing process
+_render_worker: _RenderWorker | None = None  # of this process
 
 
 def _start_render_worker(plan: CityPlan, out: Path) -> None:
     global _render_worker
-    # Ctrl-C is for the parent, which ends its pool; a child's own trace would only confuse.
+    # The parent handles Ctrl-C and shuts down the pool; workers print no traceback.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _render_worker = _RenderWorker(plan, out)
 
 
-def _draw(start: int, stop: int) -> int:
+def _render(start: int, stop: int) -> int:
     assert _render_worker is not None
-    return _render_worker.draw(start, stop)
+    return _render_worker.render(start, stop)

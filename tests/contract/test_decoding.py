@@ -50,7 +50,7 @@ class Poisoned(Preprocessing):
 
 
 POISONED = Poisoned(
-    "poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.typical_size, SQUARE.resize
+    "poisoned", 1, SQUARE.upright, SQUARE.max_pixels, SQUARE.typical_size, SQUARE.resize
 )
 
 

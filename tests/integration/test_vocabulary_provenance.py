@@ -101,7 +101,7 @@ def test_a_vocabulary_of_other_weights_is_refused_with_both_specs(vlads: Workpla
     assert job.error is not None
     assert job.error["code"] == "vocabulary_unfit"
     assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in job.error["detail"]
-    assert "test-tiny-vlad makes test-tiny (weights" in job.error["detail"]
+    assert "test-tiny-vlad computes test-tiny (weights" in job.error["detail"]
     assert job.error["learnt_with"]["backbone"] == "dinov2-vits14"
     assert job.error["extractor_makes"] == tiny_features()
     assert vlads.active().id == before

@@ -168,7 +168,7 @@ def test_photos_are_described_alike_alone_and_together(files: dict[str, Path]) -
 
 def test_photos_of_no_whole_patches_are_refused(files: dict[str, Path]) -> None:
     backbone = load(files["plain"], PLAIN, 0, "value")
-    with pytest.raises(ValueError, match="100 x 70 pixels are no whole patches of 14"):
+    with pytest.raises(ValueError, match="100 x 70 pixels are not a multiple of the patch size 14"):
         backbone.features(torch.zeros((1, 100, 70, 3), dtype=torch.uint8))
 
 

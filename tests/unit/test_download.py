@@ -128,7 +128,7 @@ def test_more_than_there_is_is_thrown_away(server: FilesServer, target: Path) ->
 def test_a_file_with_another_hash_is_refused_and_not_kept(
     server: FilesServer, target: Path, expected: str
 ) -> None:
-    with pytest.raises(Misconfigured, match="is not the file that it should be") as caught:
+    with pytest.raises(Misconfigured, match="is not the expected file") as caught:
         download_file(f"{server.url}/weights", target, sha256=expected)
     assert caught.value.code == "download_corrupt"
     assert {path.suffix for path in target.parent.iterdir()} <= {".lock"}

@@ -37,7 +37,7 @@ def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Pa
     with pytest.raises(InvalidRequest, match="sfxs_test, sfxs_val, tokyoxs_test") as caught:
         open_evaluation_set(tmp_path)
     assert code_of(caught) == "which_set"
-    with pytest.raises(NotFound, match="There are: sfxs_test, sfxs_val") as missing:
+    with pytest.raises(NotFound, match="Available: sfxs_test, sfxs_val") as missing:
         open_evaluation_set(tmp_path / "SF_XS", "sfxs_tset")
     assert code_of(missing) == "set_missing"
 
@@ -182,7 +182,7 @@ def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path)
     first = opened.database[0]
     assert (first.heading, first.place, first.frame, first.sequence) == (10, "x", 3, "s")
     assert first.zone == "32U"
-    with pytest.raises(InvalidRequest, match="1 photos say no frame"):
+    with pytest.raises(InvalidRequest, match="1 photos have no frame"):
         open_evaluation_set(tmp_path, rule="frames 2")
 
 

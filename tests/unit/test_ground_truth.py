@@ -178,7 +178,7 @@ def test_heading_rule_wants_near_photos_that_look_the_same_way() -> None:
     database = [at(0, 0, heading=350), at(10, 0, heading=31), at(20, 0, heading=10)]
     database += [at(26, 0, heading=10), at(0, 1, heading=50), at(0, 2, heading=51)]
     assert positives("heading 25 40", [at(0, 0, heading=10)], database) == [[0, 1, 2, 4]]
-    with pytest.raises(InvalidRequest, match="1 photos say no heading"):
+    with pytest.raises(InvalidRequest, match="1 photos have no heading"):
         positives("heading", [at(0, 0)], database)
 
 

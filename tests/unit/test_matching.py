@@ -69,7 +69,7 @@ def test_patches_without_direction_or_likeness_match_nothing() -> None:
 def test_matches_are_the_same_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
     x, y = noise(1, 50), torch.cat([noise(1, 50)[20:40], noise(2, 30)])
     whole = mutual_matches(x, y)
-    monkeypatch.setattr(matching, "ROWS_AT_ONCE", 7)
+    monkeypatch.setattr(matching, "BLOCK_ROWS", 7)
     for one, other in zip(whole, mutual_matches(x, y), strict=True):
         torch.testing.assert_close(one, other)
     assert len(whole[0]) >= 20
@@ -126,7 +126,7 @@ def test_kept_features_are_what_was_compared() -> None:
     ids=["empty", "a header's begin", "cut off", "an archive"],
 )
 def test_damaged_features_are_noticed(data: bytes) -> None:
-    with pytest.raises(ValueError, match="no array"):
+    with pytest.raises(ValueError, match="not a NumPy array"):
         LocalFeatures.decode(data, WIDTH)
 
 

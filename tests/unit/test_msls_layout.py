@@ -99,6 +99,6 @@ def test_msls_of_one_city_or_of_mixed_versions_is_refused(tmp_path: Path) -> Non
         open_evaluation_set(tmp_path)
     assert code_of(caught) == "bad_table"
     (tmp_path / "train_val" / "sf").rename(tmp_path / "train_val" / "amman")
-    with pytest.raises(NotFound, match=r"no city sf\. There are: amman, cph") as missing:
+    with pytest.raises(NotFound, match=r"no city sf\. Available: amman, cph") as missing:
         open_evaluation_set(tmp_path)
     assert code_of(missing) == "city_missing"

@@ -99,7 +99,7 @@ def test_warming_up_is_a_pass_of_the_largest_size_and_finds_what_fits() -> None:
 
 
 def test_model_that_leaves_no_room_for_one_photo_is_refused_when_it_is_loaded() -> None:
-    with pytest.raises(Misconfigured, match="not one photo") as caught:
+    with pytest.raises(Misconfigured, match="no memory left for a single photo") as caught:
         on(SmallGpu(0)).warm_up(16)
     assert caught.value.code == "gpu_out_of_memory"
 

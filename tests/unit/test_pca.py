@@ -275,7 +275,7 @@ def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhi
         known.check_compatible({**spec, "layer": 4})
     assert caught.value.code == "pca_unfit"
     for either in (known, PcaWhiteningFile(fitted, None)):
-        with pytest.raises(Unprocessable, match="of 30 dimensions, and these have 31"):
+        with pytest.raises(Unprocessable, match="of 30 dimensions, but these have 31"):
             either.check_compatible({**spec, "dimension": 31})
 
 
@@ -289,11 +289,11 @@ def test_fingerprint_is_that_of_the_projection(fitted: PcaWhitening) -> None:
     [
         ("mean", None, "no mean"),
         ("rows", None, "no rows"),
-        ("mean", np.zeros(29, np.float32), "do not belong together"),
-        ("directions", np.zeros(30, np.float32), "do not belong together"),
-        ("variances", np.ones(5, np.float32), "do not belong together"),
+        ("mean", np.zeros(29, np.float32), "do not match: "),
+        ("directions", np.zeros(30, np.float32), "do not match: "),
+        ("variances", np.ones(5, np.float32), "do not match: "),
         ("variances", -np.ones(6, np.float32), "not positive"),
-        ("variances", np.full(6, 9, np.float32), "not those of its variances"),
+        ("variances", np.full(6, 9, np.float32), "do not match its variances"),
         ("mean", np.full(30, np.nan, np.float32), "NaN"),
         ("mean", np.zeros(30, np.float64), "float64, not float32"),
         ("rows", np.zeros(2, np.int64), "one number each"),
@@ -313,9 +313,9 @@ def test_files_that_would_spoil_descriptors_are_refused(
 def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
     data = PcaWhiteningFile(fitted, None).encode()
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
-        assert "not a whole one" in unfit(broken)
+        assert "or it is truncated" in unfit(broken)
     whole = load(data)
-    for spec, said in (("{", "can't be read"), ("[1]", "is none")):
+    for spec, said in (("{", "can't be read"), ("[1]", "is not a JSON object")):
         assert said in unfit(save(whole, {"spec": spec}))
 
 

@@ -86,7 +86,7 @@ def test_published_ways_give_the_published_numbers(name: str, size: tuple[int, i
     image = photo(*size)
     pixels = get_preprocessing(name).apply(image)
     assert pixels.shape[0] % 14 == pixels.shape[1] % 14 == 0
-    assert pixels.shape[0] * pixels.shape[1] <= get_preprocessing(name).most_pixels
+    assert pixels.shape[0] * pixels.shape[1] <= get_preprocessing(name).max_pixels
     ours = normalise_pixels(torch.from_numpy(np.stack([pixels])), MEAN, STD)[0]
     expected = PUBLISHED[name](image)
     assert ours.shape == expected.shape

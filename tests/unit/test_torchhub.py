@@ -205,7 +205,7 @@ def test_licence_of_the_code_is_read_or_said_to_be_missing(
         ("maps", "(2, 4, 224, 224)"),
         ("not_finite", "NaN"),
         ("zero", "zero"),
-        ("of_the_batch", "when another one is beside it"),
+        ("of_the_batch", "depends on the other photos of its batch"),
         ("one_size", "only 320 x 320 will do"),
         ("colours:dimension=200000", "200000 dimensions"),
         ("asks", "It asks a question"),

@@ -69,7 +69,7 @@ def test_city_with_more_than_a_hundred_thousand_places_clashes_with_no_other(
 
 def test_missing_city_is_named_with_those_that_are_there(tmp_path: Path) -> None:
     gsv_xs(tmp_path, "osl", {1: 2})
-    with pytest.raises(NotFound, match=r"no city London, Rome\. There are: osl") as caught:
+    with pytest.raises(NotFound, match=r"no city London, Rome\. Available: osl") as caught:
         open_training_set(tmp_path, ["London", "osl", "Rome"])
     assert code_of(caught) == "city_missing"
 

@@ -91,8 +91,8 @@ def broken_archives() -> dict[str, bytes]:
         "its provenance belongs to other centres": npz(
             centres=npy(good_centres()[:3]), provenance=provenance
         ),
-        "does not say what it was learnt with": npz(centres=centres, provenance=text({})),
-        "does not say what": npz(centres=centres, provenance=text(["a list"])),
+        "does not name the features it was fitted on": npz(centres=centres, provenance=text({})),
+        "does not name the features": npz(centres=centres, provenance=text(["a list"])),
         "it holds centres.npy": npz(centres=centres),
         "it holds nothing": npz(),
         "it holds centres.npy, code.npy": npz(centres=centres, provenance=provenance, code=b"x"),
@@ -147,7 +147,7 @@ def test_parameter_and_half_precision_tensors_are_read(tmp_path: Path) -> None:
 def test_tensor_file_holding_a_dictionary_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "c_centers.pt"
     torch.save({"centres": torch.ones(2, 3)}, path)
-    with pytest.raises(Unprocessable, match="holds a dict, not one tensor"):
+    with pytest.raises(Unprocessable, match="holds a dict, expected one tensor"):
         read_vocabulary(path)
 
 

@@ -87,7 +87,7 @@ def check_memory(settings: Settings) -> str:
         there, whose = memory_limit_bytes(), "this machine"
     weights = recipe.parameters * BYTES_PER_PARAMETER
     # One photo always goes through whole, however large its preprocessing leaves it.
-    one = math.ceil(get_preprocessing(recipe.preprocessing).most_pixels / DEFAULT_PHOTO_PIXELS)
+    one = math.ceil(get_preprocessing(recipe.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
     batch = max(settings.batch_photos, one) * BYTES_PER_BATCH_PHOTO
     needed = PROCESS_OVERHEAD_BYTES + weights + batch
     estimate = (

@@ -1,9 +1,7 @@
-"""How data sets lie on disk: one module for each way; `registry.py` lists them.
+"""Dataset layouts: how datasets are stored on disk, in the order in which they are tried.
 
-Each is a `TrainingLayout` or an `EvaluationLayout` (`layout.py`): it tells its folders from others,
-and reads them into the types of `shared/datasets/dataset.py`.
-
-The layouts that are known, in the order in which they are asked.
+Each layout is a `TrainingLayout` or an `EvaluationLayout` (`base`): it recognises its folders, and
+reads them into the types of `shared/datasets/dataset.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from shared.datasets.layouts.msls import Msls
 from shared.datasets.layouts.npy_lists import NpyLists
 
 TRAINING_LAYOUTS: tuple[TrainingLayout, ...] = (GsvXs(), GsvCities(), CsvTrainingTable())
-# Lists come before folders: where both are there, the lists bring the ground truth.
+# Lists come before folders: if a dataset has both, the lists have the ground truth.
 EVALUATION_LAYOUTS: tuple[EvaluationLayout, ...] = (
     NpyLists(),
     DbStruct(),

@@ -1,7 +1,4 @@
-"""What each layout can do: tell its folders from others, and read them.
-
-What training layouts by city share: which cities are meant, and numbers that don't clash.
-"""
+"""Interfaces of dataset layouts, and helpers for training sets of several cities."""
 
 from __future__ import annotations
 
@@ -15,65 +12,69 @@ from shared.errors import NotFound
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 
 PLACEWISE_PROTOCOL = "placewise"
-"""The protocol of a set that is taken as it lies there: all photos, all queries, safe over zones"""
+"""The default protocol: all photos, all queries, correct across UTM zones"""
 DEFAULT_RULE = "radius 25 m"
-"""The rule of nearly all published figures."""
+"""The positive-match criterion of nearly all published results."""
 
 
 @dataclass(frozen=True, slots=True)
 class ListedSet:
-    """An evaluation set as its layout lists it, before a rule has found positives."""
+    """An evaluation set as its layout lists it, before positives are computed."""
 
     database: tuple[DatasetPhoto, ...]
     queries: tuple[DatasetPhoto, ...]
     rule: str = DEFAULT_RULE
-    """The rule that this set is measured by when none is asked for."""
+    """The default positive-match criterion of the set."""
     positives: tuple[Indices, ...] | None = None
-    """By that rule, of a set that brings its own ground truth."""
+    """Positives by that rule, if the set includes a ground truth."""
     drops_queries: bool = False
-    """Whether the protocol leaves queries without positives out."""
+    """Whether the protocol excludes queries without positives."""
 
 
 class TrainingLayout(Protocol):
-    """Places to learn from. `base` is a folder that `recognises` has said yes to."""
+    """A layout of training sets. `base` is a folder for which `recognises` is true."""
 
     @property
     def name(self) -> str: ...
 
-    def recognises(self, base: Path) -> bool: ...
+    def recognises(self, base: Path) -> bool:
+        """Whether the folder has this layout."""
+        ...
 
     def cities(self, base: Path) -> tuple[str, ...]:
-        """In order of their names."""
+        """Return the names of the cities, sorted."""
         ...
 
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
-        """The cities in the order asked; all of them when None."""
+        """Open the given cities, in their order; None opens all."""
         ...
 
 
 class EvaluationLayout(Protocol):
-    """Sets of database photos and queries."""
+    """A layout of evaluation sets."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """The first is taken when none is asked for."""
+        """Names of the protocols; the first is the default."""
         ...
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        """What `open` takes, by the name of each set in `base`; {} for a folder of another layout.
+        """Return the key for `open` by the name of each set in `base`; {} for other layouts.
 
-        `prefix` begins the names of sets that have none of their own.
+        `prefix` is the first part of generated names.
         """
         ...
 
-    def open(self, base: Path, key: str, protocol: str) -> ListedSet: ...
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        """Read the photos of a set."""
+        ...
 
 
 def photos_below(folder: Path) -> list[Path]:
-    """Every photo below the folder, hidden ones left out, in the order of the paths' parts."""
+    """Return all photos below a folder, except hidden ones, sorted by path."""
     return sorted(
         path
         for path in folder.rglob("*")
@@ -82,27 +83,30 @@ def photos_below(folder: Path) -> list[Path]:
 
 
 def city_missing_error(base: Path, missing: Iterable[str], available: Sequence[str]) -> NotFound:
-    """The error that names the cities which are not there, and those which are."""
+    """Return the error for missing cities; it lists the available ones."""
     return NotFound(
         "city_missing",
-        f"{base} has no city {', '.join(missing)}. There are: {', '.join(available) or 'none'}. "
-        "Name some of these, or download the missing ones.",
+        f"{base} has no city {', '.join(missing)}. Available: {', '.join(available) or 'none'}. "
+        "Use these, or download the missing ones.",
         missing=list(missing),
         there=list(available),
     )
 
 
 PLACE_ID_STEP = 10**5
-"""between the place numbers of two cities, as GSV-Cities has it"""
+"""Offset between the place ids of two cities, as in GSV-Cities"""
 
 CityPhotos = dict[int, list[Path]]
-"""the photos of each place of one city, by the city's own number of the place"""
+"""The photos of each place of a city, by the city's own place id"""
 
 
 def select_cities(
     base: Path, requested: Sequence[str] | None, available: Sequence[str]
 ) -> list[str]:
-    """The asked cities as they are written there; doubles count once. NotFound (`city_missing`)."""
+    """Return the requested cities in their stored spelling, without duplicates.
+
+    Raises NotFound (`city_missing`).
+    """
     if requested is None:
         return list(available)
     known = {city.lower(): city for city in available}
@@ -115,10 +119,10 @@ def select_cities(
 def number_places(
     cities: Mapping[str, CityPhotos] | Iterable[tuple[str, CityPhotos]], min_photos: int
 ) -> tuple[TrainingPlace, ...]:
-    """The places with enough photos, city after city, each city's by number.
+    """Return the places with at least `min_photos` photos, city by city, sorted by id.
 
-    The i-th city's numbers grow by `i * STEP`. Where a city counts on beyond STEP, the step of all
-    is the next power of ten above its largest number.
+    The i-th city's ids are offset by `i * PLACE_ID_STEP`. If any id is not below PLACE_ID_STEP, the
+    step is the next power of ten above the largest id.
     """
     named = list(cities.items() if isinstance(cities, Mapping) else cities)
     largest = max((max(photos, default=0) for _, photos in named), default=0)

@@ -1,8 +1,8 @@
-"""One's own photos, listed in CSV: `database.csv` and `queries.csv`, and `train.csv` to learn from.
+"""CSV layout for your own photos: `database.csv` and `queries.csv`, and `train.csv` for training.
 
-Columns: `path`, beginning at the tables' folder; `latitude`, `longitude` or `easting`, `northing`,
-`zone`; `heading`, `place`, `frame`, `sequence`. All but the path may be left out; `train.csv` needs
-a `place` in each row, and may have a `city`.
+Columns: `path`, relative to the tables' folder; `latitude`, `longitude` or `easting`, `northing`,
+`zone`; `heading`, `place`, `frame`, `sequence`. All but `path` are optional; `train.csv` needs a
+`place` in each row, and may have a `city`.
 """
 
 from __future__ import annotations
@@ -23,26 +23,30 @@ from shared.datasets.photo_lists import bad_row_error, read_photo_list, read_tab
 
 
 class CsvTables:
+    """Evaluation sets as CSV tables."""
+
     name = "CSV tables"
     protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        there = all((base / name).is_file() for name in ("database.csv", "queries.csv"))
-        return {prefix: "."} if there else {}
+        exists = all((base / name).is_file() for name in ("database.csv", "queries.csv"))
+        return {prefix: "."} if exists else {}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         database, queries = (
             read_photo_list(base / "database.csv"),
             read_photo_list(base / "queries.csv"),
         )
-        placed = any(shot.easting is not None for shot in database + queries)
-        labelled = any(shot.place for shot in database + queries)
+        has_positions = any(photo.easting is not None for photo in database + queries)
+        has_labels = any(photo.place for photo in database + queries)
         return ListedSet(
-            database, queries, "place-label" if labelled and not placed else DEFAULT_RULE
+            database, queries, "place-label" if has_labels and not has_positions else DEFAULT_RULE
         )
 
 
 class CsvTrainingTable:
+    """Training sets as a CSV table."""
+
     name = "CSV table of places"
 
     def recognises(self, base: Path) -> bool:
@@ -54,23 +58,25 @@ class CsvTrainingTable:
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
         by_city = _by_city(base)
         chosen = select_cities(base, cities, sorted(by_city))
-        places = number_places([(city, _numbers(by_city[city])) for city in chosen], min_photos)
+        places = number_places(
+            [(city, _number_labels(by_city[city])) for city in chosen], min_photos
+        )
         return TrainingSet(base.resolve().name, base, self.name, places)
 
 
 def _by_city(base: Path) -> dict[str, dict[str, list[Path]]]:
-    """The photos of each label of each city; without a column `city` all are of one."""
+    """Group photos by city and place label; without a column `city` there is one city."""
     table = base / "train.csv"
-    found: dict[str, dict[str, list[Path]]] = {}
+    by_city: dict[str, dict[str, list[Path]]] = {}
     for line, row in read_table(table, ("path", "place")):
         if not (row["path"].strip() and row["place"].strip()):
-            raise bad_row_error(table, line, "path and place must be given")
+            raise bad_row_error(table, line, "path and place are required")
         city = row.get("city", "").strip() or base.resolve().name
-        photos = found.setdefault(city, {}).setdefault(row["place"].strip(), [])
+        photos = by_city.setdefault(city, {}).setdefault(row["place"].strip(), [])
         photos.append(base / row["path"].strip())
-    return found
+    return by_city
 
 
-def _numbers(labels: Mapping[str, list[Path]]) -> CityPhotos:
-    """Places by number: a label's rank among the city's."""
+def _number_labels(labels: Mapping[str, list[Path]]) -> CityPhotos:
+    """Number the places of a city by the rank of their labels."""
     return {number: labels[label] for number, label in enumerate(sorted(labels))}

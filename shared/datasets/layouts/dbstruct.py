@@ -1,4 +1,4 @@
-"""NetVLAD's `dbStruct` in a MATLAB file: how Pitts30k and Pitts250k are published.
+"""NetVLAD's `dbStruct` in MATLAB files: the layout of Pitts30k and Pitts250k.
 
 Its fields, in their order: whichSet, database names, database UTM, query names, query UTM, two
 counts, the radius in metres. (Arandjelovic et al., NetVLAD, 2016; its Pittsburgh files)
@@ -17,12 +17,14 @@ from shared.datasets.layouts.base import PLACEWISE_PROTOCOL, ListedSet
 from shared.errors import InvalidRequest, Misconfigured
 
 FIELDS = 8
-"""from whichSet to posDistThr; what follows is not needed"""
+"""From whichSet to posDistThr; later fields are not used"""
 DATABASE_FOLDERS = (".", "images", "database", "..")
 QUERY_FOLDERS = ("queries_real", ".", "images", "queries", "../queries_real", "..")
 
 
 class DbStruct:
+    """Evaluation sets as dbStruct files."""
+
     name = "dbStruct .mat"
     protocols = (PLACEWISE_PROTOCOL,)
 
@@ -34,12 +36,12 @@ class DbStruct:
         fields = list(_struct(path).values())
         if len(fields) < FIELDS:
             raise _bad_struct_error(
-                path, f"its dbStruct has {len(fields)} fields, at least {FIELDS} are needed"
+                path, f"its dbStruct has {len(fields)} fields, expected at least {FIELDS}"
             )
         try:
             radius = float(fields[7])
-            database = _shots(base, DATABASE_FOLDERS, fields[1], fields[2])
-            queries = _shots(base, QUERY_FOLDERS, fields[3], fields[4])
+            database = _read_photos(base, DATABASE_FOLDERS, fields[1], fields[2])
+            queries = _read_photos(base, QUERY_FOLDERS, fields[3], fields[4])
         except (TypeError, ValueError) as error:
             raise _bad_struct_error(path, str(error)) from error
         return ListedSet(database, queries, f"radius {radius:g} m")
@@ -51,23 +53,25 @@ def _struct(path: Path) -> dict[str, Any]:
     except ImportError as error:
         raise Misconfigured(
             "trainer_missing",
-            f"{path} can only be read with SciPy, which is not installed: "
+            f"Reading {path} requires SciPy, which is not installed. Run "
             "pip install 'placewise[trainer]'.",
         ) from error
     try:
-        found = loadmat(path, simplify_cells=True).get("dbStruct")
+        struct = loadmat(path, simplify_cells=True).get("dbStruct")
     except (OSError, ValueError, TypeError, NotImplementedError) as error:
         raise _bad_struct_error(path, str(error)) from error
-    if not isinstance(found, dict):
+    if not isinstance(struct, dict):
         raise _bad_struct_error(path, "it has no dbStruct")
-    return found
+    return struct
 
 
-def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[DatasetPhoto, ...]:
+def _read_photos(
+    base: Path, folders: Sequence[str], names: Any, utm: Any
+) -> tuple[DatasetPhoto, ...]:
     listed = [str(name) for name in np.atleast_1d(names).tolist()]
     metres = np.asarray(utm, np.float64).reshape(2, -1)
     if metres.shape[1] != len(listed):
-        raise ValueError(f"{len(listed)} names have {metres.shape[1]} positions")
+        raise ValueError(f"it has {len(listed)} names, but {metres.shape[1]} positions")
     folder = next(
         (base / name for name in folders if listed and (base / name / listed[0]).is_file()), base
     )
@@ -77,5 +81,5 @@ def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[Da
     )
 
 
-def _bad_struct_error(path: Path, fault: str) -> InvalidRequest:
-    return InvalidRequest("bad_dbstruct", f"{path} can't be read as a dbStruct: {fault}.")
+def _bad_struct_error(path: Path, reason: str) -> InvalidRequest:
+    return InvalidRequest("bad_dbstruct", f"{path} can't be read as a dbStruct: {reason}.")

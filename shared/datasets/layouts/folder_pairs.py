@@ -1,9 +1,9 @@
-"""Two folders, `database/` and `queries/`: alone, or in `train/`, `val/` and `test/` each.
+"""Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
-Positions stand in `@UTM@` file names, or in EXIF where no name has one. Photos in folders of their
-own below `database/` and `queries/` have the folder as their place. Beside a folder `NAME` there
-may be a list `NAME_images_paths.txt`, one path a line from the data set on: then it is the set, in
-its order. (VPR-methods-evaluation, deep-visual-geo-localization-benchmark)
+Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
+and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
+one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
+deep-visual-geo-localization-benchmark)
 """
 
 from __future__ import annotations
@@ -20,48 +20,49 @@ from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
 VME_PROTOCOL = "vme"
-"""VPR-methods-evaluation's: metres of different zones are compared as if they were of one"""
+"""Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
 
 class FolderPairs:
-    """`sets` names a pair after its folder and its split."""
+    """Evaluation sets as pairs of folders, named by the dataset's folder and the split."""
 
     name = "database and queries folders"
     protocols = (PLACEWISE_PROTOCOL, VME_PROTOCOL)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        found = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
-        return {prefix: ".", **found} if _is_pair(base) else found
+        splits = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
+        return {prefix: ".", **splits} if _is_pair(base) else splits
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         folder = base / key
-        database, queries = (_shots(folder / name, base) for name in ("database", "queries"))
+        database, queries = (_read_photos(folder / name, base) for name in ("database", "queries"))
         if protocol == VME_PROTOCOL:
             database, queries = (
-                tuple(replace(shot, zone=None) for shot in shots) for shots in (database, queries)
+                tuple(replace(photo, zone=None) for photo in photos)
+                for photos in (database, queries)
             )
-        return ListedSet(database, queries, _natural_rule(database + queries))
+        return ListedSet(database, queries, _default_rule(database + queries))
 
 
 def _is_pair(folder: Path) -> bool:
     return (folder / "database").is_dir() and (folder / "queries").is_dir()
 
 
-def _natural_rule(shots: tuple[DatasetPhoto, ...]) -> str:
-    """Photos that nobody has placed on a map may still lie in folders of places."""
-    if all(shot.easting is None for shot in shots) and any(shot.place for shot in shots):
+def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:
+    """Use place labels if no photo has a position but some have a label."""
+    if all(photo.easting is None for photo in photos) and any(photo.place for photo in photos):
         return "place-label"
     return DEFAULT_RULE
 
 
-def _shots(folder: Path, base: Path) -> tuple[DatasetPhoto, ...]:
-    shots = [
+def _read_photos(folder: Path, base: Path) -> tuple[DatasetPhoto, ...]:
+    photos = [
         photo_from_filename(path, path.relative_to(base).as_posix(), _place(path, folder))
         for path in _paths(folder)
     ]
-    if any(shot.easting is not None for shot in shots):
-        return tuple(shots)
-    return add_utm_positions(add_exif_positions(shots))
+    if any(photo.easting is not None for photo in photos):
+        return tuple(photos)
+    return add_utm_positions(add_exif_positions(photos))
 
 
 def _place(path: Path, folder: Path) -> str | None:
@@ -75,13 +76,13 @@ def _paths(folder: Path) -> list[Path]:
         return photos_below(folder)
     lines = [line.strip() for line in listing.read_text(encoding="utf-8").splitlines()]
     roots = (folder.parent, folder, folder.parent.parent)
-    named = [line for line in lines if line]
+    paths = [line for line in lines if line]
     for root in roots:
-        if named and (root / named[0]).exists():
-            return [root / line for line in named]
+        if paths and (root / paths[0]).exists():
+            return [root / line for line in paths]
     raise InvalidRequest(
         "bad_list",
-        f"{listing}: its first path, {named[0] if named else 'nothing'}, is in none of "
-        f"{', '.join(map(str, roots))}. Correct the list, or take it away: then all photos of "
-        f"{folder} count.",
+        f"{listing}: its first path, {paths[0] if paths else 'nothing'}, is in none of "
+        f"{', '.join(map(str, roots))}. Correct the list, or remove it to use all photos of "
+        f"{folder}.",
     )

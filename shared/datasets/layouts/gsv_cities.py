@@ -1,11 +1,11 @@
-"""GSV-Cities as it was published: `Dataframes/CITY.csv` and `Images/CITY/*.jpg`.
+"""Training layouts GSV-Cities and gsv_xs.
 
-A photo's name follows from its row: CITY_PLACE_YEAR_MONTH_NORTHDEG_LAT_LON_PANOID.jpg. gsv-cities-
-light is the same with fewer and smaller photos. (github.com/amaralibey/gsv-cities, OpenVPRLab)
+GSV-Cities: `Dataframes/CITY.csv` and `Images/CITY/*.jpg`. A photo's file name follows from its row:
+CITY_PLACE_YEAR_MONTH_NORTHDEG_LAT_LON_PANOID.jpg. gsv-cities-light is the same with fewer and
+smaller photos. (github.com/amaralibey/gsv-cities, OpenVPRLab)
 
-gsv_xs: `train/CITY/*.jpg` with `@` names, and `dataframes/CITY.csv` where somebody made it.
-
-Without a table the place stands in the names: `4257` of the note `4257_Bangkok`.
+gsv_xs: `train/CITY/*.jpg` with `@UTM@` names, and optionally `dataframes/CITY.csv`. Without a table
+the place id is in the file names: `4257` in the note `4257_Bangkok`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ from shared.datasets.utm_filenames import parse_utm_file_name
 from shared.errors import InvalidRequest
 
 GSV_CITIES_COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
-# A photo's row and its file agree in these; latitude and longitude are left out, because their
+# Fields by which a row is matched to its file. Latitude and longitude are excluded, because their
 # digits depend on the library that wrote them.
 PhotoKey = tuple[int, int, int, int, str]
 
 
 class GsvCities:
+    """Training sets in the layout of GSV-Cities."""
+
     name = "GSV-Cities"
 
     def recognises(self, base: Path) -> bool:
@@ -59,13 +61,13 @@ def _photos(base: Path, city: str) -> CityPhotos:
 
 
 def _files(folder: Path) -> dict[PhotoKey, Path]:
-    """The photos of the folder by what their rows say of them; none where there is no folder."""
+    """Return the photos of a folder by key; empty if the folder does not exist."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return {key: path for path in paths if (key := _key_of(path.name)) is not None}
 
 
 def _key_of(name: str) -> PhotoKey | None:
-    """None for a file that is no photo of this layout. A panorama's name may hold underscores."""
+    """Parse the key of a file name, or return None; panorama ids may contain underscores."""
     fields = name.removesuffix(".jpg").split("_", 7)
     if len(fields) != 8:
         return None
@@ -88,6 +90,8 @@ GSV_XS_COLUMNS = ("place_id", "class_name", "filename")
 
 
 class GsvXs:
+    """Training sets in the layout of gsv_xs."""
+
     name = "gsv_xs"
 
     def recognises(self, base: Path) -> bool:
@@ -111,20 +115,22 @@ def _folders(base: Path) -> tuple[str, ...]:
     train = base / "train"
     if not train.is_dir():
         return ()
-    hidden_or_pair = {"database", "queries"}
+    evaluation_folders = {"database", "queries"}
     return tuple(
         sorted(
             path.name
             for path in train.iterdir()
-            if path.is_dir() and path.name not in hidden_or_pair and not path.name.startswith(".")
+            if path.is_dir()
+            and path.name not in evaluation_folders
+            and not path.name.startswith(".")
         )
     )
 
 
 def _first_photo(base: Path, city: str) -> list[Path]:
-    """The first photo that the folder gives, of which one is enough to see how all are named."""
-    found = (p for p in (base / "train" / city).iterdir() if p.name.startswith("@"))
-    first = next(found, None)
+    """Return one photo of the folder, to detect the naming, or an empty list."""
+    candidates = (p for p in (base / "train" / city).iterdir() if p.name.startswith("@"))
+    first = next(candidates, None)
     return [] if first is None else [first]
 
 
@@ -142,14 +148,14 @@ def _photos_of_gsv_xs(base: Path, city: str) -> CityPhotos:
         if place_or_none is None:
             raise InvalidRequest(
                 "no_place_in_name",
-                f"{path} says no place: its note, the last field, has to be PLACE_CITY such as "
-                f"4257_Bangkok. A table {table} may say it instead.",
+                f"{path} has no place id: its note, the last field, must be PLACE_CITY such as "
+                f"4257_Bangkok. Alternatively, add the table {table}.",
             )
         photos.setdefault(place_or_none, []).append(path)
     return photos
 
 
 def _place_of(name: str) -> int | None:
-    spot = parse_utm_file_name(name)
-    number = spot.note.partition("_")[0] if spot else ""
+    location = parse_utm_file_name(name)
+    number = location.note.partition("_")[0] if location else ""
     return int(number) if number.isdecimal() and number.isascii() else None

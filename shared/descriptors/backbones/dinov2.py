@@ -1,14 +1,14 @@
-"""DINOv2 (Oquab et al. 2023): a facet of one transformer block, as AnyLoc takes it.
+"""DINOv2 backbone (Oquab et al. 2023): a facet of one transformer block, as in AnyLoc.
 
     tokens = [class, registers, patches] + positions
     tokens = block(tokens)                        for every block before `layer`, counted from 0
-    facet  = block `layer` of them (token), or norm1(tokens) @ W + b with the third of that block's
-             qkv projection that makes queries, keys or values
+    facet  = output of block `layer` (token), or norm1(tokens) @ W + b with the third of that
+             block's qkv projection that computes queries, keys or values
     feature of a patch = facet / |facet|          class and register tokens dropped
 
-AnyLoc hooks a whole forward pass; this one ends where the facet is known, with the same numbers.
+AnyLoc hooks a whole forward pass; this one stops once the facet is computed, with the same numbers.
 The blocks are timm's. Positions are resampled as in Meta's code, on which AnyLoc's published
-vocabularies rest; timm's own resampling gives other features at any size but the training's.
+vocabularies depend; timm's own resampling gives other features at any size but the training's.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from shared.descriptors.backbones.dinov2_weights import (
 from shared.extractor_config.configs import FACETS
 
 PATCH = 14  # pixels
-GRID = 37  # patches along a side of the training's 518 x 518 photos
-INTERPOLATE_OFFSET = 0.1  # Meta's, against rounding of the output's size
+GRID = 37  # patches along a side of the 518 x 518 training photos
+INTERPOLATE_OFFSET = 0.1  # from Meta's code, avoids rounding errors of the output size
 META_DEVICE = torch.device("meta")
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet
 
@@ -47,7 +47,7 @@ class VitShape:
     """The size of a vision transformer with patches of 14 x 14 pixels."""
 
     timm_name: str
-    """timm's network with the same kind of blocks (SwiGLU in the giant, plain MLP otherwise)."""
+    """Name of timm's network with the same blocks (SwiGLU in the giant, else plain MLP)."""
     depth: int
     width: int
     heads: int
@@ -63,6 +63,8 @@ SHAPES = {
 
 
 class Dinov2:
+    """Backbone that computes one facet of one DINOv2 block."""
+
     licence = "Apache-2.0"
 
     def __init__(
@@ -75,10 +77,18 @@ class Dinov2:
         *,
         shape: VitShape | None = None,
     ) -> None:
-        """Load the blocks up to `layer`; `weights` as DINO_WEIGHTS, None for timm's on the hub.
+        """Load the blocks up to `layer`; holds one copy of their weights in memory.
 
-        `shape` is that of `size` unless a test has a smaller one. Raises Misconfigured:
-        `weights_missing`, `weights_unfit`. Takes one copy of the weights in use, no more.
+        Args:
+            size: A key of SHAPES.
+            layer: Number of the block, from 0.
+            facet: query, key, value or token.
+            device: Where the network computes.
+            weights: The setting DINO_WEIGHTS; None for timm's weights from the hub.
+            shape: Overrides the shape of `size`, for tests.
+
+        Raises:
+            Misconfigured: `weights_missing`, `weights_unfit`.
         """
         self._shape = shape or SHAPES[size]
         self.name = f"dinov2-{size}"
@@ -103,12 +113,14 @@ class Dinov2:
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         _, height, width, _ = pixels.shape
         if height % PATCH or width % PATCH:
-            raise ValueError(f"{height} x {width} pixels are no whole patches of {PATCH}")
+            raise ValueError(
+                f"{height} x {width} pixels are not a multiple of the patch size {PATCH}"
+            )
         batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
         patches = self._vit.patch_embed.proj(batch).flatten(2).transpose(1, 2)
         tokens = self._with_positions(patches, height // PATCH, width // PATCH)
-        *before, last = self._vit.blocks
-        for block in before:
+        *earlier, last = self._vit.blocks
+        for block in earlier:
             tokens = block(tokens)
         facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
         return normalise_features(facet[:, 1 + self._shape.registers :])
@@ -120,20 +132,20 @@ class Dinov2:
         """(B, patches, width) -> (B, 1 + registers + patches, width)."""
         vit, registers = self._vit, self._shape.registers
         if (rows, columns) not in self._positions:
-            of_patches = vit.pos_embed if registers else vit.pos_embed[:, 1:]
+            patch_positions = vit.pos_embed if registers else vit.pos_embed[:, 1:]
             self._positions[rows, columns] = resample_positions(
-                of_patches, rows, columns, registers=registers
+                patch_positions, rows, columns, registers=registers
             )
         first = vit.cls_token if registers else vit.cls_token + vit.pos_embed[:, :1]
         prefix = torch.cat([first, vit.reg_token], dim=1) if registers else first
-        placed = patches + self._positions[rows, columns]
-        return torch.cat([prefix.expand(len(patches), -1, -1), placed], dim=1)
+        positioned = patches + self._positions[rows, columns]
+        return torch.cat([prefix.expand(len(patches), -1, -1), positioned], dim=1)
 
 
 def check_dinov2_weights(
     size: str, layer: int, facet: str, file: DinoWeightsFile, *, shape: VitShape | None = None
 ) -> None:
-    """Misconfigured (`weights_unfit`) when loading would refuse the file; reads its index only."""
+    """Raise Misconfigured (`weights_unfit`) if the file can't be loaded; reads its index only."""
     shape = shape or SHAPES[size]
     check_tensor_shapes(file, _shapes(build_empty_vit(shape, layer, facet)), size, shape.registers)
 
@@ -141,7 +153,7 @@ def check_dinov2_weights(
 def resample_positions(
     positions: torch.Tensor, rows: int, columns: int, *, registers: int = 0
 ) -> torch.Tensor:
-    """(1, side * side, width) learnt positions of patches -> (1, rows * columns, width).
+    """Resample (1, side * side, width) position embeddings to (1, rows * columns, width).
 
     As `interpolate_pos_encoding` of Meta's dinov2/models/vision_transformer.py with the arguments
     of its hub models: bicubic in float32. Networks without registers scale by (rows + 0.1) / side,
@@ -152,11 +164,11 @@ def resample_positions(
         return positions
     grid = positions.float().reshape(1, side, side, -1).permute(0, 3, 1, 2)
     if registers:
-        moved = interpolate(grid, size=(rows, columns), mode="bicubic", antialias=True)
+        resampled = interpolate(grid, size=(rows, columns), mode="bicubic", antialias=True)
     else:
         scale = ((rows + INTERPOLATE_OFFSET) / side, (columns + INTERPOLATE_OFFSET) / side)
-        moved = interpolate(grid, scale_factor=scale, mode="bicubic", antialias=False)
-    return moved.permute(0, 2, 3, 1).flatten(1, 2)
+        resampled = interpolate(grid, scale_factor=scale, mode="bicubic", antialias=False)
+    return resampled.permute(0, 2, 3, 1).flatten(1, 2)
 
 
 def build_empty_vit(
@@ -167,10 +179,12 @@ def build_empty_vit(
     with_norm: bool = False,
     device: torch.device = META_DEVICE,
 ) -> Any:
-    """timm's network up to where the facet is known, and to the norm after it on demand; without
-    memory for its tensors unless a device is given, where they are random.
+    """Build timm's network up to the layers that the facet needs.
+
+    On the default `meta` device the tensors have no memory; on others they are random.
+    `with_norm` keeps the network's last norm.
     """
-    import timm  # takes seconds, which other extractors and commands need not pay
+    import timm  # imported here because it takes seconds
 
     with device:
         vit: Any = timm.create_model(
@@ -197,9 +211,9 @@ def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
 
 
 def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile) -> str:
-    """The `fingerprint` of a network with these weights; reads the file, loads no network.
+    """Return the `fingerprint` of a network with these weights without loading it onto a device.
 
-    Misconfigured: `weights_unfit`.
+    Raises Misconfigured (`weights_unfit`).
     """
     vit = build_empty_vit(SHAPES[size], layer, facet)
     digest = hashlib.sha256()
@@ -211,9 +225,9 @@ def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile)
 def load_vit_weights(
     vit: Any, file: DinoWeightsFile, shape: VitShape, size: str, device: torch.device
 ) -> str:
-    """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes.
+    """Load the tensors into an empty network.
 
-    Misconfigured: `weights_unfit`.
+    Returns their sha256: name-sorted, as float32 bytes. Raises Misconfigured (`weights_unfit`).
     """
     digest = hashlib.sha256()
     state = {}
@@ -227,14 +241,16 @@ def load_vit_weights(
 def _tensors(
     vit: Any, file: DinoWeightsFile, shape: VitShape, size: str
 ) -> Iterator[tuple[str, torch.Tensor]]:
-    """What the outline needs of the file, sorted by name, in float32; checked."""
-    wanted = _shapes(vit)
-    check_tensor_shapes(file, wanted, size, shape.registers)
-    for name in sorted(wanted):
+    """Yield the tensors that the network needs, sorted by name, in float32, validated."""
+    expected_shapes = _shapes(vit)
+    check_tensor_shapes(file, expected_shapes, size, shape.registers)
+    for name in sorted(expected_shapes):
         stored = file.read(name)
         if not stored.is_floating_point() or not torch.isfinite(stored).all():
-            raise weights_unfit_error(file.path, f"{name} is not all finite floats", size)
-        # Copied: the file may be changed or taken away while the service runs.
+            raise weights_unfit_error(
+                file.path, f"{name} holds numbers that are not finite floats", size
+            )
+        # Copied: the file may be changed or removed while the service runs.
         yield name, torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
 
 
@@ -244,10 +260,10 @@ def _update_digest(digest: Any, name: str, tensor: torch.Tensor) -> None:
 
 
 def _slice_qkv(attention: Any, third: int) -> None:
-    """Of the joint projection [query; key; value], keep the rows that make one of them."""
+    """Keep only the query, key or value rows of the joint qkv projection."""
     joint: Linear = attention.qkv
     width = joint.in_features
     rows = slice(third * width, (third + 1) * width)
     attention.qkv = Linear(width, width, device="meta").requires_grad_(False)
-    kept = {"weight": joint.weight[rows].clone(), "bias": joint.bias[rows].clone()}
-    attention.qkv.load_state_dict(kept, assign=True)
+    parameters = {"weight": joint.weight[rows].clone(), "bias": joint.bias[rows].clone()}
+    attention.qkv.load_state_dict(parameters, assign=True)

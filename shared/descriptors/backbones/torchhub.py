@@ -1,13 +1,11 @@
-"""The code of a torch.hub extractor: brought here at its commit, fingerprinted, executed.
-
-A repository lies where torch.hub itself would put it (`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), so that
-a folder filled by either serves both. Whether its code may run at all is decided before
-(`Settings.recipe`); what runs can do whatever this process can.
-
-A torch.hub entry as a backbone: a network that makes one global descriptor of a photo.
+"""torch.hub backbones: entries of third-party repositories that compute one global descriptor.
 
 MegaLoc, BoQ, CosPlace, EigenPlaces and others publish such entries: (B, 3, H, W) normalised pixels
--> (B, D). Of a tuple the first member counts: BoQ adds its attention maps.
+-> (B, D). If an entry returns a tuple, its first element is used: BoQ adds its attention maps.
+
+A repository is downloaded at a fixed commit to the folder that torch.hub uses
+(`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), fingerprinted and executed. `Settings.recipe` decides whether
+its code may run at all; once it runs, it can do whatever this process can do.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ import torch
 from torch.nn.functional import normalize
 
 from shared.descriptors.backbones import normalise_features, normalise_pixels
-from shared.descriptors.weight_files import OnProgress, download_file
+from shared.descriptors.weight_files import OnProgress, download_file, first_error_line
 from shared.errors import Misconfigured, PlacewiseError
 from shared.extractor_config.configs import MAX_WIDTH
 from shared.extractor_config.names import TORCHHUB_PREFIX, TorchHubEntry
@@ -43,11 +41,11 @@ NETWORK_ERRORS = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
 
 
 def ignore_progress(_done: int, _total: int | None) -> None:
-    """For who does not want to see bytes come."""
+    """Progress callback that does nothing."""
 
 
 def cached_code_folder(hub: TorchHubEntry) -> Path:
-    """Where the code lies, or would lie once it was brought."""
+    """Return the folder of the entry's code, whether or not it exists."""
     if hub.folder is not None:
         return Path(hub.folder)
     assert hub.repository is not None
@@ -55,9 +53,9 @@ def cached_code_folder(hub: TorchHubEntry) -> Path:
 
 
 def find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_progress) -> Path:
-    """The folder of the code; a repository's is downloaded from GitHub if it is not there.
+    """Return the folder of the code; a repository is downloaded from GitHub if it is missing.
 
-    Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
+    Raises Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
     """
     folder = cached_code_folder(hub)
     if hub.folder is None and not folder.exists():
@@ -65,17 +63,17 @@ def find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_p
             _download_repository(hub, folder, on_progress)
         except (*NETWORK_ERRORS, OSError) as error:
             raise code_missing_error(
-                hub, f"its code can't be downloaded: {_first_line(error)}"
+                hub, f"its code can't be downloaded: {first_error_line(error)}"
             ) from error
     return find_local_code(hub)
 
 
 def find_local_code(hub: TorchHubEntry) -> Path:
-    """As `find_or_download_code`, but what would have to be downloaded is missing."""
+    """As `find_or_download_code`, without downloading: raises `weights_missing` instead."""
     folder = cached_code_folder(hub)
     if not (folder / HUBCONF).is_file():
-        where = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not here"
-        raise code_missing_error(hub, where)
+        reason = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not downloaded"
+        raise code_missing_error(hub, reason)
     return folder
 
 
@@ -84,26 +82,28 @@ def load_module(
 ) -> torch.nn.Module:
     """Execute the entry of the folder's `hubconf.py` with its arguments.
 
-    Weights that it takes from the network through torch.hub come by
-    `shared.descriptors.weight_files`.
-    Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+    Weights that the entry downloads through torch.hub are downloaded by `download_file` instead.
+
+    Raises Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
     """
     try:
         with _import_guard(folder, on_progress):
-            # From GitHub, too, it is a folder by now: torch.hub's own question whether it is to be
-            # trusted is not asked, and nothing is compared with the repository's branches.
+            # The code is a local folder also for repositories, so torch.hub neither asks whether to
+            # trust it nor compares it with the repository's branches.
             load: Any = torch.hub.load  # untyped
             module = load(str(folder), hub.entry, source="local", **dict(hub.arguments))
     except PlacewiseError:
         raise
-    except (Exception, SystemExit) as error:  # whatever the code of others does
-        said = f"{type(error).__name__}: {_first_line(error)}"
-        if isinstance(error, EOFError) and "reading a line" in said:
-            said += ". It asks a question (as torch.hub does about a further repository), and here "
-            said += "nobody answers"
+    except (Exception, SystemExit) as error:  # third-party code may raise anything
+        message = f"{type(error).__name__}: {first_error_line(error)}"
+        if isinstance(error, EOFError) and "reading a line" in message:
+            message += ". It asks a question (as torch.hub does about a further repository), but "
+            message += "there is no interactive input"
         if any(isinstance(cause, NETWORK_ERRORS) for cause in _exception_chain(error)):
-            raise code_missing_error(hub, f"what it needs can't be downloaded: {said}") from error
-        raise torchhub_unfit_error(hub, f"loading it ended with {said}") from error
+            raise code_missing_error(
+                hub, f"a file that it needs can't be downloaded: {message}"
+            ) from error
+        raise torchhub_unfit_error(hub, f"loading it failed with {message}") from error
     if not isinstance(module, torch.nn.Module):
         raise torchhub_unfit_error(
             hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module"
@@ -112,47 +112,48 @@ def load_module(
 
 
 def code_fingerprint(folder: Path) -> str:
-    """sha256 of every file's path and content; hidden files and bytecode don't count."""
+    """Return the sha256 of every file's path and content, except hidden files and bytecode."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
-        inside = path.relative_to(folder)
-        skipped = any(part.startswith(".") or part == "__pycache__" for part in inside.parts)
+        relative = path.relative_to(folder)
+        skipped = any(part.startswith(".") or part == "__pycache__" for part in relative.parts)
         if skipped or not path.is_file():
             continue
         with path.open("rb") as file:
             content = hashlib.file_digest(file, "sha256").hexdigest()
-        digest.update(f"{inside.as_posix()}\0{content}\n".encode(errors="surrogateescape"))
+        digest.update(f"{relative.as_posix()}\0{content}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
 
 
 def find_licence(folder: Path) -> str:
-    """What the folder's licence file calls itself, with the file's name; or `none found`."""
+    """Return the title and the name of the folder's licence file, or `none found`."""
     for path in sorted(folder.iterdir()):
         if not LICENCE_FILES.fullmatch(path.name) or not path.is_file():
             continue
         text = path.read_text(errors="replace")
         lines = [line.strip() for line in text.splitlines() if line.strip()][:2]
-        named = ", ".join(lines if lines[1:] and lines[1].startswith("Version") else lines[:1])
-        return f"{named[:100]} ({path.name})"
+        title = ", ".join(lines if lines[1:] and lines[1].startswith("Version") else lines[:1])
+        return f"{title[:100]} ({path.name})"
     return "none found"
 
 
 def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
-    """The refusal of what is not there. Callers of the API read it: it names no folder of this
-    machine that is not in the extractor's name.
+    """Return the error for code or weights that are missing.
+
+    API clients see the message: it names no local folder that is not in the extractor's name.
     """
     cache = "$TORCH_HOME/hub (~/.cache/torch/hub where TORCH_HOME is not set)"
     fetch = f"with internet access, `placewise models fetch {hub.name}`"
     if hub.folder is not None:
         ways = (
-            "(1) bring the folder to that path, on every machine that describes photos; (2) for "
+            "(1) copy the folder to that path, on every machine that describes photos; (2) for "
             f"weights that its code downloads, {fetch}; (3) copy them from a machine that has "
             f"them: {cache}, the folder checkpoints."
         )
     else:
         ways = (
             f"(1) {fetch}; (2) copy {cache} with its checkpoints from a machine that has them; "
-            "(3) clone the repository at its commit and name the folder: "
+            "(3) clone the repository at its commit and use the folder: "
             f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}."
         )
     return Misconfigured(
@@ -163,30 +164,32 @@ def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
 
 
 def torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
-    """The refusal of what can't be used."""
+    """Return the error for an entry that can't be used."""
     return Misconfigured(
         "torchhub_unfit",
-        f"The extractor {hub.name} can't be used: {reason}. Three ways out: (1) other arguments of "
-        "the entry, or what its network wants to see, in the name "
-        "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) another commit, with the "
-        "packages that it needs installed; (3) a copy of the folder, changed by you: "
+        f"The extractor {hub.name} can't be used: {reason}. Three ways to fix it: (1) in the name, "
+        "set other arguments of the entry, or the input that its network expects "
+        "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) use another commit, and "
+        "install the packages that it needs; (3) use a changed copy of the folder: "
         f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
     )
 
 
 @contextlib.contextmanager
 def _import_guard(folder: Path, on_progress: OnProgress) -> Iterator[None]:
-    """While code of others is loaded: it asks nothing, prints nothing on stdout, leaves no bytecode
-    in its folder and no module behind that the next repository would take for its own.
+    """Isolate the loading of third-party code.
+
+    Within the context stdin is empty, stdout goes to stderr and no bytecode is written. Afterwards
+    the imported modules are removed, so that the next repository does not import them.
     """
-    torchs_own = torch.hub.download_url_to_file
+    original_download = torch.hub.download_url_to_file
 
     def download_url_to_file(
         url: str, dst: str, hash_prefix: str | None = None, progress: bool = True
     ) -> None:
-        # torch.hub's own begins anew after a break, and waits without end for a silent server.
+        # torch.hub's own download does not resume, and has no read timeout.
         if not url.startswith(("http://", "https://")):
-            torchs_own(url, dst, hash_prefix, progress)
+            original_download(url, dst, hash_prefix, progress)
             return
         target = Path(dst).expanduser()
         download_file(url, target, sha256=hash_prefix, on_progress=on_progress)
@@ -214,11 +217,11 @@ def _patched(owner: Any, name: str, value: object) -> Iterator[None]:
 
 
 def _forget_modules(*folders: Path) -> None:
-    """Two repositories may both have a `models.py`, and one folder may have changed since."""
-    places = tuple(f"{folder.resolve()}{os.sep}" for folder in folders)
+    """Unload modules: repositories may share module names, and a folder may change."""
+    prefixes = tuple(f"{folder.resolve()}{os.sep}" for folder in folders)
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if isinstance(file, str) and os.path.realpath(file).startswith(places):
+        if isinstance(file, str) and os.path.realpath(file).startswith(prefixes):
             del sys.modules[name]
 
 
@@ -230,22 +233,22 @@ def _download_repository(hub: TorchHubEntry, folder: Path, on_progress: OnProgre
     with tempfile.TemporaryDirectory(dir=folder.parent) as unpacked:
         try:
             with zipfile.ZipFile(packed) as archive:
-                # GitHub writes the commit there; it is the one thing to compare with.
+                # GitHub writes the commit to the comment; there is no other checksum.
                 if archive.comment not in (b"", str(hub.commit).encode()):
-                    raise zipfile.BadZipFile(f"it is of the commit {archive.comment.decode()}")
-                archive.extractall(unpacked)  # leaves no folder: zipfile strips roots and ..
+                    raise zipfile.BadZipFile(f"its commit is {archive.comment.decode()}")
+                archive.extractall(unpacked)  # stays in the folder: zipfile strips roots and ..
         except zipfile.BadZipFile as error:
             raise Misconfigured(
                 "download_corrupt",
-                f"{url} is not the archive of that commit: {error}. Nothing of it was kept. Try "
-                "again, or clone the repository and name its folder: "
+                f"{url} is not the archive of that commit: {error}. The download was deleted. "
+                "Try again, or clone the repository and use its folder: "
                 f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
             ) from error
         finally:
             packed.unlink()
-        inside = list(Path(unpacked).iterdir())
-        root = inside[0] if len(inside) == 1 else Path(unpacked)
-        with contextlib.suppress(FileExistsError):  # another process was first
+        entries = list(Path(unpacked).iterdir())
+        root = entries[0] if len(entries) == 1 else Path(unpacked)
+        with contextlib.suppress(FileExistsError):  # another process has downloaded it
             shutil.move(root, folder)
 
 
@@ -255,27 +258,25 @@ def _exception_chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
-
-
 PROBE_SEED = 20_242
-MIN_REPEAT_COSINE = 0.999  # of a photo described alone and beside others; kernels differ a little
+MIN_REPEAT_COSINE = 0.999  # of a photo alone and in a batch; kernels differ slightly
 
 
 class TorchHubBackbone:
+    """Backbone that runs a torch.hub entry; one feature per photo."""
+
     facet: str | None = None
 
     def __init__(
         self, hub: TorchHubEntry, device: torch.device, *, on_progress: OnProgress = ignore_progress
     ) -> None:
-        """Load the entry, which executes its code, and let it describe two pictures of noise.
+        """Load the entry, which executes its code, and check it on two images of noise.
 
-        Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+        Raises Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
         """
         self._hub = hub
         folder = find_or_download_code(hub, on_progress)
-        # Before anything is executed: the code may change what lies beside it.
+        # Before anything is executed: the code may change its own folder.
         self.code_fingerprint = code_fingerprint(folder)
         self.name = hub.module
         self.layer = hub.entry
@@ -306,32 +307,33 @@ class TorchHubBackbone:
 
     @torch.inference_mode()
     def _probe(self) -> int:
-        """The length of a descriptor, found by describing; `torchhub_unfit` for what is none."""
+        """Return the descriptor's dimension; raise `torchhub_unfit` for invalid descriptors."""
         hub = self._hub
         noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, hub.height, hub.width, 3)
         photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
-        except Exception as error:  # whatever the network of others does
-            said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        except Exception as error:  # third-party networks may raise anything
             raise torchhub_unfit_error(
                 hub,
-                f"with 2 photos of {hub.height} x {hub.width} pixels it ends with "
-                f"{type(error).__name__}: {said}",
+                f"with 2 photos of {hub.height} x {hub.width} pixels it fails with "
+                f"{type(error).__name__}: {first_error_line(error)}",
             ) from error
         if not isinstance(both, torch.Tensor) or not both.is_floating_point():
             raise torchhub_unfit_error(
-                hub, f"it makes a {_value_kind(both)}, not a tensor of floats"
+                hub, f"it returns a {_describe_value(both)}, not a tensor of floats"
             )
         if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
             raise torchhub_unfit_error(
                 hub,
-                f"of 2 photos it makes numbers of the shape {tuple(both.shape)}, of one "
-                f"{tuple(alone.shape)}; one descriptor for each is expected: (2, D) and (1, D)",
+                f"for 2 photos it returns the shape {tuple(both.shape)}, for one "
+                f"{tuple(alone.shape)}; expected one descriptor per photo: (2, D) and (1, D)",
             )
         if both.shape[1] > MAX_WIDTH:
-            raise torchhub_unfit_error(hub, f"{both.shape[1]} dimensions are more than {MAX_WIDTH}")
+            raise torchhub_unfit_error(
+                hub, f"{both.shape[1]} dimensions exceed the maximum of {MAX_WIDTH}"
+            )
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
             raise torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()):
@@ -340,20 +342,23 @@ class TorchHubBackbone:
         if cosine < MIN_REPEAT_COSINE:
             raise torchhub_unfit_error(
                 hub,
-                "it describes a photo otherwise when another one is beside it (cosine "
-                f"{cosine:.3f}), and which ones are described together is chance here",
+                "the descriptor of a photo depends on the other photos of its batch (cosine "
+                f"{cosine:.3f}), and the composition of batches varies",
             )
         return int(both.shape[1])
 
 
 def module_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
-    """sha256 of the module's tensors, name-sorted with type and shape, and their size in bytes."""
+    """Return the sha256 of a module's tensors, and their size in bytes.
+
+    Each tensor counts with name, dtype and shape; sorted by name.
+    """
     digest, size_bytes = hashlib.sha256(), 0
     state: dict[str, Any] = module.state_dict()
     for name in sorted(state):
         tensor = state[name]
         if not isinstance(tensor, torch.Tensor):
-            continue  # what a module keeps beside its weights
+            continue  # extra state that is not a tensor
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().cpu().contiguous().reshape(-1)
         digest.update(flat.view(torch.uint8).numpy().data)
@@ -361,5 +366,5 @@ def module_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
     return digest.hexdigest(), size_bytes
 
 
-def _value_kind(value: object) -> str:
+def _describe_value(value: object) -> str:
     return f"tensor of {value.dtype}" if isinstance(value, torch.Tensor) else type(value).__name__

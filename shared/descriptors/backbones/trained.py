@@ -1,8 +1,8 @@
-"""A model of `placewise train` as a backbone: it makes one global descriptor of a photo.
+"""Backbone of models from `placewise train`: computes one global descriptor per photo.
 
-Photos are brought to the model's image size as they were for the figures of its evaluations:
-upright, bilinear, antialiased, whatever the aspect (`resizeHEIGHTxWIDTH` in
-`shared.imaging.preprocessing`), then normalised by ImageNet's mean and deviation.
+Photos are resized to the model's image size as in its evaluations: upright, bilinear, antialiased,
+ignoring the aspect ratio (`resizeHEIGHTxWIDTH` in `shared.imaging.preprocessing`), then normalised
+by ImageNet's mean and standard deviation.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.preprocessing import Preprocessing, get_preprocessing
 
 PROBE_SEED = 20_242
-MIN_REPEAT_COSINE = 0.999  # of a photo described alone and beside another; kernels differ a little
+MIN_REPEAT_COSINE = 0.999  # of a photo alone and in a batch; kernels differ slightly
 
 
 class TrainedBackbone:
+    """Backbone that runs a `VprModel`; one feature per photo."""
+
     facet: str | None = None
 
     def __init__(
@@ -37,7 +39,16 @@ class TrainedBackbone:
         licence: str,
         card: dict[str, Any],
     ) -> None:
-        """`name` as in `gsv:N`; `fingerprint` of configuration and weights."""
+        """Wrap a loaded model.
+
+        Args:
+            name: The extractor's name, as in `gsv:N`.
+            model: The model, with its weights.
+            fingerprint: Hash of configuration and weights.
+            device: Where the model computes.
+            licence: Licence of the weights.
+            card: Model card: where the weights come from.
+        """
         self.name = name
         self.fingerprint = fingerprint
         self.licence = licence
@@ -49,12 +60,19 @@ class TrainedBackbone:
 
     @classmethod
     def from_checkpoint(cls, name: str, path: Path, device: torch.device) -> TrainedBackbone:
-        """The model in a checkpoint of this machine; raises as `load_checkpoint` and `check`."""
-        found = load_checkpoint(path)
-        card = {"source": path.name, **found.about}
-        made = cls(name, found.model, found.fingerprint, device, licence="not said", card=card)
-        made.check()
-        return made
+        """Load and check a local checkpoint; raises as `load_checkpoint` and `check`."""
+        checkpoint = load_checkpoint(path)
+        card = {"source": path.name, **checkpoint.about}
+        backbone = cls(
+            name,
+            checkpoint.model,
+            checkpoint.fingerprint,
+            device,
+            licence="not said",
+            card=card,
+        )
+        backbone.check()
+        return backbone
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -63,10 +81,11 @@ class TrainedBackbone:
 
     @property
     def preprocessing(self) -> Preprocessing:
+        """The resize to the model's image size."""
         return get_preprocessing("resize{}x{}".format(*self.image_size))
 
     def as_spec(self) -> dict[str, Any]:
-        """What the network is shown, beside what every extractor's spec says."""
+        """Return the fields that the model adds to the extractor spec: its input (JSON)."""
         return {
             "image_size": list(self.image_size),
             "normalisation": {"mean": list(IMAGENET_MEAN), "std": list(IMAGENET_STD)},
@@ -86,34 +105,32 @@ class TrainedBackbone:
 
     @torch.inference_mode()
     def check(self) -> None:
-        """Describe two pictures of noise; Unprocessable (`model_unfit`) for weights that make no
-        descriptors."""
+        """Check the weights, and the descriptors of two images of noise.
+
+        Raises Unprocessable (`model_unfit`).
+        """
         for name, tensor in self._model.state_dict().items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-                raise _model_unfit_error(f"its weights {name} hold NaN or infinite numbers")
+                raise _model_unfit_error(f"its weights {name} contain NaN or infinite numbers")
         if self.width > MAX_WIDTH:
-            raise _model_unfit_error(f"{self.width} dimensions are more than {MAX_WIDTH}")
+            raise _model_unfit_error(f"{self.width} dimensions exceed the maximum of {MAX_WIDTH}")
         noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, *self.image_size, 3)
         photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
         both, alone = self._forward(photos), self._forward(photos[:1])
         if both.shape != (2, self.width) or alone.shape != (1, self.width):
-            raise _model_unfit_error(
-                f"of 2 photos it makes numbers of the shape {tuple(both.shape)}"
-            )
+            raise _model_unfit_error(f"for 2 photos it returns the shape {tuple(both.shape)}")
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
             raise _model_unfit_error("its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()) or torch.equal(both[0], both[1]):
-            raise _model_unfit_error(
-                "of two different photos its descriptors are zero, or the same"
-            )
+            raise _model_unfit_error("its descriptors of two different photos are zero or equal")
         cosine = float(normalise_features(both[0]) @ normalise_features(alone[0]))
         if cosine < MIN_REPEAT_COSINE:
             raise _model_unfit_error(
-                "it describes a photo otherwise when another one is beside it (cosine "
-                f"{cosine:.3f}), and which ones are described together is chance here"
+                "the descriptor of a photo depends on the other photos of its batch (cosine "
+                f"{cosine:.3f}), and the composition of batches varies"
             )
 
 
-def _model_unfit_error(fault: str) -> Unprocessable:
-    return Unprocessable("model_unfit", f"The model can't describe photos: {fault}.")
+def _model_unfit_error(reason: str) -> Unprocessable:
+    return Unprocessable("model_unfit", f"The model can't describe photos: {reason}.")

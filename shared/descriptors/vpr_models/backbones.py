@@ -1,24 +1,19 @@
-"""A backbone as a stem and numbered stages: what can be frozen and cropped is the same for all.
-
-DINOv2 (Oquab et al. 2023) as a map: the patch tokens after the last norm, and the class token.
-
-A stage is a block: `layers_to_freeze` of the depth less n trains the last n. The network is that of
-`shared.descriptors.backbones.dinov2`, with gradients.
-
-torchvision's networks with their published ImageNet weights, from the cache or a given file.
-
-Random weights are never a fallback: what can't be had is a Misconfigured that names the ways.
+"""Backbones of VPR models: pretrained networks as a stem and numbered stages.
 
 ResNet (He et al. 2016) and ResNeXt (Xie et al. 2017) by torchvision: strides 4, 8, 16, 32.
 
 Swin-T (Liu et al. 2021) by torchvision: strides 4, 8, 16, 32; photos of any size.
 
-EfficientNet-B0 (Tan and Le 2019) by torchvision, and its Lite0 by timm.
+EfficientNet-B0 (Tan and Le 2019) by torchvision, and its Lite0 by timm: stages 1 to 7 are the
+groups of blocks (strides 2, 4, 8, 16, 16, 32, 32), the 8th is the convolution to 1,280 channels
+before the classifier.
 
-Stages 1 to 7 are the groups of blocks (strides 2, 4, 8, 16, 16, 32, 32), the 8th is the convolution
-to 1,280 channels before the classifier.
+DINOv2 (Oquab et al. 2023): the map is the patch tokens after the last norm, and the class token is
+returned as well. A stage is a block: `layers_to_freeze` = depth - n trains the last n blocks. The
+network is that of `shared.descriptors.backbones.dinov2`, with gradients.
 
-Backbones of place models by name: photos to maps of local features. One module per family.
+Pretrained weights come from a cache or a given file. Random weights are never a fallback: missing
+weights raise a Misconfigured that names the ways to get them.
 """
 
 from __future__ import annotations
@@ -54,24 +49,27 @@ from shared.errors import Misconfigured
 
 
 class FeatureMaps(NamedTuple):
-    """What a backbone makes of a batch of photos."""
+    """The output of a backbone for a batch of photos."""
 
     maps: torch.Tensor
     """(B, C, h, w)."""
     token: torch.Tensor | None = None
-    """(B, C), a transformer's class token; None of networks that have none."""
+    """(B, C) class tokens of a transformer; None for other networks."""
 
 
 class StagedBackbone(nn.Module):
-    """(B, 3, H, W) float32, normalised as for ImageNet -> Features."""
+    """A network as a stem, stages and a norm, which can be cropped and frozen.
+
+    Takes (B, 3, H, W) float32, normalised as for ImageNet; returns FeatureMaps.
+    """
 
     patch: ClassVar[int] = 1
-    """Height and width of a photo have to be multiples of so many pixels."""
+    """Height and width of a photo must be multiples of this, in pixels."""
 
     def __init__(
         self, stem: nn.Module, stages: Sequence[nn.Module], norm: nn.Module | None = None
     ) -> None:
-        """`norm` comes after the last stage."""
+        """`norm` follows the last stage."""
         super().__init__()
         self.stem = stem
         self.stages = nn.ModuleList(stages)
@@ -82,10 +80,10 @@ class StagedBackbone(nn.Module):
         return FeatureMaps(self._run(photos))
 
     def _run(self, photos: torch.Tensor) -> torch.Tensor:
-        found: torch.Tensor = self.stem(photos)
+        features: torch.Tensor = self.stem(photos)
         for stage in self.stages:
-            found = stage(found)
-        normed: torch.Tensor = self.norm(found)
+            features = stage(features)
+        normed: torch.Tensor = self.norm(features)
         return normed
 
     def crop(self, count: int) -> None:
@@ -93,11 +91,10 @@ class StagedBackbone(nn.Module):
         self.stages = self.stages[:count]
 
     def freeze(self, count: int) -> None:
-        """Freeze the stem and the first `count` stages, and with all of them what comes after;
-        nothing where `count` is negative.
+        """Freeze the stem and the first `count` stages; if these are all stages, the norm, too.
 
-        Frozen layers have no gradients, and stay in evaluation mode: their BatchNorms neither use
-        nor gather a batch's statistics.
+        Does nothing if `count` is negative. Frozen layers have no gradients and stay in evaluation
+        mode: their BatchNorms neither use nor update batch statistics.
         """
         if count < 0:
             return
@@ -108,6 +105,7 @@ class StagedBackbone(nn.Module):
             module.requires_grad_(False)
 
     def train(self, mode: bool = True) -> StagedBackbone:
+        """Set the mode of all layers but the frozen ones."""
         super().train(mode)
         for module in self._frozen:
             module.eval()
@@ -115,6 +113,8 @@ class StagedBackbone(nn.Module):
 
 
 class Dinov2Backbone(StagedBackbone):
+    """Patch tokens as a map, and the class token."""
+
     patch: ClassVar[int] = PATCH
 
     def forward(self, photos: torch.Tensor) -> FeatureMaps:
@@ -125,7 +125,10 @@ class Dinov2Backbone(StagedBackbone):
 
 
 class VitTokens(nn.Module):
-    """(B, 3, H, W) -> (B, 1 + patches, width): the class token, and patches row by row."""
+    """Stem of a ViT: (B, 3, H, W) -> (B, 1 + patches, width), class token first.
+
+    Patches are in row-major order.
+    """
 
     def __init__(self, vit: Any) -> None:
         super().__init__()
@@ -136,8 +139,8 @@ class VitTokens(nn.Module):
     def forward(self, photos: torch.Tensor) -> torch.Tensor:
         maps: torch.Tensor = self.projection(photos)
         rows, columns = maps.shape[-2:]
-        of_patches = resample_positions(self.positions[:, 1:], rows, columns)
-        patches = maps.flatten(2).transpose(1, 2) + of_patches
+        patch_positions = resample_positions(self.positions[:, 1:], rows, columns)
+        patches = maps.flatten(2).transpose(1, 2) + patch_positions
         first = self.cls_token + self.positions[:, :1]
         return torch.cat([first.expand(len(photos), -1, -1), patches], dim=1)
 
@@ -145,8 +148,14 @@ class VitTokens(nn.Module):
 def build_dinov2(
     name: str, pretrained: bool, weights: Path | None, *, shape: VitShape | None = None
 ) -> StagedBackbone:
-    """`weights`: a file in Meta's or timm's naming, None for timm's on the hub. `shape` is that of
-    `name` unless a test has a smaller one."""
+    """Build a DINOv2 backbone.
+
+    Args:
+        name: A key of `config.STAGES`.
+        pretrained: Whether to load weights; else they are random.
+        weights: A file in Meta's or timm's naming; None for timm's from the hub.
+        shape: Overrides the shape of `name`, for tests.
+    """
     size = name.removeprefix("dinov2_")
     shape = shape or SHAPES[size]
     if pretrained:
@@ -167,13 +176,18 @@ def build_dinov2(
 
 
 def load_torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
-    """The network `torchvision.models.NAME`; without `pretrained` its tensors are random.
+    """Build the network `torchvision.models.NAME`.
 
-    `weights`: a `.pth` or `.safetensors` in torchvision's naming instead of its own IMAGENET1K_V1,
-    which is looked for in torch.hub's cache and else downloaded. Raises Misconfigured:
-    `weights_missing`, `weights_unfit`, `download_corrupt`.
+    Args:
+        name: The network's name in torchvision.
+        pretrained: Whether to load weights; else they are random.
+        weights: A `.pth` or `.safetensors` file in torchvision's naming; None for torchvision's
+            IMAGENET1K_V1, from torch.hub's cache or downloaded.
+
+    Raises:
+        Misconfigured: `weights_missing`, `weights_unfit`, `download_corrupt`.
     """
-    from torchvision import models  # takes seconds, which not every command need pay
+    from torchvision import models  # imported here because it takes seconds
 
     network = models.get_model(name, weights=None)
     if pretrained:
@@ -184,13 +198,13 @@ def load_torchvision_network(name: str, pretrained: bool, weights: Path | None) 
 
 
 def find_or_download_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
-    """The file of the weights, downloaded to torch.hub's cache if need be."""
+    """Return the weights file: `given`, else that of torch.hub's cache, downloaded if missing."""
     if given is not None:
         return check_weights_file(given, name)
     filename = url.rpartition("/")[2]
     cached = Path(torch.hub.get_dir(), "checkpoints", filename)
     if not cached.exists():
-        # By torchvision's custom the name ends with the beginning of the hash.
+        # torchvision's file names end with the first characters of the hash.
         sha256 = cached.stem.rpartition("-")[2]
         try:
             download_file(url, cached, sha256=sha256)
@@ -201,20 +215,20 @@ def find_or_download_torchvision_weights(name: str, url: str, given: Path | None
 
 
 def check_weights_file(path: Path, name: str) -> Path:
-    """`path`, if it is a file; else Misconfigured (`weights_missing`)."""
+    """Return `path`; raise Misconfigured (`weights_missing`) unless it is a file."""
     if not path.is_file():
         what = "is not a file" if path.exists() else "does not exist"
         raise Misconfigured(
             "weights_missing",
-            f"{path} {what}: it was named as the file of the pretrained weights of {name}.",
+            f"{path}, given as the file of the pretrained weights of {name}, {what}.",
         )
     return path
 
 
 def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
-    """The tensors of a `.safetensors` or PyTorch file, by name; weights only, no code is run.
+    """Load the tensors of a `.safetensors` or PyTorch file by name; no code is executed.
 
-    Misconfigured (`weights_unfit`) for what is no such file.
+    Raises Misconfigured (`weights_unfit`) for other files.
     """
     from safetensors.torch import load_file
 
@@ -228,25 +242,25 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
         reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
         raise pretrained_unfit_error(path, name, reason) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise pretrained_unfit_error(path, name, "it holds something else than named tensors")
+        raise pretrained_unfit_error(path, name, "it contains other objects than named tensors")
     return state
 
 
 def load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
-    """Give the network its tensors; Misconfigured (`weights_unfit`) where they don't fit."""
-    own: dict[str, torch.Tensor] = network.state_dict()
-    # Files of old releases count no batches, and nothing depends on that count.
-    state = {n: t for n, t in own.items() if n.endswith("num_batches_tracked")} | state
-    faults = [f"no tensor {n}" for n in own if n not in state]
-    faults += [f"a tensor {n} too many" for n in state if n not in own]
-    faults += [
-        f"{n} of {tuple(t.shape)}, not {tuple(own[n].shape)}"
+    """Load tensors into a network; raise Misconfigured (`weights_unfit`) if they don't fit."""
+    expected: dict[str, torch.Tensor] = network.state_dict()
+    # Files of old releases lack num_batches_tracked, which is not used.
+    state = {n: t for n, t in expected.items() if n.endswith("num_batches_tracked")} | state
+    problems = [f"no tensor {n}" for n in expected if n not in state]
+    problems += [f"an unexpected tensor {n}" for n in state if n not in expected]
+    problems += [
+        f"{n} of shape {tuple(t.shape)}, expected {tuple(expected[n].shape)}"
         for n, t in state.items()
-        if n in own and own[n].shape != t.shape
+        if n in expected and expected[n].shape != t.shape
     ]
-    if faults:
-        more = f" and {len(faults) - 1} faults more" if len(faults) > 1 else ""
-        raise pretrained_unfit_error(path, name, f"it has {faults[0]}{more}")
+    if problems:
+        more = f" and {len(problems) - 1} more problems" if len(problems) > 1 else ""
+        raise pretrained_unfit_error(path, name, f"it has {problems[0]}{more}")
     network.load_state_dict(state)
 
 
@@ -259,31 +273,34 @@ def _pretrained_missing_error(name: str, url: str, reason: str) -> Misconfigured
     return Misconfigured(
         "weights_missing",
         f"{reason} Ways to get the pretrained weights of {name}: (1) with internet access they are "
-        f"downloaded on first use; (2) bring {url} from another machine into {folder}; (3) name a "
-        "file of them; (4) pretrained=False begins with random weights, which takes far more "
+        f"downloaded on first use; (2) copy {url} from another machine to {folder}; (3) pass a "
+        "file of them; (4) pretrained=False starts with random weights, which needs far more "
         "photos and epochs.",
     )
 
 
 def build_resnet(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
-    """`name` as in `config.STAGES`."""
+    """Build a ResNet or ResNeXt; `name` is a key of `config.STAGES`."""
     network = load_torchvision_network(name, pretrained, weights)
     stem = nn.Sequential(network.conv1, network.bn1, network.relu, network.maxpool)
     return StagedBackbone(stem, [network.layer1, network.layer2, network.layer3, network.layer4])
 
 
 class SwinBackbone(StagedBackbone):
+    """Swin transformer with its map in channels-first order."""
+
     def forward(self, photos: torch.Tensor) -> FeatureMaps:
-        return FeatureMaps(self._run(photos).permute(0, 3, 1, 2))  # channels come last in it
+        return FeatureMaps(self._run(photos).permute(0, 3, 1, 2))  # from channels-last
 
     def crop(self, count: int) -> None:
-        """The last norm belongs to the last stage and goes with it."""
+        """Keep the first `count` stages; the norm belongs to the last stage."""
         if count < len(self.stages):
             self.norm = nn.Identity()
         super().crop(count)
 
 
 def build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+    """Build a Swin transformer; each stage begins with its patch merging."""
     network = load_torchvision_network(name, pretrained, weights)
     stem, first, *later = network.features
     merged = [
@@ -293,14 +310,18 @@ def build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackb
 
 
 def build_efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+    """Build an EfficientNet of torchvision."""
     stem, *stages = load_torchvision_network(name, pretrained, weights).features
     return StagedBackbone(stem, stages)
 
 
 def build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
-    """Published weights come with the package of the embedded default, or from a file in timm's
-    naming."""
-    import timm  # takes seconds, which not every command need pay
+    """Build EfficientNet-Lite0.
+
+    Pretrained weights come from the package of the embedded default, or from a file in timm's
+    naming.
+    """
+    import timm  # imported here because it takes seconds
 
     network: Any
     if not pretrained:
@@ -315,7 +336,7 @@ def build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) 
 
 
 class Renormalise(nn.Module):
-    """From ImageNet's mean and deviation to those that Lite0 was trained with."""
+    """Converts pixels from ImageNet's normalisation to that of Lite0's training."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -350,10 +371,14 @@ _BUILDERS: dict[str, BackboneBuilder] = {
 
 
 def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbone:
-    """The backbone, cropped and frozen as the config says, in evaluation mode.
+    """Build the backbone of a config, cropped and frozen, in evaluation mode.
 
-    `weights`: a file of pretrained weights, None for those of the hub's cache. Raises
-    Misconfigured: `weights_missing`, `weights_unfit`, `download_corrupt`.
+    Args:
+        config: The model's architecture.
+        weights: A file of pretrained weights; None for those of the hub's cache.
+
+    Raises:
+        Misconfigured: `weights_missing`, `weights_unfit`, `download_corrupt`.
     """
     name = config.backbone_arch
     backbone = _BUILDERS[name](name, config.pretrained, weights)

@@ -1,4 +1,4 @@
-"""Which network: everything that decides a place model but its weights. Imports no torch."""
+"""VprModelConfig: the architecture of a VPR model, validated. Imports no torch."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ STAGES = {
     "dinov2_vitl14": 24,
     "dinov2_vitg14": 40,
 }
-"""Backbones, with the number of their stages after the stem: layer1 to layer4 of a ResNet, the
-blocks of a transformer. The 8th of an EfficientNet is the convolution before its classifier."""
+"""Backbones and their number of stages after the stem: layer1 to layer4 of a ResNet, the blocks of
+a transformer. The 8th stage of an EfficientNet is the convolution before its classifier."""
 
 ALIASES = {
     "resnext50": "resnext50_32x4d",
@@ -44,98 +44,100 @@ VPR_AGGREGATORS = {
     "salad": "SALAD",
     "boq": "BoQ",
 }
-"""By the part of a name, in small letters, that means them."""
+"""Canonical names by the lowercase substring that selects them."""
 
 NO_FREEZING = -1
-MIN_STAGE_TO_CROP = 2  # a stem without any stage sees a few pixels
+MIN_STAGE_TO_CROP = 2  # a stem alone has a receptive field of a few pixels
 MAX_SIDE_PIXELS = 4096
 
 SidePixels = Annotated[int, Field(ge=16, le=MAX_SIDE_PIXELS)]
 
 
 class VprModelConfig(BaseModel):
-    """A place model in words; `model_dump()` is of plain types.
+    """The architecture of a VPR model; `model_dump()` returns plain types.
 
-    Names are brought to their canonical form: backbones by any name of STAGES or ALIASES, in
-    capitals or not, `-` for `_`; aggregators by any name that contains a key of AGGREGATORS.
+    Names are canonicalised: backbones by any name in STAGES or ALIASES, case-insensitive, with `-`
+    for `_`; aggregators by any name that contains a key of VPR_AGGREGATORS.
 
-    Raises Unprocessable: `unknown_backbone`, `unknown_aggregator` (both list the known ones),
-    `bad_model_config`. What has another type is pydantic's ValidationError; `read` makes that
-    `bad_model_config`, too.
+    Raises:
+        Unprocessable: `unknown_backbone`, `unknown_aggregator` (both list the valid names),
+            `bad_model_config`.
+        pydantic.ValidationError: A value of another type; `parse` converts it to
+            `bad_model_config`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     backbone_arch: str = "resnet18"
     pretrained: bool = True
-    """Begin with the published ImageNet (DINOv2: LVD-142M) weights."""
+    """Initialise with the published ImageNet (DINOv2: LVD-142M) weights."""
     layers_to_freeze: int = 2
-    """-1 trains everything; 0 freezes the stem; n the stem and the first n stages. Frozen layers
-    keep their weights and the statistics of their BatchNorms, in training as well."""
+    """-1 trains everything; 0 freezes the stem; n freezes the stem and the first n stages. Frozen
+    layers keep their weights and their BatchNorm statistics during training."""
     layers_to_crop: tuple[int, ...] = ()
-    """Numbers of stages, from 1: the lowest of them and all after it are left out."""
+    """Stage numbers, from 1: the lowest of them and all later stages are removed."""
     agg_arch: str = "AVG"
     agg_config: dict[str, Any] = {}
-    """Arguments of the aggregator; what is left out has the published default, and sizes of the
-    map are found by the first pass."""
+    """Arguments of the aggregator. Missing ones have the published defaults; the sizes of the map
+    are inferred by a first pass."""
     image_size: tuple[SidePixels, SidePixels] = (320, 320)
     """Height and width in pixels."""
 
     @classmethod
     def parse(cls, values: Mapping[str, Any]) -> VprModelConfig:
-        """From a mapping of anything; Unprocessable as above."""
+        """Validate a mapping; raises Unprocessable as the class does."""
         try:
             return cls.model_validate(dict(values))
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise _bad(f"{where}: {first['msg']}") from error
+            field = ".".join(str(part) for part in first["loc"])
+            raise _bad_config_error(f"{field}: {first['msg']}") from error
 
     @property
     def stages(self) -> int:
-        """How many stages are left after cropping."""
+        """Number of stages after cropping."""
         return min((STAGES[self.backbone_arch] + 1, *self.layers_to_crop)) - 1
 
     @field_validator("backbone_arch")
     @classmethod
     def _canonical_backbone(cls, name: str) -> str:
-        plain = name.strip().lower().replace("-", "_")
-        plain = ALIASES.get(plain, plain)
-        if plain not in STAGES:
+        canonical = name.strip().lower().replace("-", "_")
+        canonical = ALIASES.get(canonical, canonical)
+        if canonical not in STAGES:
             raise Unprocessable(
                 "unknown_backbone",
-                f"There is no backbone {name!r}. Known: {', '.join(STAGES)} (backbone_arch).",
+                f"Unknown backbone {name!r} (backbone_arch). Valid names: {', '.join(STAGES)}.",
             )
-        return plain
+        return canonical
 
     @field_validator("agg_arch")
     @classmethod
     def _canonical_aggregator(cls, name: str) -> str:
-        for part, canonical in VPR_AGGREGATORS.items():
-            if part in name.lower():
+        for substring, canonical in VPR_AGGREGATORS.items():
+            if substring in name.lower():
                 return canonical
         raise Unprocessable(
             "unknown_aggregator",
-            f"There is no aggregator {name!r}. Known: {', '.join(VPR_AGGREGATORS.values())} "
-            "(agg_arch).",
+            f"Unknown aggregator {name!r} (agg_arch). Valid names: "
+            f"{', '.join(VPR_AGGREGATORS.values())}.",
         )
 
     @model_validator(mode="after")
-    def _layers_exist(self) -> VprModelConfig:
+    def _check_layers(self) -> VprModelConfig:
         count = STAGES[self.backbone_arch]
         if not NO_FREEZING <= self.layers_to_freeze <= count:
-            raise _bad(
+            raise _bad_config_error(
                 f"layers_to_freeze={self.layers_to_freeze}: {self.backbone_arch} has {count} "
-                f"stages, so it is a number from {NO_FREEZING} (train everything) to {count}."
+                f"stages; set a number from {NO_FREEZING} (train everything) to {count}."
             )
         outside = [n for n in self.layers_to_crop if not MIN_STAGE_TO_CROP <= n <= count]
         if outside:
-            raise _bad(
+            raise _bad_config_error(
                 f"layers_to_crop={list(self.layers_to_crop)}: {self.backbone_arch} has {count} "
-                f"stages; those from {MIN_STAGE_TO_CROP} to {count} can be cropped."
+                f"stages; stages from {MIN_STAGE_TO_CROP} to {count} can be cropped."
             )
         return self
 
 
-def _bad(detail: str) -> Unprocessable:
+def _bad_config_error(detail: str) -> Unprocessable:
     return Unprocessable("bad_model_config", detail)

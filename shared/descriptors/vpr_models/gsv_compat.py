@@ -1,10 +1,10 @@
-"""Checkpoints of the predecessor's training (gsv_xs research code, PyTorch Lightning 1.8).
+"""Compatibility with gsv_xs checkpoints (research training code, PyTorch Lightning 1.8).
 
-    hyper_parameters   backbone_arch, layers_to_crop, agg_arch, agg_config, lr, ... side by side
+    hyper_parameters   backbone_arch, layers_to_crop, agg_arch, agg_config, lr, ... in one mapping
     state_dict         backbone.model.conv1 ..., aggregator.p ...
 
-They are read under the names that are used here. Their size of photos is not in them: all published
-runs were trained at 320 x 320, but for MixVPR the size follows from its map.
+Names are translated to those of `VprModel`. The checkpoints do not store the image size: all
+published runs were trained at 320 x 320; for MixVPR the size follows from its map.
 """
 
 from __future__ import annotations
@@ -41,26 +41,29 @@ _RENAMED = (
 
 
 def is_gsv_checkpoint(parameters: Mapping[str, Any]) -> bool:
-    """Whether these hyperparameters are those of one of its checkpoints."""
+    """Whether these hyperparameters are those of a gsv_xs checkpoint."""
     return {"backbone_arch", "agg_arch"} <= parameters.keys()
 
 
 def read_gsv_config(parameters: Mapping[str, Any]) -> VprModelConfig:
-    """Unprocessable as `ModelConfig.read`. (Its `layers_to_freeze` froze nothing.)"""
-    said = {name: parameters[name] for name in GSV_MODEL_ARGUMENTS if name in parameters}
-    found = VprModelConfig.parse({**said, "pretrained": False, "layers_to_freeze": NO_FREEZING})
-    sides = [found.agg_config.get(name) for name in ("in_h", "in_w")]
-    if found.agg_arch != "MixVPR" or not all(isinstance(side, int) for side in sides):
-        return found.model_copy(update={"image_size": GSV_IMAGE_SIZE})
-    stride = 2 ** (found.stages + 1)  # of a ResNet, the only networks that it had
+    """Translate the hyperparameters of a gsv_xs checkpoint.
+
+    `layers_to_freeze` is ignored: it froze nothing in gsv_xs. Raises as `VprModelConfig.parse`.
+    """
+    values = {name: parameters[name] for name in GSV_MODEL_ARGUMENTS if name in parameters}
+    config = VprModelConfig.parse({**values, "pretrained": False, "layers_to_freeze": NO_FREEZING})
+    sides = [config.agg_config.get(name) for name in ("in_h", "in_w")]
+    if config.agg_arch != "MixVPR" or not all(isinstance(side, int) for side in sides):
+        return config.model_copy(update={"image_size": GSV_IMAGE_SIZE})
+    stride = 2 ** (config.stages + 1)  # of a ResNet, the only backbones of gsv_xs
     size = [side * stride for side in sides if side is not None]
-    return VprModelConfig.parse({**found.model_dump(), "image_size": size})
+    return VprModelConfig.parse({**config.model_dump(), "image_size": size})
 
 
 def rename_gsv_tensor(tensor: str) -> str:
-    """The name in `PlaceModel.state_dict()` of one of its tensors; as it was, if there is none."""
-    for theirs, ours in _RENAMED:
-        renamed, hits = re.subn(f"^{theirs}", ours, tensor)
+    """Return a gsv_xs tensor's name in `VprModel.state_dict()`; unchanged if there is none."""
+    for pattern, replacement in _RENAMED:
+        renamed, hits = re.subn(f"^{pattern}", replacement, tensor)
         if hits:
             return renamed
     stage = re.match(r"backbone\.model\.layer(\d)\.(.*)", tensor)

@@ -1,4 +1,4 @@
-"""A place model: photos to global descriptors, by a backbone and an aggregator."""
+"""The VPR model: photos to global descriptors by a backbone and an aggregator."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from shared.errors import Unprocessable
 
 
 class VprModel(nn.Module):
-    """(B, 3, H, W) float32, normalised by ImageNet's mean and deviation -> (B, D) float32 rows of
-    length 1.
+    """Computes (B, D) float32 unit descriptors of (B, 3, H, W) float32 photos.
 
-    A map of nothing but zeros has a row of zeros; what is not finite stays so.
+    Photos are normalised by ImageNet's mean and standard deviation. An all-zero map gives a zero
+    row; non-finite values propagate.
     """
 
     def __init__(
@@ -30,11 +30,11 @@ class VprModel(nn.Module):
 
     @property
     def dimension(self) -> int:
-        """D, the length of a descriptor."""
+        """D, the number of dimensions of a descriptor."""
         return self.aggregator.dimension
 
     def forward(self, photos: torch.Tensor) -> torch.Tensor:
-        """Unprocessable (`image_size_unfit`) for photos of a size that the model can't take."""
+        """Compute descriptors; raises Unprocessable (`image_size_unfit`) for unsupported sizes."""
         height, width = photos.shape[-2:]
         _check_patches(self.backbone, height, width, self.config)
         maps, token = self.backbone(photos)
@@ -46,14 +46,20 @@ class VprModel(nn.Module):
 
 
 def build_vpr_model(config: VprModelConfig, *, weights: Path | None = None) -> VprModel:
-    """The model in evaluation mode on the CPU. Its own `config` holds all arguments of the
-    aggregator, those that were read off the map and the defaults as well.
+    """Build a model on the CPU, in evaluation mode.
 
-    `weights`: a file of pretrained weights for the backbone, None for those of the hub's cache;
-    neither is looked at without `config.pretrained`, when every tensor is random (by torch's seed).
+    The model's own `config` holds all arguments of the aggregator, including the defaults and those
+    inferred from the backbone's map.
 
-    Raises Misconfigured: `weights_missing`, `weights_unfit`; Unprocessable: `bad_agg_config`,
-    `image_size_unfit`.
+    Args:
+        config: The architecture. Without `config.pretrained` every tensor is random, by torch's
+            seed.
+        weights: A file of pretrained weights for the backbone; None for those of the hub's cache.
+            Unused without `config.pretrained`.
+
+    Raises:
+        Misconfigured: `weights_missing`, `weights_unfit`.
+        Unprocessable: `bad_agg_config`, `image_size_unfit`.
     """
     backbone = build_backbone(config, weights)
     _check_patches(backbone, *config.image_size, config)
@@ -75,8 +81,8 @@ def _check_patches(
         nearest = [max(1, round(length / side)) * side for length in (height, width)]
         raise Unprocessable(
             "image_size_unfit",
-            f"{config.backbone_arch} takes photos of whole patches of {side} x {side} pixels, not "
-            f"{height} x {width}. The nearest size is {nearest[0]} x {nearest[1]}.",
+            f"{config.backbone_arch} needs photos whose height and width are multiples of {side} "
+            f"pixels, not {height} x {width}. The nearest size is {nearest[0]} x {nearest[1]}.",
         )
 
 
@@ -89,8 +95,8 @@ def _check_map(
         advice = (
             "Set a larger image_size, or crop layers (layers_to_crop)."
             if photo == built
-            else f"The model was built for {built[0]} x {built[1]}: bring photos to that size, or "
-            "train a model at theirs."
+            else f"The model was built for {built[0]} x {built[1]}: resize photos to that size, or "
+            "train a model at this size."
         )
         raise Unprocessable(
             "image_size_unfit",

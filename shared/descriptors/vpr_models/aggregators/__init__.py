@@ -1,4 +1,7 @@
-"""Aggregators by name: maps of local features to one descriptor. One module each."""
+"""Aggregators of VPR models: maps of local features to one descriptor.
+
+`build_aggregator` builds one by its name. `base` has the interface.
+"""
 
 from __future__ import annotations
 
@@ -32,35 +35,36 @@ _AGGREGATORS: dict[str, type[Aggregator]] = {
 def build_aggregator(
     config: VprModelConfig, shape: FeatureMapShape
 ) -> tuple[Aggregator, dict[str, Any]]:
-    """The aggregator for maps of `shape`, and all of its arguments.
+    """Build the aggregator for maps of `shape`; return it with all of its arguments.
 
-    Raises Unprocessable: `bad_agg_config` (an argument that it does not have, of a wrong type, or
-    another size than the map's), `image_size_unfit`.
+    Raises:
+        Unprocessable: `bad_agg_config` for an unknown argument, one of a wrong type, or a size that
+            differs from the map's.
     """
-    kind = _AGGREGATORS[config.agg_arch]
-    found = {name: getattr(shape, field) for name, field in kind.inferred.items()}
-    for name, size in found.items():
+    aggregator_class = _AGGREGATORS[config.agg_arch]
+    inferred = {name: getattr(shape, field) for name, field in aggregator_class.inferred.items()}
+    for name, size in inferred.items():
         given = config.agg_config.get(name, size)
         if given != size:
-            raise _bad(
+            raise _bad_config_error(
                 config,
                 f"{name}={given}, but {config.backbone_arch} with layers_to_crop="
-                f"{list(config.layers_to_crop)} makes {shape.channels} channels of {shape.height} "
-                f"x {shape.width} at image_size {list(config.image_size)}. Leave {name} out.",
+                f"{list(config.layers_to_crop)} has {shape.channels} channels of {shape.height} "
+                f"x {shape.width} at image_size {list(config.image_size)}. Remove {name}.",
             )
-    arguments = _checked(config, kind, {**config.agg_config, **found})
-    aggregator = kind(**arguments)
+    arguments = _validate_arguments(config, aggregator_class, {**config.agg_config, **inferred})
+    aggregator = aggregator_class(**arguments)
     return aggregator, arguments
 
 
-def _checked(
-    config: VprModelConfig, kind: type[Aggregator], given: Mapping[str, Any]
+def _validate_arguments(
+    config: VprModelConfig, aggregator_class: type[Aggregator], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """All arguments of `kind`, with its defaults; of the types that its signature says."""
-    hints = get_type_hints(kind.__init__, include_extras=True)
+    """Validate arguments against the signature of `aggregator_class` and add its defaults."""
+    hints = get_type_hints(aggregator_class.__init__, include_extras=True)
     fields: dict[str, Any] = {
         name: (hints[name], ... if parameter.default is parameter.empty else parameter.default)
-        for name, parameter in inspect.signature(kind).parameters.items()
+        for name, parameter in inspect.signature(aggregator_class).parameters.items()
     }
     arguments = create_model(
         "Arguments", __config__=ConfigDict(extra="forbid", strict=True), **fields
@@ -71,9 +75,11 @@ def _checked(
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise _bad(config, f"it has no argument {name}; it has {', '.join(fields)}") from error
-        raise _bad(config, f"{name}={given.get(name)!r}: {first['msg']}") from error
+            raise _bad_config_error(
+                config, f"it has no argument {name}; it has {', '.join(fields)}"
+            ) from error
+        raise _bad_config_error(config, f"{name}={given.get(name)!r}: {first['msg']}") from error
 
 
-def _bad(config: VprModelConfig, reason: str) -> Unprocessable:
+def _bad_config_error(config: VprModelConfig, reason: str) -> Unprocessable:
     return Unprocessable("bad_agg_config", f"agg_config of {config.agg_arch}: {reason}")

@@ -1,4 +1,4 @@
-"""What every aggregator offers."""
+"""Aggregator: the base class of the aggregators of VPR models."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pydantic import Field
 from torch import nn
 from torch.nn.functional import normalize
 
-# Arguments of aggregators come from files of others, too: these bounds keep sizes computable.
+# Arguments may come from untrusted checkpoints; these bounds limit the sizes of tensors.
 Size = Annotated[int, Field(ge=1, le=1 << 20)]
 Layers = Annotated[int, Field(ge=1, le=64)]
 Positive = Annotated[float, Field(gt=0, le=1000)]
 
 
 class FeatureMapShape(NamedTuple):
-    """The size of a backbone's map of one photo."""
+    """Shape of a backbone's output for one photo."""
 
     channels: int
     height: int
@@ -25,23 +25,26 @@ class FeatureMapShape(NamedTuple):
 
 
 class Aggregator(nn.Module):
-    """(B, C, h, w) maps -> (B, dimension) float32 rows of length 1 (0 of a photo without any)."""
+    """Aggregates (B, C, h, w) maps to (B, dimension) float32 unit rows.
+
+    A photo without features gives a zero row.
+    """
 
     inferred: ClassVar[dict[str, str]] = {}
-    """Arguments that are read off the map: their name -> the field of MapShape."""
+    """Arguments inferred from the map: argument name -> field of FeatureMapShape."""
     takes_token: ClassVar[bool] = False
-    """Whether `forward` has a second argument, (B, C) or None: a transformer's class token."""
+    """Whether `forward` takes a second argument: (B, C) class tokens or None."""
 
     def __init__(self, dimension: int) -> None:
         super().__init__()
         self.dimension = dimension
 
     def refusal(self, height: int, width: int) -> str | None:
-        """Why maps of h x w can't be aggregated; None where they can."""
+        """Return why maps of `height` x `width` are not supported, or None if they are."""
         del height, width
         return None
 
 
 def normalise_rows(values: torch.Tensor) -> torch.Tensor:
-    """(B, ...) of any floating type -> (B, D) float32, each row divided by its length."""
+    """Flatten (B, ...) of any floating type to (B, D) float32 rows of length 1."""
     return normalize(values.flatten(1).float(), dim=-1)

@@ -1,5 +1,7 @@
-"""NetVLAD (Arandjelovic et al. 2016, "NetVLAD: CNN Architecture for Weakly Supervised Place
-Recognition", eq. 1 to 4).
+"""Aggregators by clusters: NetVLAD and SALAD.
+
+NetVLAD (Arandjelovic et al. 2016, "NetVLAD: CNN Architecture for Weakly Supervised Place
+Recognition", eq. 1 to 4):
 
     x_i   = local feature of position i, L2-normalised
     a_ik  = softmax over k of w_k . x_i + b_k
@@ -7,23 +9,23 @@ Recognition", eq. 1 to 4).
     V_k  <- V_k / |V_k|
     row   = [V_0 ... V_{K-1}] / | . |            cluster-major
 
-w, b and c are learnt apart. They begin as the paper has them, w_k = 2 alpha c_k and b_k = -alpha
-|c_k|^2, but around random unit vectors c_k: with alpha 100, the best cluster of a feature then
-outweighs the second by about 100 in 256 channels, which is the paper's rule for alpha.
+w, b and c are separate parameters. They are initialised as in the paper, w_k = 2 alpha c_k and
+b_k = -alpha |c_k|^2, but around random unit vectors c_k: with alpha 100, the best cluster of a
+feature outweighs the second by about 100 in 256 channels, which is the paper's rule for alpha.
 
 SALAD (Izquierdo and Civera 2024, "Optimal Transport Aggregation for Visual Place Recognition",
-section 3).
+section 3):
 
     s_ik  = score of local feature i in cluster k, by an MLP; one learnt number for the dustbin
-    P     = Sinkhorn's plan for exp(s): every feature has a mass of 1 to give, every cluster room
-            for 1, the dustbin for the others
+    P     = Sinkhorn's plan for exp(s): every feature has a mass of 1, every cluster a capacity of
+            1, the dustbin takes the rest
     V_k   = sum over i of P_ik f_i              f: the features, by an MLP to `cluster_dim` numbers
     g     = the global token, by an MLP to `token_dim` numbers
     row   = [g / |g|, V_0 / |V_0|, V_1 / |V_1|, ...] / | . |
 
-The paper's backbone is DINOv2, whose class token is the global token. Of a network that has none,
-it is the mean of the map over its positions. There have to be more positions than clusters, or
-nothing is left for the dustbin.
+The paper's backbone is DINOv2, whose class token is the global token. For a network without one, it
+is the mean of the map over its positions. The map needs more positions than there are clusters;
+otherwise nothing is left for the dustbin.
 """
 
 from __future__ import annotations
@@ -45,6 +47,8 @@ from shared.descriptors.vpr_models.aggregators.base import (
 
 
 class NetVLAD(Aggregator):
+    """Soft-assigned residuals to learnt cluster centres."""
+
     inferred: ClassVar = {"in_channels": "channels"}
 
     def __init__(self, in_channels: Size, clusters: Size = 64, alpha: Positive = 100.0) -> None:
@@ -57,20 +61,22 @@ class NetVLAD(Aggregator):
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         features = normalize(maps.flatten(2).transpose(1, 2).float(), dim=-1)  # (B, hw, C)
         shares = (features @ self.weight.T + self.bias).softmax(dim=-1)  # (B, hw, K)
-        # Sums apart, so that no (B, hw, K, C) is needed.
+        # Separate sums avoid a tensor of (B, hw, K, C).
         sums = shares.transpose(1, 2) @ features
         residuals = sums - shares.sum(dim=1).unsqueeze(-1) * self.centres
         return normalise_rows(normalize(residuals, dim=-1))
 
 
 HIDDEN_WIDTH = 512  # channels between the two layers of each MLP
-SINKHORN_ITERATIONS = 3  # of Sinkhorn's algorithm
-DUSTBIN_SCORE = 1.0  # to begin with
+SINKHORN_ITERATIONS = 3
+DUSTBIN_SCORE = 1.0  # initial value
 
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class SALAD(Aggregator):
+    """Features assigned to clusters by optimal transport, and a global token."""
+
     inferred: ClassVar = {"in_channels": "channels"}
     takes_token: ClassVar = True
 
@@ -84,8 +90,8 @@ class SALAD(Aggregator):
     ) -> None:
         super().__init__(token_dim + num_clusters * cluster_dim)
         self.num_clusters = num_clusters
-        self.features = _at_each_position(in_channels, cluster_dim, dropout)
-        self.scores = _at_each_position(in_channels, num_clusters, dropout)
+        self.features = _pointwise_mlp(in_channels, cluster_dim, dropout)
+        self.scores = _pointwise_mlp(in_channels, num_clusters, dropout)
         self.token = nn.Sequential(
             nn.Linear(in_channels, HIDDEN_WIDTH), nn.ReLU(), nn.Linear(HIDDEN_WIDTH, token_dim)
         )
@@ -98,36 +104,43 @@ class SALAD(Aggregator):
         clusters = normalize(plan @ features.transpose(1, 2), dim=-1)  # (B, K, cluster_dim)
         if token is None:
             token = maps.mean(dim=(-2, -1))
-        whole = normalize(self.token(token).float(), dim=-1)
-        return normalise_rows(torch.cat([whole, clusters.flatten(1)], dim=1))
+        global_token = normalize(self.token(token).float(), dim=-1)
+        return normalise_rows(torch.cat([global_token, clusters.flatten(1)], dim=1))
 
     def refusal(self, height: int, width: int) -> str | None:
         if height * width > self.num_clusters:
             return None
         return (
-            f"their map has {height} x {width} positions, and it needs more of them than its "
+            f"their map has {height} x {width} positions, but it needs more positions than its "
             f"{self.num_clusters} clusters (num_clusters)"
         )
 
 
 def optimal_transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
-    """(B, K, n) float32 scores, a number -> (B, K, n): how much of feature i goes to cluster k.
+    """Compute the transport plan of features to clusters by log-domain Sinkhorn iterations.
 
-    Sinkhorn and Knopp's algorithm on logarithms, with the masses 1 of a cluster, n - K of the
-    dustbin and 1 of a feature; the features' come out exactly, the others nearly.
+    The masses are 1 for a cluster, n - K for the dustbin and 1 for a feature; after a finite number
+    of iterations those of the features are exact, the others approximate.
+
+    Args:
+        scores: (B, K, n) float32 scores of n features in K clusters.
+        dustbin: The dustbin's score, a scalar.
+
+    Returns:
+        (B, K, n) mass of each feature in each cluster.
     """
     batch, clusters, positions = scores.shape
     extended = torch.cat([scores, dustbin.float().expand(batch, 1, positions)], dim=1)
-    room = scores.new_zeros(clusters + 1)
-    room[-1] = math.log(positions - clusters)
-    of_feature = scores.new_zeros(batch, 1, positions)
+    log_masses = scores.new_zeros(clusters + 1)
+    log_masses[-1] = math.log(positions - clusters)
+    log_v = scores.new_zeros(batch, 1, positions)
     for _ in range(SINKHORN_ITERATIONS):
-        of_cluster = room.view(1, -1, 1) - (extended + of_feature).logsumexp(dim=2, keepdim=True)
-        of_feature = -(extended + of_cluster).logsumexp(dim=1, keepdim=True)
-    return (extended + of_cluster + of_feature).exp()[:, :clusters]
+        log_u = log_masses.view(1, -1, 1) - (extended + log_v).logsumexp(dim=2, keepdim=True)
+        log_v = -(extended + log_u).logsumexp(dim=1, keepdim=True)
+    return (extended + log_u + log_v).exp()[:, :clusters]
 
 
-def _at_each_position(channels: int, out: int, dropout: float) -> nn.Sequential:
+def _pointwise_mlp(channels: int, out: int, dropout: float) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(channels, HIDDEN_WIDTH, kernel_size=1),
         nn.Dropout(dropout),

@@ -1,5 +1,7 @@
-"""MixVPR (Ali-bey, Chaib-draa and Giguere 2023, "MixVPR: Feature Mixing for Visual Place
-Recognition", eq. 2 to 5).
+"""Aggregators by mixing of positions: MixVPR and BoQ.
+
+MixVPR (Ali-bey, Chaib-draa and Giguere 2023, "MixVPR: Feature Mixing for Visual Place Recognition",
+eq. 2 to 5):
 
     x   = the map with its h x w positions as one axis: (C, hw)
     x  <- x + W2 relu(W1 LayerNorm(x))          along hw, `mix_depth` times
@@ -7,10 +9,10 @@ Recognition", eq. 2 to 5).
     z   = Wr y                                  along hw, to `out_rows`
     row = z / |z|                               channel-major
 
-All maps have the one size that its layers were made for.
+All maps must have the size that the layers were built for.
 
 BoQ (Ali-bey, Chaib-draa and Giguere 2024, "BoQ: A Place is Worth a Bag of Learnable Queries",
-section 3).
+section 3):
 
     x_0   = LayerNorm of a 3 x 3 convolution of the map to `proj_channels`, position by position
     x_l   = Encoder_l(x_{l-1})                  one transformer encoder layer
@@ -40,6 +42,8 @@ from shared.descriptors.vpr_models.aggregators.base import (
 
 
 class FeatureMixer(nn.Module):
+    """Residual MLP along the positions of a (B, C, hw) map."""
+
     def __init__(self, positions: int, hidden: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(positions)
@@ -55,6 +59,8 @@ class FeatureMixer(nn.Module):
 
 
 class MixVPR(Aggregator):
+    """Feature mixing along positions, then projections of channels and positions."""
+
     inferred: ClassVar = {"in_channels": "channels", "in_h": "height", "in_w": "width"}
 
     def __init__(
@@ -84,8 +90,8 @@ class MixVPR(Aggregator):
         if (height, width) == self.size:
             return None
         return (
-            f"their map is {height} x {width}, and its layers take {self.size[0]} x "
-            f"{self.size[1]} only"
+            f"their map is {height} x {width}, but its layers only take {self.size[0]} x "
+            f"{self.size[1]}"
         )
 
 
@@ -94,6 +100,8 @@ FEEDFORWARD_FACTOR = 4  # of an encoder layer's MLP
 
 
 class BoqBlock(nn.Module):
+    """One encoder layer and the cross-attention of its learnt queries."""
+
     def __init__(self, width: int, queries: int) -> None:
         super().__init__()
         heads = width // HEAD_WIDTH
@@ -107,7 +115,7 @@ class BoqBlock(nn.Module):
         self.norm_out = nn.LayerNorm(width)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, hw, width) -> the encoded positions, and (B, queries, width)."""
+        """Return the encoded positions (B, hw, width) and the outputs (B, queries, width)."""
         x = self.encoder(x)
         attended, _ = self.among_queries(
             self.queries, self.queries, self.queries, need_weights=False
@@ -118,6 +126,8 @@ class BoqBlock(nn.Module):
 
 
 class BoQ(Aggregator):
+    """Cross-attention of learnt queries to the positions of the map."""
+
     inferred: ClassVar = {"in_channels": "channels"}
 
     def __init__(
@@ -136,8 +146,8 @@ class BoQ(Aggregator):
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         x = self.norm(self.project(maps).flatten(2).transpose(1, 2))  # (B, hw, width)
-        found = []
+        outputs = []
         for block in self.blocks:
             x, out = block(x)
-            found.append(out)
-        return normalise_rows(self.rows(torch.cat(found, dim=1).transpose(1, 2)))
+            outputs.append(out)
+        return normalise_rows(self.rows(torch.cat(outputs, dim=1).transpose(1, 2)))
