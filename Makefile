@@ -6,7 +6,7 @@ HOST ?= 127.0.0.1
 PORT ?= 8000
 PLACEWISE_HOME ?= ./var
 
-# Where it is set, each process would compile PyTorch and all else anew: seconds, every time.
+# With it, each process would compile PyTorch and everything else again, which takes seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
 VENV := .venv
@@ -20,7 +20,7 @@ INSTALLED := $(VENV)/.installed
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
-setup: $(INSTALLED) ## make .venv and install everything into it (TORCH_INDEX= picks another torch build)
+setup: $(INSTALLED) ## create .venv and install everything (TORCH_INDEX= selects another torch build)
 
 $(INSTALLED): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Placewise needs Python 3.11 or newer; this is %d.%d. Try: make setup PYTHON=python3.12" % sys.version_info[:2])'
@@ -29,7 +29,7 @@ $(INSTALLED): pyproject.toml requirements.lock
 ifeq ($(TORCH_INDEX),)
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --requirement requirements.lock
 else
-	# The lock pins the CUDA build and its libraries: leave those out and take torch from the other index.
+	# The lock pins the CUDA build and its libraries: skip those and install torch from the other index.
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --index-url $(TORCH_INDEX) \
 		$$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock)
 	grep -vE '^(torch|torchvision|triton|nvidia-[a-z0-9-]+|cuda-[a-z0-9-]+)(\[|==)' requirements.lock > $(VENV)/other.lock
@@ -41,49 +41,49 @@ endif
 run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
 	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) $(BIN)/placewise serve
 
-test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
+test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
 	PLACEWISE_TEST_NO_SERVERS=1 $(BIN)/python -m pytest tests/unit tests/contract --numprocesses auto --dist loadfile
 
-test-deploy: $(INSTALLED) ## the files for containers and Kubernetes alone (`make test` has them, too)
+test-deploy: $(INSTALLED) ## tests of the files for containers and Kubernetes (part of `make test`)
 	$(BIN)/python -m pytest tests/deploy
 
-test-browser: $(INSTALLED) ## the page in a real Chromium (apt-get install chromium)
+test-browser: $(INSTALLED) ## tests of the page in Chromium (apt-get install chromium)
 	PLACEWISE_TEST_BROWSER=1 $(BIN)/python -m pytest tests/browser
 
-test-api-fuzz: $(INSTALLED) ## very many made-up calls by the API's description (PLACEWISE_FUZZ_EXAMPLES=)
+test-api-fuzz: $(INSTALLED) ## many generated API calls (PLACEWISE_FUZZ_EXAMPLES=)
 	PLACEWISE_FUZZ_EXAMPLES=$${PLACEWISE_FUZZ_EXAMPLES:-200} $(BIN)/python -m pytest tests/integration/test_api_fuzz.py --timeout 7200
 
-pictures: $(INSTALLED) ## test-browser, and the screenshots in docs/pictures anew
+pictures: $(INSTALLED) ## test-browser, and retake the screenshots in docs/pictures
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
 
-client: $(INSTALLED) ## the synchronous client anew, from the asynchronous one
+client: $(INSTALLED) ## generate the synchronous client from the asynchronous one
 	$(BIN)/python -m tools.make_sync_client
 
-api-page: $(INSTALLED) ## docs/api-calls.md anew, from the API's description
+api-page: $(INSTALLED) ## generate docs/api-calls.md from the OpenAPI description
 	$(BIN)/python -m tools.make_api_page
 
-lint: $(INSTALLED) ## ruff, formatting and the import contracts
+lint: $(INSTALLED) ## check ruff rules, formatting and import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-types: $(INSTALLED) ## mypy, strict
+types: $(INSTALLED) ## check types with mypy (strict)
 	$(BIN)/mypy
 
-bench: $(INSTALLED) ## time the main job: upload, describe, search
+bench: $(INSTALLED) ## benchmark upload, description and search
 	$(BIN)/placewise bench spine
 
-demo: $(INSTALLED) ## draw a city, index it, fit, ask, print recall, write docs/demo.jpg
+demo: $(INSTALLED) ## generate a city, index it, fit a vocabulary, search, print recall, write docs/demo.jpg
 	$(BIN)/python -m benchmarks.demo --picture docs/demo.jpg
 
-env: ## write .env for docker compose, with fresh secrets (one that is there stays as it is)
-	@test ! -e .env || { echo ".env is there already"; exit 1; }
+env: ## write .env for docker compose with new secrets (an existing one is kept)
+	@test ! -e .env || { echo ".env exists already"; exit 1; }
 	@umask 077 && $(PYTHON) -c 'import re, secrets; print(re.sub(r"(?m)^([A-Z0-9_]+=)$$", lambda name: name[1] + secrets.token_hex(20), open(".env.example").read()), end="")' > .env
 	@echo "Written: .env. Next: docker compose up --build --detach"
 
-clean: ## remove the environment and what tools left behind (your data under PLACEWISE_HOME stays)
+clean: ## remove .venv and caches (your data under PLACEWISE_HOME stays)
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
