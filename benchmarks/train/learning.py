@@ -73,11 +73,11 @@ class BarDisplay(NullDisplay):
         self._progress = progress
         self._bars: dict[str, Any] = {}
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         if what not in self._bars:
-            self._bars[what] = self._progress.add_task(what, total=most)
-        self._progress.update(self._bars[what], completed=done, total=most)
-        if done >= most:
+            self._bars[what] = self._progress.add_task(what, total=total)
+        self._progress.update(self._bars[what], completed=done, total=total)
+        if done >= total:
             self._progress.remove_task(self._bars.pop(what))
 
 
