@@ -132,7 +132,7 @@ def measure_gain(
         hits = compute_hits(ranked, evaluation_set.positives)[:, :k]
         found.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
     (difference,) = paired_differences(
-        found[1], found[0], cluster_queries(evaluation_set.queries).of
+        found[1], found[0], cluster_queries(evaluation_set.queries).labels
     )
     assert difference.low is not None
     assert difference.high is not None
