@@ -1,15 +1,11 @@
-"""`make demo`: a made-up city, indexed, fitted, evaluated and asked, from nothing to a picture.
+"""`make demo`: indexes a generated city, fits, evaluates, queries, and draws a picture.
 
     python -m benchmarks.demo [--places 300] [--picture docs/demo.jpg]
 
-Half of the city's queries are uploaded as labelled queries, so that the map learns what its scores
-mean; the other half it has never seen: they are asked as a user's photos, and what is printed of
-them is what a user would get. Every figure is of a generated place: not comparable with published
-figures.
-
-Asking as a user does, with photos whose place is known, and what the answers were worth.
-
-A picture of queries and what was found: each query above its best match.
+Half of the city's queries are uploaded as labelled queries, with which the map's confidence is
+calibrated. The other half is held out and queried as a user's photos; the printed results are those
+that a user would get. All metrics are of a generated city and are not comparable with published
+results.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ CORRECT_WITHIN_M = 25.0
 
 @dataclass(frozen=True, slots=True)
 class QueryOutcome:
-    """One query photo, its truth and its answer."""
+    """A query photo with its ground truth and its result."""
 
     query: Path
     in_map: bool
@@ -60,7 +56,7 @@ class QueryOutcome:
 def query_with_photo(
     client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
 ) -> QueryOutcome:
-    """Ask with a photo that is not stored, and compare the answer with what its name says."""
+    """Query with a photo that is not stored, and compare the result with its ground truth."""
     truth = _location(query.fields)
     answer = client.similar_to_file(query.path, top_k=1)
     best, estimate = answer["similar_images"][0], answer["estimate"]
@@ -75,7 +71,7 @@ def query_with_photo(
 
 
 def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
-    """Recall, false accepts and the confidence's figures; the latter None while uncalibrated."""
+    """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
     here = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
     accepted = [a for a in outcomes if a.estimate["in_map"]]
@@ -123,8 +119,10 @@ CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), 
 
 
 def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
-    """Write a JPEG: queries in the upper rows, under each its most similar photo, framed green
-    where it shows the place, red where not, grey where the answer was "not in this map"."""
+    """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
+
+    The frame is green for a correct match, red for a wrong one, grey for "not in this map".
+    """
     chosen = _choose_outcomes(outcomes)
     width = COLUMNS * (CELL[0] + GAP) + GAP
     block = 2 * CELL[1] + 2 * CAPTION + 2 * GAP
@@ -149,7 +147,7 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
-    """Two rows: mostly what it was sure of and right, then where it was wrong, then strangers."""
+    """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
     given = [a for a in outcomes if a.estimate["in_map"]]
     right = [a for a in given if a.best_is_correct]
     wrong = [a for a in given if not a.best_is_correct]
@@ -203,13 +201,17 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="From a made-up city to answers.")
+    parser = argparse.ArgumentParser(description="Index and query a generated city.")
     parser.add_argument("--places", type=int, default=300)
-    parser.add_argument("--views", type=int, default=3, help="database photos of a place")
-    parser.add_argument("--queries", type=int, default=400, help="half of them labelled")
-    parser.add_argument("--out-of-map", type=float, default=0.2, help="share of the queries")
+    parser.add_argument("--views", type=int, default=3, help="database photos per place")
+    parser.add_argument(
+        "--queries", type=int, default=400, help="number of queries, half of them labelled"
+    )
+    parser.add_argument(
+        "--out-of-map", type=float, default=0.2, help="share of queries outside the map"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, help="where to draw queries and matches")
+    parser.add_argument("--picture", type=Path, help="JPEG file of queries and matches to write")
     return parser.parse_args()
 
 
@@ -232,7 +234,7 @@ def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> N
 
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
-    """Index, evaluate, fit, evaluate, ask; prints recall before and after the fit."""
+    """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
     from services.cli.client import wait_for_job
     from services.cli.descriptors.vocabulary import fit_and_wait
     from services.cli.ingest.geotags import find_photos

@@ -1,6 +1,6 @@
-"""What everything around the model costs: CPU time of a photo from its upload until it is found.
+"""Benchmark of the pipeline's overhead: CPU time per photo from upload to searchable.
 
-And how many uploads a gateway takes beside a bare FastAPI that only stores the file.
+Also compares the upload rate of a gateway with that of a bare FastAPI server that stores the file.
 """
 
 from __future__ import annotations
@@ -42,8 +42,10 @@ SERVICES = ("gateway", "extractor", "search", "steward")
 def measure(
     progress: Progress, *, widths: Sequence[int], photos: int, batch: int, rounds: int
 ) -> Report:
-    """`photos` of 100 kB at each width of descriptors, `batch` at once; then `rounds` of uploads
-    to the gateway and to the bare one in turn."""
+    """Measure `photos` of 100 kB per descriptor width in batches of `batch`; then upload rates.
+
+    Uploads go to the gateway and to the bare server in `rounds` alternating rounds.
+    """
     report = Report("Around the model, for each photo")
     made = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
     with start_servers() as servers:
@@ -123,7 +125,7 @@ def _measure_cpu(
 
 
 def _upload_and_wait(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
-    """Upload, and wait until all of it can be found."""
+    """Upload the photos and wait until all are searchable."""
     forms = [multipart_form(made[number % len(made)]) for number in range(photos)]
     upload_all(fleet.gateway_urls[0], forms, CLIENTS)
     wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS, on_left)  # type: ignore[arg-type]
@@ -135,8 +137,7 @@ def _upload_and_wait(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: 
 
 
 def _model_milliseconds(width: int, batch: int) -> float:
-    """CPU time that the backbone itself takes of a photo: it only picks pixels, but not for
-    nothing."""
+    """Return the CPU time per photo of the fake backbone, which only samples pixels."""
     recipe = get_extractor_config(_test_extractor(width), allow_test_extractors=True)
     extractor = Extractor(recipe, torch.device("cpu"))
     pixels = np.zeros((batch, 224, 224, 3), np.uint8)
@@ -155,7 +156,7 @@ def _measure_uploads(
     rounds: int,
     on_done: object,
 ) -> None:
-    """No extractor runs: each server has the machine, the store and the clients to itself."""
+    """Measure upload rates without extractors, one server at a time."""
     rates: dict[str, list[float]] = {"gateway": [], "bare": []}
     with _start_bare_server(fleet) as bare:
         targets = {

@@ -1,7 +1,7 @@
-"""Do twice as many extractors describe twice as many photos, and none of them twice?
+"""Benchmark of horizontal scaling: throughput of 1, 2, 4 ... extractors, and duplicate work.
 
-The extractors sleep instead of computing, so that many of them fit on one machine and what is left
-is what the job table, the hints and publishing cost.
+The extractors sleep instead of computing, so that many fit on one machine. What remains is the cost
+of the job table, the Celery hints and publishing.
 """
 
 from __future__ import annotations
@@ -41,8 +41,10 @@ def measure(
     milliseconds: int,
     batch: int,
 ) -> Report:
-    """Throughput of each number of `workers`, with `photos` for each of them, which sleep
-    `milliseconds` a photo and take `batch` at once."""
+    """Measure the throughput for each number of `workers`, with `photos` photos per worker.
+
+    Workers sleep `milliseconds` per photo and take batches of `batch`.
+    """
     report = Report("Extractors that sleep")
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -93,7 +95,7 @@ def measure(
 
 
 def _warm_up(fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int) -> int:
-    """Until every extractor has described a batch, and has its decoders; how many it took."""
+    """Upload until every extractor has described a batch; return the number of photos used."""
     wanted = {str(extractor.process.pid) for extractor in extractors}
     served: set[str] = set()
     for round_ in range(MAX_WARM_UP_ROUNDS):
@@ -115,9 +117,9 @@ def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:
 def _measure_throughput(
     fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int, on_left: Any
 ) -> float:
-    """Photos per second, from the first claim to the last commit by the database's clock.
+    """Return photos per second from the first claim to the last commit, by the database's clock.
 
-    All photos wait before the first is claimed: the extractors stand still meanwhile.
+    All photos are queued before the first is claimed: the extractors are paused meanwhile.
     """
     for extractor in extractors:
         extractor.pause()

@@ -1,7 +1,4 @@
-"""One fault after the other, and the counts after each.
-
-What is true after a fault, counted in the catalog and in the store.
-"""
+"""Runs the fault-injection suite and checks the invariants after each fault."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ from tests.support.clock import clock_off_by
 
 @dataclass(slots=True)
 class InvariantViolations:
-    """All of it has to be zero."""
+    """Numbers of violations of each invariant; all must be zero."""
 
     lost: int = 0
     """Acknowledged photos that the catalog or the store does not have, or that have no row."""
@@ -53,7 +50,7 @@ class InvariantViolations:
 
 
 def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
-    """Jobs that have not ended yet; `photos`: without those of questions."""
+    """Count unfinished jobs; with `photos`, without the jobs of queries."""
     wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
     if photos:
         wanted.append(Job.kind != JobKind.DESCRIBE)
@@ -64,7 +61,7 @@ def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
 def check_invariants(
     catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
 ) -> InvariantViolations:
-    """Count; `acknowledged` gives the photo's id for the sha256 of each photo that was taken."""
+    """Count violations; `acknowledged` maps the sha256 of each acknowledged photo to its id."""
     counts = InvariantViolations()
     with catalog.read() as session:
         photos = {
@@ -127,7 +124,7 @@ MAX_FAULT_DELAY_SECONDS = 0.5  # at most: how long the fault waits for uploads t
 
 @dataclass(slots=True)
 class FaultOutcome:
-    """After one fault. Everything but `refused` and `recovery_seconds` has to be zero."""
+    """Result of one fault. All values except `refused` and `recovery_seconds` must be zero."""
 
     fault: str
     counts: InvariantViolations
@@ -149,7 +146,7 @@ class FaultOutcome:
 
 @dataclass(slots=True)
 class ChaosRun:
-    """What became of a run, fault by fault."""
+    """Results of a run, by fault."""
 
     outcomes: list[FaultOutcome] = field(default_factory=list)
     asked: int = 0
@@ -172,10 +169,10 @@ def run_chaos(
     executed: bool = True,
     on_outcome: Callable[[FaultOutcome], object] = lambda outcome: None,
 ) -> ChaosRun:
-    """Upload `photos` in equal parts, one for each fault, in an order that the seed decides.
+    """Upload `photos` in equal parts, one per fault; the seed determines the order of the faults.
 
-    Faults that have a length last `fault_seconds`. Ends at the first fault after which something
-    is not as it has to be, with the services' logs in the run. `executed`: see `Fleet`.
+    Faults that have a duration last `fault_seconds`. The run ends at the first fault that leaves a
+    violation; the services' logs are then part of the result. `executed`: see `Fleet`.
     """
     moments = random.Random(seed)
     chosen = list(faults or all_faults())
@@ -218,7 +215,7 @@ def run_chaos(
 def _upload_by_thirds(
     traffic: Traffic, photos: int, place: int, faults: int
 ) -> Callable[[int], None]:
-    """Releases the first, second or third third of the part of the fault at `place`."""
+    """Release the first, second or third third of the photos of the fault at index `place`."""
 
     def upload(third: int) -> None:
         traffic.release((3 * place + third) * photos // (3 * faults))
@@ -234,7 +231,7 @@ def _run_fault(
     moments: random.Random,
     upload: Callable[[int], None],
 ) -> FaultOutcome:
-    """Photos are uploaded before the fault, while it lasts, and after it; then all is counted."""
+    """Upload photos before, during and after the fault, then check the invariants."""
     before = traffic.answers.copy()
     fell = len(fleet.crashed)
     upload(1)

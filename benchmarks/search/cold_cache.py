@@ -1,4 +1,4 @@
-"""Queries whose rows are on the disk and in no cache."""
+"""Search latency when the descriptors are on disk and not in the page cache."""
 
 from __future__ import annotations
 
@@ -30,11 +30,10 @@ MAX_CACHED_SHARE = 0.01  # of the rows' pages: else nothing was cold
 def measure_cold_cache(
     report: Report, world: SyntheticMap, city: SyntheticCity, queries: int, bar: Progress
 ) -> None:
-    """Each query warm, then with every row dropped from the page cache. The codes stay in memory.
+    """Time each query warm, then with all rows dropped from the page cache (not the codes).
 
-    A page that a process has mapped can't be dropped: its own mapping is given up first
-    (MADV_DONTNEED), then the file's pages are (posix_fadvise DONTNEED); `mincore` says what is
-    left.
+    A page that a process has mapped cannot be dropped. Its mapping is released first
+    (MADV_DONTNEED), then the file's pages (posix_fadvise DONTNEED); `mincore` reports what remains.
     """
     gc.collect()  # mappings of those who were asked before
     task = bar.add_task("cold", total=queries)
@@ -76,7 +75,7 @@ def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
 
 
 def cached_share(snapshot: Snapshot) -> float:
-    """The share of the rows' pages that are in memory."""
+    """Return the share of the rows' pages that are in memory."""
     libc = ctypes.CDLL(None, use_errno=True)
     there = pages = 0
     for chunk in snapshot.chunks:

@@ -1,4 +1,4 @@
-"""How the scan of the codes grows with the map; the codes are random words, made directly."""
+"""Scan time of the sign codes as the map grows; the codes are random words."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEED = 20_261_121
 def measure_growth(
     report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
 ) -> None:
-    """Scans and reads of the same codes, in turn."""
+    """Time scans and plain reads of the same codes in turn."""
     turn = get_rotation(DIMENSION)
     words = int(level_ends(turn.padded)[0])
     draw = np.random.default_rng(SEED)
@@ -77,7 +77,7 @@ def measure_growth(
 
 
 def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:
-    """Codes as a scan wants them: chunk by chunk, their first level only."""
+    """Return codes as the scan takes them: by chunk, the first level only."""
     begins = np.arange(0, len(codes), BLOCK_ROWS)
     nothing = np.empty(0, np.uint64)
     return SignCodeBlocks(

@@ -1,7 +1,7 @@
-"""Many clients at once, while photos are added, deleted and merged: is any answer wrong?
+"""Correctness under load: clients search while photos are added, deleted and merged.
 
-The search service runs in a process of its own, as in production. Every answer names the version
-of the map that it is of, and is compared with brute force on the photos that the map had then.
+The search service runs in a process of its own, as in production. Each response names the version
+of the map that it refers to, and is compared with brute force on the photos of that version.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class SearchObservation:
 
 @dataclass(slots=True)
 class LoadOutcome:
-    """What clients and the one who changes the map have seen."""
+    """Responses and changes recorded during the load."""
 
     answered: list[SearchObservation] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -69,7 +69,7 @@ class LoadOutcome:
     seconds: float = 0.0
 
     def live_at(self, version: int) -> int:
-        """The number of the entry of `live`. ValueError for a version before the first."""
+        """Return a version's index in `live`; ValueError for a version before the first."""
         found = bisect.bisect_right(self.versions, version) - 1
         if found < 0:
             raise ValueError(f"version {version} is older than all")
@@ -79,7 +79,7 @@ class LoadOutcome:
 def measure_load(
     report: Report, world: SyntheticMap, city: SyntheticCity, seconds: float, progress: Progress
 ) -> None:
-    """CLIENTS ask for `seconds`."""
+    """Run CLIENTS clients for `seconds`."""
     photos = len(world.photo_ids)
     paths = world.chunk_paths()
     queries = np.concatenate(
@@ -115,8 +115,7 @@ def measure_load(
 
 
 def count_wrong_answers(outcome: LoadOutcome, oracle: BruteForce) -> int:
-    """Answers that are not those of brute force on the version that they name, or that name one
-    older than they had to know."""
+    """Count responses that differ from brute force on their version, or are too old."""
     expected: dict[tuple[int, int, int], Ranking] = {}
     wrong = 0
     for answered in outcome.answered:
@@ -211,7 +210,7 @@ def _send_query(
 def _change_loop(
     world: SyntheticMap, pool: Rows, outcome: LoadOutcome, stop: threading.Event
 ) -> None:
-    """Add a photo, delete another one, merge what was added from time to time."""
+    """Add a photo, delete another one, and merge the added chunks from time to time."""
     draw = random.Random(SEED)
     slot = len(world.photo_ids)  # far beyond those that are there
     added = turn = 0
@@ -238,7 +237,7 @@ def _record_version(outcome: LoadOutcome, version: int, live: NDArray[np.bool_])
 
 
 def _similar_rows(queries: Rows, others: Rows) -> Rows:
-    """(POOL, dimension): photos that answer the queries more or less."""
+    """Return (POOL, dimension) rows of photos that match the queries to different degrees."""
     draw = np.random.default_rng(SEED)
     rows = queries[draw.integers(len(queries), size=ADDED_PHOTOS)]
     for row in rows:  # one after the other: the pool alone is large enough
@@ -251,7 +250,7 @@ def _similar_rows(queries: Rows, others: Rows) -> Rows:
 
 @contextlib.contextmanager
 def _start_search_service(world: SyntheticMap) -> Iterator[ServiceProcess]:
-    """`placewise search` on the map."""
+    """Start `placewise search` on the map."""
     (port,) = free_ports(1)
     home = world.settings.placewise_home
     service = ServiceProcess(

@@ -1,4 +1,4 @@
-"""How fast this machine reads memory, what a search reads of it, and how much a process holds."""
+"""Measures memory bandwidth, the bytes that a search reads, and the memory of a process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Words = NDArray[np.uint64]
 
 @numba_jit(REORDERED_FASTMATH)
 def _xor_words(words: Words) -> np.uint64:
-    """Something that depends on every word; four streams at once, which is faster than one."""
+    """Return a value that depends on every word; four streams at once are faster than one."""
     quarter = words.shape[0] // 4
     a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
     d = words[3 * quarter :]
@@ -39,14 +39,14 @@ def _xor_words(words: Words) -> np.uint64:
 
 
 class MemoryBandwidth:
-    """How fast memory is read: by one thread, and by one on each core; the faster is the floor.
+    """Measures memory bandwidth by one thread, and by one thread per core; the faster counts.
 
-    A context manager. Samples are taken between other measurements, so that what disturbs one
-    disturbs the other.
+    A context manager. Samples are taken between other measurements, so that other load on the
+    machine affects both.
     """
 
     def __init__(self, words: Words | None = None) -> None:
-        """What is read: these words, or some that lie in no cache."""
+        """Read these words, or by default some that do not fit into any CPU cache."""
         self._words = np.ones(STREAM_BYTES // 8, np.uint64) if words is None else words.ravel()
         cores = len(os.sched_getaffinity(0))
         self._parts = np.array_split(self._words, cores)
@@ -65,7 +65,7 @@ class MemoryBandwidth:
 
     @property
     def bytes_per_second(self) -> float:
-        """The median of the faster way. StatisticsError before the first sample."""
+        """Median rate of the faster way. StatisticsError before the first sample."""
         return self._words.nbytes / min(map(median, self._took))
 
     def __enter__(self) -> Self:
@@ -77,14 +77,14 @@ class MemoryBandwidth:
 
 @dataclass(slots=True)
 class ByteCounter:
-    """Bytes of codes and rows that were read."""
+    """Number of bytes of codes and rows read."""
 
     size_bytes: int = 0
 
 
 @contextlib.contextmanager
 def count_bytes_read() -> Iterator[ByteCounter]:
-    """Counts what searches by codes read while the block runs: their loops are told which rows."""
+    """Count the bytes that searches by codes read inside the block, by wrapping their loops."""
     count = ByteCounter()
 
     lock = threading.Lock()
@@ -121,7 +121,7 @@ def _distance_bytes(
 
 
 def private_bytes() -> int:
-    """Memory of this process that is no file's: what mapped files take is the system's cache."""
+    """Return the private memory of this process, without the page cache of mapped files."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("RssAnon:"):
             return 1024 * int(line.split()[1])

@@ -1,6 +1,6 @@
-"""The ways to search that are compared: ours, and what one would write without it.
+"""Compared search methods: Placewise and its baselines NumPy, faiss and AnyLoc's service.
 
-The truth: every row multiplied with every query in float64.
+The ground truth is brute force in float64.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Ranking = Sequence[tuple[UUID, float]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BruteForce:
-    """The cosines of n photos with q queries."""
+    """Cosines of n photos with q queries, in float64."""
 
     photo_ids: Sequence[UUID]
     scores: NDArray[np.float64]
@@ -41,7 +41,7 @@ class BruteForce:
 
     @classmethod
     def of(cls, pieces: Iterable[Rows], photo_ids: Sequence[UUID], queries: Rows) -> BruteForce:
-        """`pieces` are the rows of the photos, in their order; rows have length 1."""
+        """Compute the cosines; `pieces` are the photos' L2-normalised rows, in order."""
         asked = queries.astype(np.float64)
         asked /= np.linalg.norm(asked, axis=1, keepdims=True)
         scores = np.empty((len(queries), len(photo_ids)))
@@ -62,7 +62,7 @@ class BruteForce:
         min_score: float | None = None,
         live: NDArray[np.bool_] | None = None,
     ) -> Ranking:
-        """The answer to query number `query`, among the photos that are `live`, (n,)."""
+        """Return the result of query number `query` among the photos that are `live`, (n,) bool."""
         scores = self.scores[query]
         may = np.ones(len(scores), bool) if live is None else live.copy()
         if min_score is not None:
@@ -76,7 +76,7 @@ class BruteForce:
 
 
 def same_ranking(found: Ranking, expected: Ranking) -> bool:
-    """Whether the photos are the same in the same order, with the same scores."""
+    """Return whether photos, order and scores are the same."""
     return len(found) == len(expected) and all(
         ours[0] == truth[0] and abs(ours[1] - truth[1]) <= TOLERANCE
         for ours, truth in zip(found, expected, strict=True)
@@ -84,7 +84,7 @@ def same_ranking(found: Ranking, expected: Ranking) -> bool:
 
 
 def same_photos(found: Ranking, expected: Ranking) -> bool:
-    """The same for who computes scores in float32."""
+    """Return whether the photos are the same, for methods that compute scores in float32."""
     return [photo_id for photo_id, _ in found] == [photo_id for photo_id, _ in expected]
 
 
@@ -93,7 +93,7 @@ MIN_CANDIDATES = 32  # of the binary index, compared exactly
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkQuery:
-    """One question: the row of query number `query`, how many photos, from which score on."""
+    """A search: index `query` of the query's row, number of results, minimum score."""
 
     query: int
     k: int
@@ -112,7 +112,7 @@ class SearchMethod(Protocol):
 
 
 class PlacewiseSearch:
-    """What a search worker has loaded, asked directly."""
+    """Placewise's search on a loaded snapshot, called directly."""
 
     name = "Placewise, answer()"
 
@@ -143,7 +143,7 @@ class PlacewiseSearch:
 
 
 class PlacewiseWorker:
-    """The same through the worker: the query's descriptor is read from the store."""
+    """The same through the search worker, which reads the query's descriptor from the store."""
 
     name = "Placewise, SearchWorker"
 
@@ -186,7 +186,7 @@ class NumpySearch:
 
 
 class AnyLocSearch:
-    """Every chunk is loaded for every query (AnyLoc's similarity service)."""
+    """Loads every chunk for every query, as AnyLoc's similarity service does."""
 
     name = "predecessor: np.load of every chunk"
     memory_bytes = 0
@@ -206,7 +206,7 @@ class AnyLocSearch:
 
 
 class FaissFlat:
-    """`faiss.IndexFlatIP`. Its rows are NumPy's, too: one copy is enough for both."""
+    """`faiss.IndexFlatIP`; shares its rows with NumPy, to hold a single copy."""
 
     name = "faiss.IndexFlatIP"
 
@@ -229,9 +229,9 @@ class FaissFlat:
 
 
 class FaissBinary:
-    """`faiss.IndexBinaryFlat` on our codes, and the best of it compared exactly.
+    """`faiss.IndexBinaryFlat` on the sign codes, with exact reranking of its candidates.
 
-    Nothing says how many candidates are enough.
+    The number of candidates that suffices for an exact result is unknown.
     """
 
     name = "faiss.IndexBinaryFlat + rerank"
@@ -268,7 +268,7 @@ def top_k(
     photo_ids: Sequence[UUID],
     asked: BenchmarkQuery,
 ) -> Ranking:
-    """The best of all rows' scores, which stand in the order of the photos."""
+    """Return the top k of the scores of all rows, which are in the order of the photos."""
     k = min(asked.k, len(scores))
     best = np.argpartition(scores, len(scores) - k)[len(scores) - k :]
     if asked.min_score is not None:

@@ -1,7 +1,8 @@
-"""Whether a network learns places: against itself untrained, where it has never been.
+"""Recall gained by training over the untrained network, on places that were not trained on.
 
-It learns in the school quarter of a generated city. It is asked in that city's map quarter (other
-streets of the same style) and in another city of another catalogue (other walls, colours, windows).
+The network is trained in the school quarter of a generated city. It is evaluated in that city's map
+quarter (other streets of the same style) and in another city with another catalogue (other walls,
+colours, windows).
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class RecallGain:
-    """R@k as shares; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
+    """R@k from 0 to 1; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
 
     untrained: float
     trained: float
@@ -66,7 +67,7 @@ class RecallGain:
 
 
 class BarDisplay(NullDisplay):
-    """A run's progress as bars of a benchmark."""
+    """Display of a run that shows its progress as bars of the benchmark."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__()
@@ -91,7 +92,7 @@ def measure_learning(
     device: Device,
     seed: int,
 ) -> dict[str, RecallGain]:
-    """By where it was asked: `other streets` and `another catalogue`."""
+    """Return the gain by evaluation set: `other streets` and `another catalogue`."""
     width, height = PHOTO_SIZE
     here = CityOptions(places, VIEWS, places, seed, 0, 0.0, width, height)
     elsewhere = replace(here, seed=seed + 1, catalogue_seed=1, train=False)
@@ -122,7 +123,7 @@ def measure_gain(
     device: Device,
     k: int = 1,
 ) -> RecallGain:
-    """What the one network finds among its first k beyond the other, on the same queries."""
+    """Return the difference of recall@k of two networks on the same queries."""
     found = []
     for model in (untrained, trained):
         describe = ModelDescriber(
@@ -156,7 +157,7 @@ def measure_grid(
     device: Device,
     seed: int,
 ) -> tuple[Table, list[dict[str, str]]]:
-    """Three aggregators x two losses on the city that `measure_learning` has drawn."""
+    """Train three aggregators x two losses on the city that `measure_learning` has generated."""
     said = _training_arguments(
         folder / "here", folder / "grid", epochs, image_size, workers, device, seed
     )

@@ -1,4 +1,4 @@
-"""Photos a second: read, learned from, and the time that the one waits for the other."""
+"""Training throughput: photos loaded and trained on per second, share of time spent waiting."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TrainingThroughput:
 def measure_throughput(
     progress: Progress, folder: Path, photos: int, workers: int, device: Device
 ) -> TrainingThroughput:
-    """Over so many photos; the first batches, in which workers start, are left out."""
+    """Measure over this number of photos, without the first batches, in which workers start."""
     files = _draw_photos(folder)
     places = [
         TrainingPlace(

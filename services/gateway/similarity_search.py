@@ -109,7 +109,9 @@ def estimate_place(
     evaluations learnt what is in the map.
     """
     state = calibration.state if calibration else "uncalibrated"
-    evidence = compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
+    evidence = (
+        compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
+    )
     if evidence is None:
         reason = (
             "No photo of the map passes the filter."

@@ -247,7 +247,9 @@ class MapEvaluation:
         """The ranking as it would be if the query's place were not in the map."""
         depth = EVIDENCE_DEPTH
         while True:
-            strangers = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.location)]
+            strangers = [
+                r for r in _to_ranked(ranking) if is_different_place(query.spot, r.location)
+            ]
             if len(strangers) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
                 return strangers[:EVIDENCE_DEPTH]
             depth *= 2
