@@ -100,18 +100,18 @@ def measure_learning(
         "other streets": _draw_city(progress, here, folder / "here"),
         "another catalogue": _draw_city(progress, elsewhere, folder / "elsewhere"),
     }
-    said = _training_arguments(
+    arguments = _training_arguments(
         folder / "here", folder / "runs", epochs, image_size, workers, device, seed
     )
     report = run.run(
-        build_arguments({**said, "run_name": "gem"}), BarDisplay(progress), StopRequest()
+        build_arguments({**arguments, "run_name": "gem"}), BarDisplay(progress), StopRequest()
     )
     trained = load_checkpoint(Path(report["best"]["path"])).model
     seed_everything(seed)
-    untrained = make_model(build_arguments(said), NullDisplay(), resuming=False)
+    untrained = make_model(build_arguments(arguments), NullDisplay(), resuming=False)
     return {
-        where: measure_gain(untrained, trained, asked, image_size, device)
-        for where, asked in sets.items()
+        name: measure_gain(untrained, trained, evaluation_set, image_size, device)
+        for name, evaluation_set in sets.items()
     }
 
 
@@ -124,22 +124,22 @@ def measure_gain(
     k: int = 1,
 ) -> RecallGain:
     """Return the difference of recall@k of two networks on the same queries."""
-    found = []
+    within = []
     for model in (untrained, trained):
         describe = ModelDescriber(
             model.to(device.torch_device), device.torch_device, (image_size, image_size)
         )
         ranked = evaluate_recall(describe, evaluation_set, ks=(k,)).ranked.indices
         hits = compute_hits(ranked, evaluation_set.positives)[:, :k]
-        found.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
+        within.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
     (difference,) = paired_differences(
-        found[1], found[0], cluster_queries(evaluation_set.queries).labels
+        within[1], within[0], cluster_queries(evaluation_set.queries).labels
     )
     assert difference.low is not None
     assert difference.high is not None
     return RecallGain(
-        float(found[0].mean()),
-        float(found[1].mean()),
+        float(within[0].mean()),
+        float(within[1].mean()),
         difference.mean,
         difference.low,
         difference.high,
@@ -158,14 +158,14 @@ def measure_grid(
     seed: int,
 ) -> tuple[Table, list[dict[str, str]]]:
     """Train three aggregators x two losses on the city that `measure_learning` has generated."""
-    said = _training_arguments(
+    arguments = _training_arguments(
         folder / "here", folder / "grid", epochs, image_size, workers, device, seed
     )
-    del said["default_root_dir"]
+    del arguments["default_root_dir"]
     plan = GridPlan(
         tuple(
             PlannedRun(
-                f"{aggregator['agg_arch']}-{loss}", {**said, **aggregator, "loss_name": loss}
+                f"{aggregator['agg_arch']}-{loss}", {**arguments, **aggregator, "loss_name": loss}
             )
             for aggregator in AGGREGATORS
             for loss in LOSSES
@@ -207,7 +207,7 @@ def _training_arguments(
         "pretrained": False,
         "layers_to_freeze": -1,
         "agg_arch": "GeM",
-        "augmentation": "none",  # the sessions' light and weather are enough to begin with
+        "augmentation": "none",  # light and weather already differ between the sessions
         "image_size": image_size,
         "batch_size": PLACES_PER_BATCH,
         "img_per_place": 4,
