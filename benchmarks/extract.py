@@ -310,9 +310,9 @@ class RoundTimings:
 
     def take(self, do: Callable[[], Rows]) -> Rows:
         """Return the descriptors on the CPU, which also waits for the GPU."""
-        begun, cpu_begun = time.perf_counter(), _cpu_seconds()
+        started_at, cpu_begun = time.perf_counter(), _cpu_seconds()
         rows = do()
-        self.seconds.append(time.perf_counter() - begun)
+        self.seconds.append(time.perf_counter() - started_at)
         self.cpu_seconds.append(_cpu_seconds() - cpu_begun)
         return rows
 
@@ -342,9 +342,9 @@ def _matmul_flops_per_second(device: torch.device, precision: Precision) -> floa
     best = 0.0
     with autocast("float32", device):
         for _ in range(MATRIX_ROUNDS):
-            begun = time.perf_counter()
+            started_at = time.perf_counter()
             (one @ one)[0, 0].item()  # waits for the device
-            best = max(best, 2 * side**3 / (time.perf_counter() - begun))
+            best = max(best, 2 * side**3 / (time.perf_counter() - started_at))
     return best
 
 

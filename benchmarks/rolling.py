@@ -217,9 +217,9 @@ def restart_under_load(
         try:
             clients.begin(INITIAL_PHOTOS)
             for name in names:
-                begun = time.monotonic()
+                started_at = time.monotonic()
                 codes[name] = fleet[name].stop()
-                stopping[name] = time.monotonic() - begun
+                stopping[name] = time.monotonic() - started_at
                 fleet.start(name)
                 on_restarted()
         finally:

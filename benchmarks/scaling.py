@@ -96,16 +96,18 @@ def measure(
 
 def _warm_up(fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int) -> int:
     """Upload until every extractor has described a batch; return the number of photos used."""
-    wanted = {str(extractor.process.pid) for extractor in extractors}
+    expected_workers = {str(extractor.process.pid) for extractor in extractors}
     served: set[str] = set()
     for round_ in range(MAX_WARM_UP_ROUNDS):
         answers = _upload_photos(fleet, photos)
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
         jobs = load_jobs(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
         served |= {(job.worker or "").rpartition("-")[2] for job in jobs}
-        if wanted <= served:
+        if expected_workers <= served:
             return photos * (round_ + 1)
-    raise AssertionError(f"{len(wanted - served)} extractors take no work: {fleet.logs()}")
+    raise AssertionError(
+        f"{len(expected_workers - served)} extractors take no work: {fleet.logs()}"
+    )
 
 
 def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:

@@ -77,13 +77,13 @@ def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress:
         progress.advance(bar)
         return time.perf_counter() - started, answer
 
-    begun = time.perf_counter()
+    started_at = time.perf_counter()
     with ThreadPoolExecutor(4) as pool:
         uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
-    uploaded = time.perf_counter() - begun
+    uploaded = time.perf_counter() - started_at
     for _, answer in uploads:
         client.wait_for(answer["job_id"])
-    searchable = time.perf_counter() - begun
+    searchable = time.perf_counter() - started_at
     stored = [
         timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
     ]

@@ -51,11 +51,11 @@ class InvariantViolations:
 
 def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
     """Count unfinished jobs; with `photos`, without the jobs of queries."""
-    wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
+    conditions: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
     if photos:
-        wanted.append(Job.kind != JobKind.DESCRIBE)
+        conditions.append(Job.kind != JobKind.DESCRIBE)
     with catalog.read() as session:
-        return session.scalar(select(func.count()).select_from(Job).where(*wanted)) or 0
+        return session.scalar(select(func.count()).select_from(Job).where(*conditions)) or 0
 
 
 def check_invariants(

@@ -156,14 +156,14 @@ class Traffic:
     ) -> dict[str, Any] | None:
         """Return the response body; None if the caller should retry."""
         number = caller % len(self._clients)
-        begun = time.monotonic()
+        started_at = time.monotonic()
         try:
             answer = self._clients[number].post(path, **options)
         except httpx2.TransportError as error:
             self.answers["away"] += 1
             if isinstance(error, httpx2.ReadTimeout):
                 self.answers["unexpected"] += 1
-                seconds = time.monotonic() - begun
+                seconds = time.monotonic() - started_at
                 self.details.append(f"{path} did not answer in {seconds:.0f} s")
             return None
         if answer.status_code in wanted:

@@ -161,7 +161,7 @@ def _median_seconds(do: Callable[[], object]) -> float:
     do()  # the first one fills caches
     took = []
     for _ in range(ROUNDS):
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         do()
-        took.append(time.perf_counter() - begun)
+        took.append(time.perf_counter() - started_at)
     return statistics.median(took)

@@ -93,6 +93,6 @@ def cached_share(snapshot: Snapshot) -> float:
 
 
 def _time_search(ours: PlacewiseSearch, question: BenchmarkQuery) -> tuple[float, Ranking]:
-    begun = time.perf_counter()
+    started_at = time.perf_counter()
     found = ours.search(question)
-    return time.perf_counter() - begun, found
+    return time.perf_counter() - started_at, found

@@ -216,9 +216,9 @@ def compare_methods(
                 expected = oracle.best(number, case.k, case.min_score)
                 for method in draw.sample(methods, len(methods)):
                     time.sleep(PAUSE_SECONDS)
-                    begun = time.perf_counter()
+                    started_at = time.perf_counter()
                     found = method.search(question)
-                    took[case.name][method.name].append(time.perf_counter() - begun)
+                    took[case.name][method.name].append(time.perf_counter() - started_at)
                     right = same_ranking if method.name in PLACEWISE_METHODS else same_photos
                     differ[case.name, method.name] += not right(found, expected)
                 speed.sample()

@@ -45,9 +45,9 @@ def measure_growth(
         scan_first_level(blocks, [query], [asked])
         with MemoryBandwidth(codes) as speed:
             for _ in range(ROUNDS):
-                begun = time.perf_counter()
+                started_at = time.perf_counter()
                 scan_first_level(blocks, [query], [asked])
-                took.append(time.perf_counter() - begun)
+                took.append(time.perf_counter() - started_at)
                 speed.sample()
                 progress.advance(task)
         seconds = median(took)

@@ -151,14 +151,14 @@ def _run_load(
             _send_query(world, caller, keys, number, TOP_KS[number], outcome)
         outcome.answered.clear()
         with ThreadPoolExecutor(CLIENTS + 1) as pool_of_threads:
-            begun = time.monotonic()
+            started_at = time.monotonic()
             calls = [
                 pool_of_threads.submit(_client_loop, world, caller, keys, number, outcome, stop)
                 for number in range(CLIENTS)
             ]
             calls.append(pool_of_threads.submit(_change_loop, world, pool, outcome, stop))
             try:
-                while (spent := time.monotonic() - begun) < seconds:
+                while (spent := time.monotonic() - started_at) < seconds:
                     progress.update(task, completed=spent)
                     if any(call.done() for call in calls):
                         break  # one of them has died: its error is raised below
@@ -167,7 +167,7 @@ def _run_load(
                 stop.set()
             for call in calls:
                 call.result()
-            outcome.seconds = time.monotonic() - begun
+            outcome.seconds = time.monotonic() - started_at
     return outcome
 
 
@@ -194,10 +194,10 @@ def _send_query(
 ) -> None:
     least = outcome.versions[-1]
     body = world.request(keys[query], k, least).model_dump_json().encode()
-    begun = time.perf_counter()
+    started_at = time.perf_counter()
     try:
         answer = caller.call("POST", "/search", body, **JSON_HEADERS)
-        took = time.perf_counter() - begun
+        took = time.perf_counter() - started_at
         if answer.status == 200:
             response = SearchResponse.model_validate_json(answer.body)
             outcome.answered.append(SearchObservation(query, k, least, response, took))

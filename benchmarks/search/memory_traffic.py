@@ -56,11 +56,11 @@ class MemoryBandwidth:
 
     def sample(self) -> None:
         """Read everything once in each way."""
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         _xor_words(self._words)
         alone = time.perf_counter()
         list(self._pool.map(_xor_words, self._parts))
-        self._took[0].append(alone - begun)
+        self._took[0].append(alone - started_at)
         self._took[1].append(time.perf_counter() - alone)
 
     @property
