@@ -72,7 +72,7 @@ def measure(
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
         _time_query(caller, photos[0])  # connections, and the query's own way
         _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
-        begun = _wait_for_chunks(fleet, 3)
+        since = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("asking", total=seconds)
         moments = random.Random(SEED)
         pause = 2 * milliseconds * batch / 1000
@@ -83,7 +83,7 @@ def measure(
             time.sleep(moments.uniform(0, pause))
             took.append(_time_query(caller, moments.choice(photos)))
         stages = _stage_seconds(fleet, took)
-        periods = _batch_seconds(fleet, begun, batch)
+        periods = _batch_seconds(fleet, since, batch)
         report.add("uploads still waiting at the end", _count_waiting_jobs(fleet), at_least=1)
         report.add("services that fell", len(fleet.crashed), at_most=0)
     spread, batch_ms = LatencySummary.of(took), 1000 * statistics.median(periods)
@@ -103,9 +103,9 @@ def measure(
 def _time_query(caller: HttpCaller, photo: bytes) -> float:
     """Return the seconds until the response; AssertionError if there is none."""
     form = multipart_form(photo)
-    begun = time.perf_counter()
+    sent_at = time.perf_counter()
     answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
-    took = time.perf_counter() - begun
+    took = time.perf_counter() - sent_at
     assert answer.status == 200, answer.body
     return took
 
@@ -166,12 +166,12 @@ def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
         time.sleep(0.1)
 
 
-def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
+def _batch_seconds(fleet: Fleet, since: datetime, batch: int) -> list[float]:
     """Return the time between commits of consecutive batches without a query between them."""
     with fleet.catalog.read() as session:
         commits = session.scalars(
             select(Chunk.created_at)
-            .where(Chunk.created_at >= begun, Chunk.rows == batch)  # the steward's have more
+            .where(Chunk.created_at >= since, Chunk.rows == batch)  # merged chunks have more
             .order_by(Chunk.created_at)
         ).all()
         queries = session.scalars(

@@ -171,8 +171,8 @@ def _server(home: Path, log: Path) -> Iterator[RunningServer]:
 def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Calls:
     """Make both calls in turn, each over a connection of its own."""
     calls = Calls()
-    size, began = log.stat().st_size, time.monotonic()
-    while (now := time.monotonic()) < began + seconds or not calls.uploads:
+    size, started_at = log.stat().st_size, time.monotonic()
+    while (now := time.monotonic()) < started_at + seconds or not calls.uploads:
         try:
             if len(calls.maps) <= len(calls.uploads):
                 _call(port, key, "GET", "/api/v1/maps")
@@ -185,7 +185,7 @@ def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Call
             (calls.maps if len(calls.maps) <= len(calls.uploads) else calls.uploads).append(
                 time.monotonic() - now
             )
-    calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - began) * 60
+    calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - started_at) * 60
     return calls
 
 
@@ -214,11 +214,11 @@ def _call(
 def _under(attack: Attack) -> Iterator[None]:
     """Run the attack in a process of its own, started SETTLE_SECONDS before the block."""
     context = multiprocessing.get_context("spawn")
-    begun = context.Event()
-    process = context.Process(target=_attack, args=(attack, begun))
+    started = context.Event()
+    process = context.Process(target=_attack, args=(attack, started))
     process.start()
     try:
-        if not begun.wait(START_SECONDS):
+        if not started.wait(START_SECONDS):
             raise Unavailable("attack_not_begun", "The process of the slow clients did not start.")
         time.sleep(SETTLE_SECONDS)
         yield
@@ -227,10 +227,10 @@ def _under(attack: Attack) -> Iterator[None]:
         process.join()
 
 
-def _attack(attack: Attack, begun: Event) -> None:
+def _attack(attack: Attack, started: Event) -> None:
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    begun.set()
+    started.set()
     asyncio.run(_attack_together(attack))
 
 

@@ -137,10 +137,10 @@ def _gateway_requests(
     near = f"{photo.latitude},{photo.longitude}"
 
     def ask(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
-        wanted = options.pop("params", {})
-        params = wanted if path.startswith("/maps") else {"map": LARGEST_MAP, **wanted}
-        said = "&".join(f"{name}={str(value)[:40]}" for name, value in wanted.items())
-        label = f"{method} {_path_template(path)}{'?' if said else ''}{said}"
+        own_params = options.pop("params", {})
+        params = own_params if path.startswith("/maps") else {"map": LARGEST_MAP, **own_params}
+        query = "&".join(f"{name}={str(value)[:40]}" for name, value in own_params.items())
+        label = f"{method} {_path_template(path)}{'?' if query else ''}{query}"
 
         def call() -> None:
             answer = client.request(method, f"/api/v1{path}", params=params, **options)
