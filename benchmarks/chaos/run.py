@@ -248,7 +248,7 @@ def _run_fault(
     recovery_seconds = time.monotonic() - repaired
     traffic.mark_searchable()
     with traffic.pause_queries():
-        # Questions whose gateway died are answered to nobody, but answered.
+        # The jobs of queries whose gateway was killed still complete, although nobody waits.
         _wait_until(deadline, lambda: not count_unfinished_jobs(fleet.catalog))
         counts = check_invariants(fleet.catalog, fleet.store, traffic.acknowledged)
     for known in moments.sample(traffic.known, min(QUERIES_PER_FAULT, len(traffic.known))):

@@ -35,7 +35,7 @@ def measure_cold_cache(
     A page that a process has mapped cannot be dropped. Its mapping is released first
     (MADV_DONTNEED), then the file's pages (posix_fadvise DONTNEED); `mincore` reports what remains.
     """
-    gc.collect()  # mappings of those who were asked before
+    gc.collect()  # releases the mappings of earlier searches
     task = bar.add_task("cold", total=queries)
     asked = city.revisits(len(world.photo_ids), queries)
     pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
