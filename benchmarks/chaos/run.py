@@ -84,24 +84,26 @@ def check_invariants(
     for sha256, photo_id in acknowledged.items():
         photo = photos.get(photo_id)
         if photo is None or photo.sha256 != sha256:
-            counts.details.append(f"{photo_id} was acknowledged, and the catalog has no such photo")
+            counts.details.append(f"acknowledged photo {photo_id} is not in the catalog")
         elif photo.object_key not in stored:
-            counts.details.append(f"{photo_id} was acknowledged, and its bytes are gone")
+            counts.details.append(f"acknowledged photo {photo_id} is not in the object store")
         elif not rows[photo_id]:
-            counts.details.append(f"{photo_id} was acknowledged, and has no descriptor")
+            counts.details.append(f"acknowledged photo {photo_id} has no descriptor")
         else:
             continue
         counts.lost += 1
-    by_bytes = Counter(photo.sha256 for photo in photos.values())
-    several = [sha256 for sha256, times in by_bytes.items() if times > 1]
-    doubled = [photo_id for photo_id, times in rows.items() if times > 1]
-    counts.twice = len(several) + len(doubled)
-    counts.details += [f"{sha256} is stored {by_bytes[sha256]} times" for sha256 in several]
-    counts.details += [f"{photo_id} has {rows[photo_id]} rows" for photo_id in doubled]
+    by_sha256 = Counter(photo.sha256 for photo in photos.values())
+    duplicates = [sha256 for sha256, times in by_sha256.items() if times > 1]
+    described_twice = [photo_id for photo_id, times in rows.items() if times > 1]
+    counts.twice = len(duplicates) + len(described_twice)
+    counts.details += [f"{sha256} is stored {by_sha256[sha256]} times" for sha256 in duplicates]
+    counts.details += [f"{photo_id} has {rows[photo_id]} rows" for photo_id in described_twice]
     for chunk in chunks:
         if not _is_intact(store, chunk):
             counts.torn += 1
-            counts.details.append(f"the chunk {chunk.object_key} is not what the catalog says")
+            counts.details.append(
+                f"chunk {chunk.object_key} does not match its hash in the catalog"
+            )
     return counts
 
 
@@ -113,7 +115,7 @@ def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:
     return hashlib.sha256(data).hexdigest() == chunk.sha256 and chunk.sha256.encode() in manifest
 
 
-RECOVERY_TIMEOUT_SECONDS = 180.0  # what has not recovered by then is counted as stuck
+RECOVERY_TIMEOUT_SECONDS = 180.0  # jobs that are unfinished after it count as stuck
 LEASE_SECONDS = 2.0
 POLL_SECONDS = 0.1
 QUERIES_PER_FAULT = (

@@ -197,15 +197,15 @@ def compare_methods(
     """Run all cases with `queries` queries each."""
     task = progress.add_task("asking", total=len(QUERY_CASES) * queries)
     photos = len(world.photo_ids)
-    asked = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
-    oracle = BruteForce.of(_stored_rows(world), world.photo_ids, asked)
+    query_rows = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
+    oracle = BruteForce.of(_stored_rows(world), world.photo_ids, query_rows)
     before = private_bytes()
     worker = load_worker(world)
     grown = private_bytes() - before
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
     draw = random.Random(city.seed)
-    with MemoryBandwidth() as speed, _make_methods(world, worker, asked) as (methods, ours):
+    with MemoryBandwidth() as speed, _make_methods(world, worker, query_rows) as (methods, ours):
         for case in QUERY_CASES:
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             took[case.name] = {method.name: [] for method in methods}

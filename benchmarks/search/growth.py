@@ -40,13 +40,13 @@ def measure_growth(
     for rows in sizes:
         codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
         blocks = _blocks(codes)
-        asked = np.ones(rows, bool)
+        mask = np.ones(rows, bool)
         took = []
-        scan_first_level(blocks, [query], [asked])
+        scan_first_level(blocks, [query], [mask])
         with MemoryBandwidth(codes) as speed:
             for _ in range(ROUNDS):
                 started_at = time.perf_counter()
-                scan_first_level(blocks, [query], [asked])
+                scan_first_level(blocks, [query], [mask])
                 took.append(time.perf_counter() - started_at)
                 speed.sample()
                 progress.advance(task)

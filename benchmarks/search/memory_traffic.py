@@ -114,9 +114,9 @@ def count_bytes_read() -> Iterator[ByteCounter]:
 
 
 def _distance_bytes(
-    _blocks: Any, _first: Any, asked: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
+    _blocks: Any, _first: Any, mask: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
 ) -> int:
-    rows = np.count_nonzero(asked[..., begin:end].reshape(-1, end - begin).any(axis=0))
+    rows = np.count_nonzero(mask[..., begin:end].reshape(-1, end - begin).any(axis=0))
     return 8 * int(query.shape[-1]) * int(rows)
 
 
