@@ -170,7 +170,7 @@ def vlad_in_loops(features: torch.Tensor, centres: torch.Tensor) -> NDArray[np.f
 TARGET_SPEEDUP = 2.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 TEXTURES = 32
-FIT_PHOTOS = 16  # further ones, enough for 64 centres: to be one's own centre leaves only rounding
+FIT_PHOTOS = 16  # other photos, enough for 64 centres; a photo must not be its own centre
 MATRIX_SIZE = {"cpu": 2048, "cuda": 8192}  # rows and columns
 MATRIX_ROUNDS = 5
 

@@ -33,7 +33,7 @@ TARGET_PATCH_COSINE = 0.999
 MAX_QUERY_DIFFERENCE = 1
 SIZE = 320, 240
 VIEWS = 2
-FIT_PHOTOS = 32  # photos, where no vocabulary is shipped
+FIT_PHOTOS = 32  # photos for fitting a vocabulary if none is shipped
 
 Rows = NDArray[np.float32]
 

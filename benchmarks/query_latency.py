@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 TARGET_MS_ABOVE_BATCH = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 DESCRIPTOR_DIMENSION = 7168
-TEXTURES = 64  # so that few of the rows that are found are equal
+TEXTURES = 64  # distinct photos, so that few of the retrieved rows are equal
 TIMEOUT_SECONDS = 120.0
 SEED = 20_261_121
 

@@ -42,7 +42,7 @@ KS = (1, 5, 10)
 BATCH = 16
 FIT_PHOTOS = 300
 SEED = 0
-TIMING_ROUNDS = 5  # whose candidates' features are made again, to time it
+TIMING_ROUNDS = 5  # rounds in which the candidates' features are computed again for timing
 
 Rows = NDArray[np.float32]
 Indices = NDArray[np.int64]

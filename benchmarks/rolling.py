@@ -39,7 +39,7 @@ ALL_SERVICES = (
     *("gateway-0", "gateway-1", "extractor-0", "extractor-1"),
     *("search-0-0", "search-0-1", "steward-0", "steward-1"),
 )
-PAUSE_SECONDS = 0.1  # of a client between two requests: a load, not a race for the processors
+PAUSE_SECONDS = 0.1  # between a client's requests, so that the CPU is not saturated
 TIMEOUT_SECONDS = 120.0
 BATCH = 4
 TEXTURES = 16

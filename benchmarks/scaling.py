@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TARGET_EFFICIENCY = 0.9
 CLIENTS = 4
 MAX_WARM_UP_ROUNDS = 10
-COMPACTION_DISABLED = 1_000_000  # chunks stay as the extractors wrote them
+COMPACTION_DISABLED = 1_000_000  # keeps the chunks as the extractors wrote them
 TIMEOUT_SECONDS = 900.0  # for one round
 
 

@@ -36,19 +36,19 @@ from shared.errors import Unavailable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_RATIO = 5.0  # of the p95 without an attack
+WANTED_RATIO = 5.0  # maximum p95 relative to the p95 without an attack
 WANTED_LOG_BYTES_PER_MINUTE = 1_000_000
 START_SECONDS = 60.0
-SETTLE_SECONDS = 10.0  # until the attack has opened what it can
-CALL_SECONDS = 30.0  # a call that takes longer has failed
-REOPEN_SECONDS = 5.0  # until a client comes back whose connection was closed
+SETTLE_SECONDS = 10.0  # time for the attack to open its connections
+CALL_SECONDS = 30.0  # timeout of a call
+REOPEN_SECONDS = 5.0  # delay before a closed connection is reopened
 WATCHED_JOBS = 50
-CALLERS = 5  # keys and addresses of the event streams: one key may have only a part of all
+CALLERS = 5  # keys and addresses of the event streams, whose number is limited per key
 OPEN_FILES = 1024
 BODY_BYTES = 5_000_000
-EXTRACTOR = "test-tiny-vlad"  # its jobs wait for a vocabulary, and so streams of them go on
+EXTRACTOR = "test-tiny-vlad"  # its jobs wait for a vocabulary, so their event streams stay open
 SLOW_ADDRESS, STREAM_ADDRESS = "127.0.1.1", "127.0.2.{}"  # of the clients
-ADDRESS = "127.0.0.1"  # of the idle connections and of the calls that are timed
+ADDRESS = "127.0.0.1"  # source address of the idle connections and of the timed calls
 
 
 @dataclass(slots=True)

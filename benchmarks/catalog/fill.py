@@ -20,7 +20,7 @@ from shared.ids import new_id
 MAPS = 10
 LARGEST_MAP, SECOND_MAP = "map-0", "map-1"
 SLOT_ROWS = 1000
-WAITING_JOB_SHARE = 0.01  # of the photos: uploaded a moment ago, not described yet
+WAITING_JOB_SHARE = 0.01  # share of photos just uploaded and not described yet
 
 # The n-th row of a kind, from 30 days ago until now.
 CREATED_AT_SQL = "now() - interval '30 days' * (1 - n::float8 / :photos)"

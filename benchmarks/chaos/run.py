@@ -118,10 +118,8 @@ def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:
 RECOVERY_TIMEOUT_SECONDS = 180.0  # jobs that are unfinished after it count as stuck
 LEASE_SECONDS = 2.0
 POLL_SECONDS = 0.1
-QUERIES_PER_FAULT = (
-    10  # known photos that are asked for after each fault, beside those asked for meanwhile
-)
-MAX_FAULT_DELAY_SECONDS = 0.5  # at most: how long the fault waits for uploads to be under way
+QUERIES_PER_FAULT = 10  # queries after each fault, in addition to those during it
+MAX_FAULT_DELAY_SECONDS = 0.5  # the fault starts this long after the uploads at the latest
 
 
 @dataclass(slots=True)

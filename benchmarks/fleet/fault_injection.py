@@ -20,8 +20,8 @@ from redis.exceptions import RedisError
 from shared.jobs.wakeups import WakeupQueue
 
 CHUNK_BYTES = 65_536
-CUT_AFTER_BYTES = 700  # within a photo or a chunk, after the head of its request
-SLOW_DELAY_SECONDS = 0.05  # for each piece
+CUT_AFTER_BYTES = 700  # inside the body of a photo or chunk, after the request's headers
+SLOW_DELAY_SECONDS = 0.05  # per chunk of data
 SLOW_CHUNK_BYTES = 2_048
 DISK_FULL_RESPONSE = (
     b"HTTP/1.1 507 Insufficient Storage\r\nContent-Type: application/xml\r\n"

@@ -10,7 +10,7 @@ from shared.config.settings import Settings
 from shared.search_api.client import MAX_CONCURRENT_CALLS
 
 LOADING_SECONDS = 600.0
-STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: after which it is started again
+STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: it is restarted after this time
 CHANGE_SECONDS = 0.5  # services/steward/scheduler.py, "advance model changes"
 STATEMENT_SECONDS = float(Settings.model_fields["database_work_seconds"].default)
 FOLLOW_SECONDS = float(Settings.model_fields["search_follow_seconds"].default)

@@ -14,7 +14,7 @@ from shared.storage.chunks import encode_rows
 MONTH_HOURS = 730.0
 DAY_SECONDS = 86_400.0
 MONTH_SECONDS = MONTH_HOURS * 3600
-MANIFEST_ROW_BYTES = 40  # a photo's id in the `.json` beside its chunk
+MANIFEST_ROW_BYTES = 40  # a photo's id in the chunk's `.json` manifest
 SLOT_ROWS = int(Settings.model_fields["slot_rows"].default)
 LEAST_CATALOG_RAM_BYTES = 8e9
 

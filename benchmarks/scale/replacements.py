@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from benchmarks.scale.inputs import Inputs
 
 DIMENSION = 98_304
-GPU_BYTES_PER_SECOND = 0.8 * 4.8e12  # four fifths of an H200's
+GPU_BYTES_PER_SECOND = 0.8 * 4.8e12  # 80 % of an H200's memory bandwidth
 ON_PAPER = "on paper"
 ALONE = "measured alone, not built"
 

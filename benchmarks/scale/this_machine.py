@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 CHUNK_ROWS = 1000
-CHUNKS = {7168: 20, 98_304: 2}  # 573 and 786 MB: far beyond every cache
+CHUNKS = {7168: 20, 98_304: 2}  # 573 and 786 MB: larger than any CPU cache
 ROUNDS = 7
 LISTED = 5000
 SEED = 20_261_121

@@ -42,7 +42,7 @@ from shared.storage.chunks import Rows
 PLACEWISE_METHODS = (PlacewiseSearch.name, PlacewiseWorker.name)
 TARGET_MAP_SIZE = (10_000, 98_304)
 """Photos and dimension for which figures are wanted."""
-NOISE_FACTOR = 1.1  # of two medians of one run: less is the clock's noise
+NOISE_FACTOR = 1.1  # ratio of two medians of a run; smaller differences are timing noise
 
 
 @dataclass(frozen=True, slots=True)

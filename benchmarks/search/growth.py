@@ -19,7 +19,7 @@ from shared.codes.sign_codes import level_ends
 DIMENSION = 98_304
 MEASURED_SIZES = (100_000, 1_000_000)
 EXTRAPOLATED_SIZES = (3_000_000, 10_000_000)
-BLOCK_ROWS = 1000  # of a chunk
+BLOCK_ROWS = 1000  # rows per chunk
 ROUNDS = 15
 TARGET_RATIO = 1.3
 SEED = 20_261_121

@@ -37,10 +37,10 @@ CLIENTS = 32
 QUERIES = 48
 OUT_OF_MAP_QUERIES = 16  # of them
 TOP_KS = (1, 10, 100)
-ADDED_PHOTOS = 240  # photos that are added meanwhile
+ADDED_PHOTOS = 240  # photos that are added during the load
 CHANGE_SECONDS = 0.25
 CHANGES_PER_MERGE = 20
-MAX_SIMILARITY = 0.8  # how much of another photo is in one that is added
+MAX_SIMILARITY = 0.8  # maximum share of another photo's content in an added photo
 SEED = 20_261_121
 JSON_HEADERS = {"Content-Type": "application/json"}
 

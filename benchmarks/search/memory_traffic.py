@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from services.search import kernels
 from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
-STREAM_BYTES = 256_000_000  # beyond every cache
+STREAM_BYTES = 256_000_000  # larger than any CPU cache
 
 Words = NDArray[np.uint64]
 

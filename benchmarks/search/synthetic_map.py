@@ -204,12 +204,12 @@ WALK_PHOTOS = 250
 PHOTOS_PER_PLACE = (1, 3, 30)
 """Of walk number n: the entry n modulo 3."""
 
-SUBSPACE = 110  # dimensions of a block's subspace, at most; half of the block's own
-DECAY = 0.6  # the strength of its i-th direction is i^-DECAY
-SHARED = 0.42  # strength of the shared direction, against 1 of the subspace
-NOISE = 0.5  # of what no other photo repeats
-EMPTY_BELOW = -0.583  # of a normal deviate: 28 % of the blocks
-WORD_COUNT_SPREAD = 0.22  # how much photos differ in the number of their words
+SUBSPACE = 110  # maximum dimension of a block's subspace; otherwise half of the block's width
+DECAY = 0.6  # the standard deviation of its i-th direction is i^-DECAY
+SHARED = 0.42  # strength of the shared direction relative to the subspace
+NOISE = 0.5  # strength of the noise of a single photo
+EMPTY_BELOW = -0.583  # threshold of a normal deviate; leaves 28 % of the blocks empty
+WORD_COUNT_SPREAD = 0.22  # spread of the number of words per photo
 STRONG_CHANNELS = 0.01
 STRENGTH = 9.0  # of their noise
 
@@ -218,7 +218,7 @@ NEXT_PLACE_CORRELATION = 0.85
 MIN_CHANGE, MAX_CHANGE = 0.05, 0.6
 """Of the appearance of a place that is seen again: the share of the latent variance."""
 
-OUT_OF_MAP_WALKS = 1_000_000  # numbers of walks that are in no map
+OUT_OF_MAP_WALKS = 1_000_000  # first number of walks that are in no map
 
 Floats = NDArray[np.float32]
 
