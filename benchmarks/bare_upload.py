@@ -1,8 +1,8 @@
-"""The least that an upload can be: a form's file, into the S3 store, an answer.
+"""Minimal FastAPI upload server, the baseline of `bench pipeline`: stores a form's file in S3.
 
     python -m benchmarks.bare_upload PORT    (with the S3_ settings in the environment)
 
-What `bench pipeline` compares the gateway with. Nothing is checked, counted, hashed or remembered.
+It does not validate, count, hash or record anything.
 """
 
 from __future__ import annotations

@@ -1,15 +1,11 @@
-"""`make demo`: a made-up city, indexed, fitted, evaluated and asked, from nothing to a picture.
+"""`make demo`: indexes a generated city, fits, evaluates, queries, and draws a picture.
 
     python -m benchmarks.demo [--places 300] [--picture docs/demo.jpg]
 
-Half of the city's queries are uploaded as labelled queries, so that the map learns what its scores
-mean; the other half it has never seen: they are asked as a user's photos, and what is printed of
-them is what a user would get. Every figure is of a generated place: not comparable with published
-figures.
-
-Asking as a user does, with photos whose place is known, and what the answers were worth.
-
-A picture of queries and what was found: each query above its best match.
+Half of the city's queries are uploaded as labelled queries, with which the map's confidence is
+calibrated. The other half is held out and queried as a user's photos; the printed results are those
+that a user would get. All metrics are of a generated city and are not comparable with published
+results.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ CORRECT_WITHIN_M = 25.0
 
 @dataclass(frozen=True, slots=True)
 class QueryOutcome:
-    """One query photo, its truth and its answer."""
+    """A query photo with its ground truth and its result."""
 
     query: Path
     in_map: bool
@@ -50,7 +46,7 @@ class QueryOutcome:
     best_is_correct: bool
     estimate: Json
     error_m: float | None
-    """From the truth to the estimate; None where it gave no place."""
+    """Distance of the estimate from the ground truth; None without an estimated location."""
 
     @property
     def right(self) -> bool:
@@ -60,7 +56,7 @@ class QueryOutcome:
 def query_with_photo(
     client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
 ) -> QueryOutcome:
-    """Ask with a photo that is not stored, and compare the answer with what its name says."""
+    """Query with a photo that is not stored, and compare the result with its ground truth."""
     truth = _location(query.fields)
     answer = client.similar_to_file(query.path, top_k=1)
     best, estimate = answer["similar_images"][0], answer["estimate"]
@@ -75,26 +71,30 @@ def query_with_photo(
 
 
 def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
-    """Recall, false accepts and the confidence's figures; the latter None while uncalibrated."""
-    here = [a for a in outcomes if a.in_map]
+    """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
+    inside = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
     accepted = [a for a in outcomes if a.estimate["in_map"]]
     errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    said = [a.estimate["confidence"] for a in outcomes]
-    # Without a place no estimate is right; the best photo then stands for what was found.
+    confidences = [a.estimate["confidence"] for a in outcomes]
+    # Without an estimated location, the best photo decides whether the result is correct.
     right = [a.right or (a.estimate["in_map"] is False and a.best_is_correct) for a in outcomes]
-    known = None not in said
+    is_calibrated = None not in confidences
     return {
         "queries": len(outcomes),
         "out_of_map": len(outside),
-        "R@1": _ratio(sum(a.best_is_correct for a in here), len(here)),
+        "R@1": _ratio(sum(a.best_is_correct for a in inside), len(inside)),
         "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
-        "accepted_in_map": _ratio(sum(bool(a.estimate["in_map"]) for a in here), len(here)),
+        "accepted_in_map": _ratio(sum(bool(a.estimate["in_map"]) for a in inside), len(inside)),
         "false_accepts": _ratio(sum(bool(a.estimate["in_map"]) for a in outside), len(outside)),
         "median_error_m": median(errors) if errors else None,
-        "calibration_error": expected_calibration_error(said, right) if known else None,
-        "auroc": auroc(said, right) if known else None,
-        "recall_at_99_precision": recall_at_precision(said, right, len(here)) if known else None,
+        "calibration_error": (
+            expected_calibration_error(confidences, right) if is_calibrated else None
+        ),
+        "auroc": auroc(confidences, right) if is_calibrated else None,
+        "recall_at_99_precision": (
+            recall_at_precision(confidences, right, len(inside)) if is_calibrated else None
+        ),
     }
 
 
@@ -105,9 +105,9 @@ def _location(fields: Json) -> PhotoLocation:
     return PhotoLocation(float(latitude), float(longitude), None)
 
 
-def _is_near(one: PhotoLocation, other: PhotoLocation) -> bool:
-    away = distance_between_m(one, other)
-    return away is not None and away <= CORRECT_WITHIN_M
+def _is_near(a: PhotoLocation, b: PhotoLocation) -> bool:
+    distance = distance_between_m(a, b)
+    return distance is not None and distance <= CORRECT_WITHIN_M
 
 
 def _ratio(part: int, whole: int) -> float | None:
@@ -123,8 +123,10 @@ CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), 
 
 
 def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
-    """Write a JPEG: queries in the upper rows, under each its most similar photo, framed green
-    where it shows the place, red where not, grey where the answer was "not in this map"."""
+    """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
+
+    The frame is green for a correct match, red for a wrong one, grey for "not in this map".
+    """
     chosen = _choose_outcomes(outcomes)
     width = COLUMNS * (CELL[0] + GAP) + GAP
     block = 2 * CELL[1] + 2 * CAPTION + 2 * GAP
@@ -149,7 +151,7 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
-    """Two rows: mostly what it was sure of and right, then where it was wrong, then strangers."""
+    """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
     given = [a for a in outcomes if a.estimate["in_map"]]
     right = [a for a in given if a.best_is_correct]
     wrong = [a for a in given if not a.best_is_correct]
@@ -195,21 +197,25 @@ def main() -> None:
         city = Path(folder, "city")
         _draw_city(options, city, progress)
         with connect(None, None) as client:
-            asked = _run_demo(client, city, progress)
-        _print_outcomes(asked)
+            outcomes = _run_demo(client, city, progress)
+        _print_outcomes(outcomes)
         if options.picture:
-            draw_outcomes(asked, city / "database", options.picture)
+            draw_outcomes(outcomes, city / "database", options.picture)
             print(f"Queries and their matches: {options.picture}")
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="From a made-up city to answers.")
+    parser = argparse.ArgumentParser(description="Index and query a generated city.")
     parser.add_argument("--places", type=int, default=300)
-    parser.add_argument("--views", type=int, default=3, help="database photos of a place")
-    parser.add_argument("--queries", type=int, default=400, help="half of them labelled")
-    parser.add_argument("--out-of-map", type=float, default=0.2, help="share of the queries")
+    parser.add_argument("--views", type=int, default=3, help="database photos per place")
+    parser.add_argument(
+        "--queries", type=int, default=400, help="number of queries, half of them labelled"
+    )
+    parser.add_argument(
+        "--out-of-map", type=float, default=0.2, help="share of queries outside the map"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, help="where to draw queries and matches")
+    parser.add_argument("--picture", type=Path, help="JPEG file of queries and matches to write")
     return parser.parse_args()
 
 
@@ -232,7 +238,7 @@ def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> N
 
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
-    """Index, evaluate, fit, evaluate, ask; prints recall before and after the fit."""
+    """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
     from services.cli.client import wait_for_job
     from services.cli.descriptors.vocabulary import fit_and_wait
     from services.cli.ingest.geotags import find_photos
@@ -251,30 +257,33 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
         found = job["result"]["labelled_queries"]
         shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
         print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
-    bar = progress.add_task("asking", total=len(queries[1::2]))
-    asked = []
+    bar = progress.add_task("querying", total=len(queries[1::2]))
+    outcomes = []
     for query in queries[1::2]:
-        asked.append(query_with_photo(client, query, database))
+        outcomes.append(query_with_photo(client, query, database))
         progress.advance(bar)
-    return asked
+    return outcomes
 
 
 def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
-    found = summarise_outcomes(outcomes)
-    print(f"{found['queries']} photos that it had never seen, {found['out_of_map']} out of map:")
-    print(f"  right place first, of those in the map    {found['R@1']:.1%}")
+    summary = summarise_outcomes(outcomes)
+    right_of_accepted = _format_percent(summary["right_of_accepted"])
+    print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
+    print(f"  R@1 of queries in the map                 {summary['R@1']:.1%}")
+    print(f"  precision of the accepted estimates       {right_of_accepted}")
     print(
-        f"  of the estimates that it gave, right      {_format_percent(found['right_of_accepted'])}"
+        f"  accepted queries in the map               {_format_percent(summary['accepted_in_map'])}"
     )
     print(
-        f"  places in the map that it gave            {_format_percent(found['accepted_in_map'])}"
+        f"  false accepts from outside the map        {_format_percent(summary['false_accepts'])}"
     )
-    print(f"  false accepts of photos out of map        {_format_percent(found['false_accepts'])}")
-    print(f"  median error of the right ones            {found['median_error_m']:.1f} m")
-    if found["calibration_error"] is not None:
-        print(f"  calibration error of the confidence       {found['calibration_error']:.3f}")
-        print(f"  AUROC                                     {found['auroc']:.3f}")
-        print(f"  recall at 99 % precision                  {found['recall_at_99_precision']:.1%}")
+    print(f"  median error of the correct estimates     {summary['median_error_m']:.1f} m")
+    if summary["calibration_error"] is not None:
+        print(f"  calibration error (ECE)                   {summary['calibration_error']:.3f}")
+        print(f"  AUROC                                     {summary['auroc']:.3f}")
+        print(
+            f"  recall at 99 % precision                  {summary['recall_at_99_precision']:.1%}"
+        )
 
 
 def _format_percent(share: float | None) -> str:

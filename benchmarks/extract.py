@@ -1,21 +1,18 @@
-"""How fast photos become rows here, beside AnyLoc as published, and beside what the device can do.
+"""Benchmark of descriptor extraction: Placewise, AnyLoc as published, and the device's peak rate.
 
-JPEG bytes go in, rows come out; both ways take the same photos in turn, so that whatever else the
-machine does meets both; on a CPU that has other work their CPU time tells more. The ceiling is the
-rate of large matrix products in the same precision.
+JPEG bytes go in, descriptors come out. Both implementations process the same photos in alternating
+rounds, so that other load on the machine affects both; on a busy CPU, compare their CPU times. The
+peak rate is that of large matrix products in the same precision.
 
-Extractors to measure: with the weights that are here, or with random ones where there are none.
+Extractors use the weights that are installed, or random weights if there are none. Random weights
+need the same time and memory, and allow the numerical difference of the implementations to be
+measured; their retrieval results are meaningless.
 
-Random weights take the same time and memory, and say how far two ways of computing are apart. What
-they find means nothing.
-
-AnyLoc as its authors publish it, written from the description in their paper and code: what
-`bench extract` compares with.
-
-One photo after the other, float32, the whole network although a hook takes the features in its
-middle, and VLAD in a loop over the clusters with every residual in memory. On a CPU attention is
-written out, as in Meta's code there; on a GPU it is fused, as with xFormers. Photos are decoded and
-brought to size as ours, so that both make the same descriptor.
+The AnyLoc baseline follows the description in the authors' paper and code: one photo at a time,
+float32, the whole network although a hook takes the features from the middle, and VLAD as a loop
+over the clusters with all residuals in memory. Attention is written out on a CPU, as in Meta's
+code, and fused on a GPU, as with xFormers. Photos are decoded and resized as in Placewise, so that
+both compute the same descriptor.
 """
 
 from __future__ import annotations
@@ -64,7 +61,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkedExtractor:
-    """What is measured, and with which weights."""
+    """An extractor with its weights."""
 
     recipe: ExtractorConfig
     device: torch.device
@@ -74,8 +71,10 @@ class BenchmarkedExtractor:
 
     @classmethod
     def of(cls, extractor: str, device: str, folder: Path) -> BenchmarkedExtractor:
-        """`folder` takes random weights, where there are no others. Raises Misconfigured for an
-        extractor or a device that can't be had.
+        """Load an extractor; `folder` receives random weights if no others are installed.
+
+        Raises:
+            Misconfigured: the extractor or the device is not available.
         """
         settings = read_settings()
         recipe = settings.recipe(extractor)
@@ -107,7 +106,7 @@ class BenchmarkedExtractor:
 
 
 def fit_or_load_centres(extractor: Extractor, photos: list[Pixels]) -> ClusterCentres | None:
-    """The shipped ones, or learnt from the photos where some are needed and none are shipped."""
+    """Return the shipped cluster centres, or fit them on the photos if the extractor needs some."""
     if not extractor.recipe.needs_vocabulary:
         return None
     shipped = extractor.shipped_vocabulary()
@@ -158,7 +157,7 @@ class ReferenceAnyLoc:
 
 
 def vlad_in_loops(features: torch.Tensor, centres: torch.Tensor) -> NDArray[np.float32]:
-    """(patches, width) unit features, (K, width) -> (K * width) of length 1."""
+    """Compute (K * width,) unit VLAD of (patches, width) unit features and (K, width) centres."""
     labels = (features @ normalize(centres, dim=-1).T).argmax(dim=-1).cpu()
     residuals = features[:, None] - centres[None]  # (patches, K, width)
     blocks = torch.zeros_like(centres)
@@ -171,7 +170,7 @@ def vlad_in_loops(features: torch.Tensor, centres: torch.Tensor) -> NDArray[np.f
 TARGET_SPEEDUP = 2.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 TEXTURES = 32
-FIT_PHOTOS = 16  # further ones, enough for 64 centres: to be one's own centre leaves only rounding
+FIT_PHOTOS = 16  # other photos, enough for 64 centres; a photo must not be its own centre
 MATRIX_SIZE = {"cpu": 2048, "cuda": 8192}  # rows and columns
 MATRIX_ROUNDS = 5
 
@@ -188,8 +187,9 @@ def measure(
     precision: Literal["auto", "float32", "bfloat16"],
     rounds: int,
 ) -> Report:
-    """`rounds` of `photos` by either way. Only `anyloc-` extractors with hard VLAD are published,
-    and compared; of others our own figures are told.
+    """Run `rounds` of `photos` with both implementations.
+
+    Only `anyloc-` extractors with hard VLAD are published and compared; others are only measured.
     """
     made = make_jpegs(FIT_PHOTOS + min(TEXTURES, photos), SIZE, SIZE_BYTES)
     textures = made[FIT_PHOTOS:]
@@ -260,7 +260,7 @@ def _run_rounds(
 
 
 class ExtractionPipeline:
-    """As the extractor does it: decoding children are a batch ahead of the network."""
+    """The extractor service's pipeline: decoder processes work one batch ahead of the network."""
 
     def __init__(self, made: Extractor, decoders: DecoderPool, batch: int) -> None:
         self.made = made
@@ -302,22 +302,22 @@ def _open_pipeline(
 
 @dataclass(slots=True)
 class RoundTimings:
-    """Of one way, a round after the other."""
+    """Timings of one implementation by round."""
 
     seconds: list[float] = field(default_factory=list)
     cpu_seconds: list[float] = field(default_factory=list)
     """With those of the decoding children."""
 
     def take(self, do: Callable[[], Rows]) -> Rows:
-        """What it makes. Rows lie on the CPU: a GPU has ended, too."""
-        begun, cpu_begun = time.perf_counter(), _cpu_seconds()
+        """Return the descriptors on the CPU, which also waits for the GPU."""
+        started_at, cpu_begun = time.perf_counter(), _cpu_seconds()
         rows = do()
-        self.seconds.append(time.perf_counter() - begun)
+        self.seconds.append(time.perf_counter() - started_at)
         self.cpu_seconds.append(_cpu_seconds() - cpu_begun)
         return rows
 
     def cpu_milliseconds(self, photos: int) -> float:
-        """Of one photo."""
+        """CPU time per photo."""
         return 1000 * statistics.median(self.cpu_seconds) / photos
 
 
@@ -327,7 +327,7 @@ def _cpu_seconds() -> float:
 
 
 def _count_flops(made: Extractor, photo: Pixels) -> float:
-    """Floating-point operations of the backbone for one photo; a product and its sum are two."""
+    """Count the backbone's floating-point operations per photo; a multiply-add counts as two."""
     # Fused attention is not counted on every device; written out, it always is.
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         made.features(photo[None])
@@ -335,16 +335,16 @@ def _count_flops(made: Extractor, photo: Pixels) -> float:
 
 
 def _matmul_flops_per_second(device: torch.device, precision: Precision) -> float:
-    """The best of some products of two square matrices, in operations per second."""
+    """Return the best rate of several products of two square matrices, in operations per second."""
     side = MATRIX_SIZE[device.type]
     kind = torch.float32 if precision == "float32" else torch.bfloat16
     one = torch.rand(side, side, device=device, dtype=kind)
     best = 0.0
     with autocast("float32", device):
         for _ in range(MATRIX_ROUNDS):
-            begun = time.perf_counter()
+            started_at = time.perf_counter()
             (one @ one)[0, 0].item()  # waits for the device
-            best = max(best, 2 * side**3 / (time.perf_counter() - begun))
+            best = max(best, 2 * side**3 / (time.perf_counter() - started_at))
     return best
 
 
@@ -356,7 +356,7 @@ def _reset_peak_memory(device: torch.device) -> None:
 
 
 def _peak_memory_bytes(device: torch.device) -> float:
-    """Bytes: of the GPU's memory, or of this process without its decoders."""
+    """Return the peak bytes of GPU memory, or of this process without its decoders."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return memory_bytes("VmHWM")

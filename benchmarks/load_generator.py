@@ -1,9 +1,7 @@
-"""Photos as clients send them, and a client that costs next to nothing itself.
+"""Load generator: synthetic JPEGs, an HTTP client with little overhead, counts of described photos.
 
-What is measured shares the machine with who measures: bodies are built before the clock starts, and
-are sent over kept connections without a framework.
-
-What the extractors have done, as the catalog and the store tell it.
+The client shares the machine with the measured services. Request bodies are therefore built before
+the clock starts, and are sent over persistent connections without a framework.
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ class HttpResponse:
 
 
 class HttpCaller:
-    """Calls one server over a connection of each thread's own; a context manager."""
+    """HTTP client of one server with a persistent connection per thread; a context manager."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -75,14 +73,14 @@ class HttpCaller:
         self.close()
 
     def close(self) -> None:
-        """When the threads that use it have ended."""
+        """Close the connections; call it after the threads that use them have ended."""
         for connection in self._connections:
             connection.close()
 
     def call(
         self, method: str, path: str, body: bytes | None = None, **headers: str
     ) -> HttpResponse:
-        """The answer, whatever its status; OSError or HTTPException when there is none."""
+        """Return the response of any status; OSError or HTTPException if there is none."""
         connection: HTTPConnection | None = getattr(self._own, "connection", None)
         if connection is None:
             connection = HTTPConnection(*self._address, timeout=TIMEOUT_SECONDS)
@@ -101,13 +99,13 @@ class HttpCaller:
 
 
 def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
-    """JPEGs of about `size_bytes`, each of another texture."""
+    """Create JPEGs of about `size_bytes`, each with another texture."""
     rng = np.random.default_rng(0)
     return [_make_jpeg(rng, size, size_bytes) for _ in range(count)]
 
 
 def _make_jpeg(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> bytes:
-    """The coarse half makes photos differ, the fine half fills the file as a street does."""
+    """Combine coarse noise (makes photos differ) with fine noise (gives a realistic file size)."""
     width, height = size
     coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
     fine = Image.fromarray(rng.integers(0, 256, (height // 4, width // 4, 3), dtype=np.uint8))
@@ -132,8 +130,10 @@ def _encode_jpeg(image: Image.Image, quality: int) -> bytes:
 
 
 def multipart_form(photo: bytes, filename: str = "photo.jpg") -> bytes:
-    """A multipart form with the photo, as a file that was never sent before: what follows a JPEG's
-    end changes its hash and no pixel."""
+    """Build a multipart form with the photo as a unique file.
+
+    Bytes after the end of the JPEG change its hash but no pixel.
+    """
     head = (
         f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="file"; filename="{filename}"\r\n'
         "Content-Type: image/jpeg\r\n\r\n"
@@ -156,8 +156,11 @@ def upload_all(
     path: str = "/api/v1/upload",
     on_done: Callable[[], object] = lambda: None,
 ) -> list[Any]:
-    """Upload each from one of `clients` threads; the answers' JSON. AssertionError when one is
-    not accepted."""
+    """Upload all files with `clients` threads and return the JSON responses.
+
+    Raises:
+        AssertionError: an upload was not accepted.
+    """
     with HttpCaller(url) as caller:
 
         def upload(form: bytes) -> Any:
@@ -175,11 +178,11 @@ MANIFEST_SUFFIX = ".json"
 
 
 def count_descriptions(store: ObjectStore) -> Counter[UUID]:
-    """How often each photo was described.
+    """Count how often each photo was described.
 
-    A worker writes its chunk, with a manifest that names the photos, before it asks whether it may
-    commit: work that was done twice shows here although only one of the two was let in. That holds
-    while the steward merges nothing (COMPACT_CHUNKS, SLOT_ROWS).
+    A worker writes its chunk and a manifest of its photos before it tries to commit. Duplicate work
+    is therefore counted even if only one of two workers could commit. The counts are valid while
+    the steward does not merge chunks (COMPACT_CHUNKS, SLOT_ROWS).
     """
     found: Counter[UUID] = Counter()
     for info in store.list("chunks/"):
@@ -191,8 +194,11 @@ def count_descriptions(store: ObjectStore) -> Counter[UUID]:
 def wait_for_jobs(
     catalog: Catalog, seconds: float, on_left: Callable[[int], object] = lambda left: None
 ) -> None:
-    """Until every photo that is stored is described. AssertionError when it takes longer, or when
-    one fails."""
+    """Wait until every stored photo is described.
+
+    Raises:
+        AssertionError: a job failed, or the timeout has passed.
+    """
     deadline = time.monotonic() + seconds
     while True:
         with catalog.read() as session:
@@ -213,6 +219,6 @@ def wait_for_jobs(
 
 
 def load_jobs(catalog: Catalog, job_ids: Collection[UUID]) -> list[Job]:
-    """These jobs, as they are now."""
+    """Load the current state of jobs."""
     with catalog.read() as session:
         return list(session.scalars(select(Job).where(Job.id.in_(job_ids))))

@@ -1,6 +1,6 @@
-"""What everything around the model costs: CPU time of a photo from its upload until it is found.
+"""Benchmark of the pipeline's overhead: CPU time per photo from upload to searchable.
 
-And how many uploads a gateway takes beside a bare FastAPI that only stores the file.
+Also compares the upload rate of a gateway with that of a bare FastAPI server that stores the file.
 """
 
 from __future__ import annotations
@@ -42,22 +42,24 @@ SERVICES = ("gateway", "extractor", "search", "steward")
 def measure(
     progress: Progress, *, widths: Sequence[int], photos: int, batch: int, rounds: int
 ) -> Report:
-    """`photos` of 100 kB at each width of descriptors, `batch` at once; then `rounds` of uploads
-    to the gateway and to the bare one in turn."""
+    """Measure `photos` of 100 kB per descriptor width in batches of `batch`; then upload rates.
+
+    Uploads go to the gateway and to the bare server in `rounds` alternating rounds.
+    """
     report = Report("Around the model, for each photo")
-    made = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
+    jpegs = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
     with start_servers() as servers:
         for width in widths:
             with _open_fleet(servers, width, batch) as fleet:
                 fleet.start()
                 bar = progress.add_task(f"{width:,} dimensions", total=photos)
-                _measure_cpu(report, fleet, made, width, photos, batch, progress, bar)
+                _measure_cpu(report, fleet, jpegs, width, photos, batch, progress, bar)
         with _open_fleet(servers, widths[0], batch) as fleet:
             bar = progress.add_task("gateway beside a bare one", total=2 * rounds * photos)
             fleet.start("search-0-0", "gateway-0")
-            _measure_uploads(report, fleet, made, photos, rounds, lambda: progress.advance(bar))
+            _measure_uploads(report, fleet, jpegs, photos, rounds, lambda: progress.advance(bar))
     report.details = {
-        "photo_bytes": statistics.mean(len(photo) for photo in made),
+        "photo_bytes": statistics.mean(len(photo) for photo in jpegs),
         "photos": photos,
         "batch": batch,
     }
@@ -85,18 +87,18 @@ def _test_extractor(width: int) -> str:
 def _measure_cpu(
     report: Report,
     fleet: Fleet,
-    made: Sequence[bytes],
+    jpegs: Sequence[bytes],
     width: int,
     photos: int,
     batch: int,
     progress: Progress,
     bar: object,
 ) -> None:
-    _upload_and_wait(fleet, made, 2 * batch, lambda left: None)  # models, decoders, connections
+    _upload_and_wait(fleet, jpegs, 2 * batch, lambda left: None)  # models, decoders, connections
     before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
     _upload_and_wait(
         fleet,
-        made,
+        jpegs,
         photos,
         lambda left: progress.update(bar, completed=photos - left),  # type: ignore[arg-type]
     )
@@ -122,40 +124,39 @@ def _measure_cpu(
         report.add(f"{name} {at}", used, "ms")
 
 
-def _upload_and_wait(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
-    """Upload, and wait until all of it can be found."""
-    forms = [multipart_form(made[number % len(made)]) for number in range(photos)]
+def _upload_and_wait(fleet: Fleet, jpegs: Sequence[bytes], photos: int, on_left: object) -> None:
+    """Upload the photos and wait until all are searchable."""
+    forms = [multipart_form(jpegs[number % len(jpegs)]) for number in range(photos)]
     upload_all(fleet.gateway_urls[0], forms, CLIENTS)
     wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS, on_left)  # type: ignore[arg-type]
     with fleet.catalog.read() as session:
-        wanted = session.scalars(select(Map.version)).one()
+        map_version = session.scalars(select(Map.version)).one()
     with HttpSearchClient(fleet.search_urls, timeout_seconds=10) as search:
-        while min(search.status().versions.values(), default=0) < wanted:
+        while min(search.status().versions.values(), default=0) < map_version:
             time.sleep(0.2)
 
 
 def _model_milliseconds(width: int, batch: int) -> float:
-    """CPU time that the backbone itself takes of a photo: it only picks pixels, but not for
-    nothing."""
+    """Return the CPU time per photo of the fake backbone, which only samples pixels."""
     recipe = get_extractor_config(_test_extractor(width), allow_test_extractors=True)
     extractor = Extractor(recipe, torch.device("cpu"))
     pixels = np.zeros((batch, 224, 224, 3), np.uint8)
     extractor.describe(pixels, None)
-    begun = time.process_time()
+    started_at = time.process_time()
     for _ in range(10):
         extractor.describe(pixels, None)
-    return 1000 * (time.process_time() - begun) / 10 / batch
+    return 1000 * (time.process_time() - started_at) / 10 / batch
 
 
 def _measure_uploads(
     report: Report,
     fleet: Fleet,
-    made: Sequence[bytes],
+    jpegs: Sequence[bytes],
     photos: int,
     rounds: int,
     on_done: object,
 ) -> None:
-    """No extractor runs: each server has the machine, the store and the clients to itself."""
+    """Measure upload rates without extractors, one server at a time."""
     rates: dict[str, list[float]] = {"gateway": [], "bare": []}
     with _start_bare_server(fleet) as bare:
         targets = {
@@ -163,17 +164,17 @@ def _measure_uploads(
             "bare": (bare, "/upload"),
         }
         for url, path in targets.values():
-            upload_all(url, [multipart_form(made[0]) for _ in range(20)], CLIENTS, path=path)
+            upload_all(url, [multipart_form(jpegs[0]) for _ in range(20)], CLIENTS, path=path)
         for _ in range(rounds):
             for name, (url, path) in targets.items():
-                forms = [multipart_form(made[number % len(made)]) for number in range(photos)]
-                begun = time.perf_counter()
+                forms = [multipart_form(jpegs[number % len(jpegs)]) for number in range(photos)]
+                started_at = time.perf_counter()
                 upload_all(url, forms, CLIENTS, path=path, on_done=on_done)  # type: ignore[arg-type]
-                rates[name].append(photos / (time.perf_counter() - begun))
-    for name, found in rates.items():
+                rates[name].append(photos / (time.perf_counter() - started_at))
+    for name, values in rates.items():
         report.add(
             f"uploads to the {name} server" if name == "bare" else f"uploads to the {name}",
-            statistics.median(found),
+            statistics.median(values),
             "/s",
         )
     ratios = [ours / theirs for ours, theirs in zip(rates["gateway"], rates["bare"], strict=True)]

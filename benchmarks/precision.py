@@ -1,7 +1,6 @@
-"""What bfloat16 changes: patches, descriptors and recall, against float32 on the same photos.
+"""Benchmark of bfloat16 against float32: features, descriptors and recall on the same photos.
 
-The photos are those of a generated city, which is drawn for it: recall is comparable between the
-two, and with nothing else.
+The photos are of a generated city. The recalls are comparable with each other only.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ TARGET_PATCH_COSINE = 0.999
 MAX_QUERY_DIFFERENCE = 1
 SIZE = 320, 240
 VIEWS = 2
-FIT_PHOTOS = 32  # photos, where no vocabulary is shipped
+FIT_PHOTOS = 32  # photos for fitting a vocabulary if none is shipped
 
 Rows = NDArray[np.float32]
 
@@ -42,7 +41,7 @@ Rows = NDArray[np.float32]
 def measure(
     progress: Progress, *, extractor: str, places: int, queries: int, device: str, batch: int
 ) -> Report:
-    """A city of so many places, two views of each; the vocabulary is that of float32 for both."""
+    """Compare both precisions on a city with two views per place, with the float32 vocabulary."""
     with tempfile.TemporaryDirectory() as folder:
         measured = BenchmarkedExtractor.of(extractor, device, Path(folder))
         single = measured.load("float32")
@@ -68,7 +67,7 @@ def measure(
 
 @dataclass(slots=True)
 class _PrecisionComparison:
-    """What has been described so far, in both precisions."""
+    """Descriptors computed so far in both precisions."""
 
     single: Extractor
     centres: ClusterCentres | None
@@ -112,7 +111,7 @@ class _PrecisionComparison:
 def _draw_city(
     progress: Progress, out: Path, places: int, queries: int
 ) -> tuple[list[PlannedPhoto], list[Path]]:
-    """The shots of the database and the queries, and their files."""
+    """Return the photos of the database and of the queries, and their files."""
     width, height = SIZE
     plan = make_plan(
         CityOptions(

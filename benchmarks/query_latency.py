@@ -1,6 +1,7 @@
-"""How long does a query photo take while thousands of uploads wait to be described?
+"""Benchmark of query latency while thousands of uploads wait to be described.
 
-A batch that is on the model can't be interrupted, so a query may wait for one; not for two.
+A batch that runs on the model cannot be interrupted. A query may therefore wait for one batch, but
+not for two.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 TARGET_MS_ABOVE_BATCH = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 DESCRIPTOR_DIMENSION = 7168
-TEXTURES = 64  # so that few of the rows that are found are equal
+TEXTURES = 64  # distinct photos, so that few of the retrieved rows are equal
 TIMEOUT_SECONDS = 120.0
 SEED = 20_261_121
 
@@ -48,8 +49,10 @@ SEED = 20_261_121
 def measure(
     progress: Progress, *, backlog: int, seconds: float, milliseconds: int, batch: int
 ) -> Report:
-    """Queries one after the other at random moments for `seconds`, while of `backlog` photos
-    `batch` at once are described in `milliseconds` each."""
+    """Send queries at random moments for `seconds` while a backlog of photos is being described.
+
+    The extractor takes `batch` photos at a time and `milliseconds` per photo.
+    """
     report = Report(f"Query photos while {backlog:,} uploads wait")
     photos = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
     with (
@@ -69,7 +72,7 @@ def measure(
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
         _time_query(caller, photos[0])  # connections, and the query's own way
         _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
-        begun = _wait_for_chunks(fleet, 3)
+        since = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("asking", total=seconds)
         moments = random.Random(SEED)
         pause = 2 * milliseconds * batch / 1000
@@ -80,7 +83,7 @@ def measure(
             time.sleep(moments.uniform(0, pause))
             took.append(_time_query(caller, moments.choice(photos)))
         stages = _stage_seconds(fleet, took)
-        periods = _batch_seconds(fleet, begun, batch)
+        periods = _batch_seconds(fleet, since, batch)
         report.add("uploads still waiting at the end", _count_waiting_jobs(fleet), at_least=1)
         report.add("services that fell", len(fleet.crashed), at_most=0)
     spread, batch_ms = LatencySummary.of(took), 1000 * statistics.median(periods)
@@ -98,18 +101,17 @@ def measure(
 
 
 def _time_query(caller: HttpCaller, photo: bytes) -> float:
-    """Seconds until the answer; AssertionError where there is none."""
+    """Return the seconds until the response; AssertionError if there is none."""
     form = multipart_form(photo)
-    begun = time.perf_counter()
+    sent_at = time.perf_counter()
     answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
-    took = time.perf_counter() - begun
+    took = time.perf_counter() - sent_at
     assert answer.status == 200, answer.body
     return took
 
 
 def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
-    """Uploads with the bytes of these photos: sending thousands takes long and shows nothing
-    more."""
+    """Insert uploads directly into the catalog, because sending thousands of photos takes long."""
     with fleet.catalog.write() as session:
         known = [session.get_one(Photo, photo_id) for photo_id in photo_ids]
         shared = [
@@ -150,7 +152,7 @@ def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None
 
 
 def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
-    """Until the extractor is in its stride; the database's time then."""
+    """Wait until the extractor has reached its steady state; return the database's time."""
     deadline = time.monotonic() + TIMEOUT_SECONDS
     with fleet.catalog.read() as session:
         before = session.scalar(select(func.count()).select_from(Chunk)) or 0
@@ -164,12 +166,12 @@ def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
         time.sleep(0.1)
 
 
-def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
-    """Time from one batch's commit to the next, where no query came between."""
+def _batch_seconds(fleet: Fleet, since: datetime, batch: int) -> list[float]:
+    """Return the time between commits of consecutive batches without a query between them."""
     with fleet.catalog.read() as session:
         commits = session.scalars(
             select(Chunk.created_at)
-            .where(Chunk.created_at >= begun, Chunk.rows == batch)  # the steward's have more
+            .where(Chunk.created_at >= since, Chunk.rows == batch)  # merged chunks have more
             .order_by(Chunk.created_at)
         ).all()
         queries = session.scalars(
@@ -187,7 +189,7 @@ def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
 
 
 def _stage_seconds(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
-    """Where the time of each query went, by the job table."""
+    """Return the time of each query by stage, from the job table."""
     with fleet.catalog.read() as session:
         jobs = session.scalars(
             select(Job).where(Job.kind == JobKind.DESCRIBE).order_by(Job.id.desc()).limit(len(took))

@@ -1,4 +1,4 @@
-"""What a measurement has found, and whether that is what was wanted."""
+"""Benchmark report: measured values, their bounds, and latency percentiles."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shared.client import Json
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One number. `wanted` is its bound: a least one with `at_least`, else a largest one."""
+    """A measured value. `wanted` is its bound: a minimum if `at_least`, else a maximum."""
 
     what: str
     measured: float
@@ -38,7 +38,7 @@ class Figure:
 
 @dataclass(slots=True)
 class Report:
-    """All figures of a measurement, in the order in which they are shown."""
+    """All values of a benchmark, in the order in which they are shown."""
 
     title: str
     figures: list[Figure] = field(default_factory=list)
@@ -61,7 +61,7 @@ class Report:
 
     @property
     def missed(self) -> bool:
-        """Whether any figure is not as wanted."""
+        """Whether any value violates its bound."""
         return any(figure.missed for figure in self.figures)
 
     def as_json(self) -> Json:
@@ -94,7 +94,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class LatencySummary:
-    """Seconds of many calls."""
+    """Percentiles of call durations, in seconds."""
 
     median: float
     p95: float
@@ -102,7 +102,7 @@ class LatencySummary:
 
     @classmethod
     def of(cls, seconds: list[float]) -> LatencySummary:
-        """ValueError for none."""
+        """Summarise durations in seconds; ValueError if there are none."""
         if not seconds:
             raise ValueError("nothing was timed")
         ordered = sorted(seconds)

@@ -1,8 +1,8 @@
-"""Does looking closely at the first photos bring the right place to the top, and what does it cost?
+"""Benchmark of reranking by local features: recall gained and time per photo.
 
-On a generated city, as the README's ladder has it and smaller, with the default extractor and both
-of its vocabularies; and on the real photos that PLACEWISE_TEST_DATA names, where it is set. Times
-are those of one core, whatever else the machine does.
+Runs on a generated city, smaller than that of the README, with the default extractor and both of
+its vocabularies; and on the real photos of PLACEWISE_TEST_DATA, if it is set. Times are of one
+core, and include the effect of other load on the machine.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ KS = (1, 5, 10)
 BATCH = 16
 FIT_PHOTOS = 300
 SEED = 0
-TIMING_ROUNDS = 5  # whose candidates' features are made again, to time it
+TIMING_ROUNDS = 5  # rounds in which the candidates' features are computed again for timing
 
 Rows = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -50,7 +50,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class DescribedPhotos:
-    """Photos with what the extractor makes of them."""
+    """Photos with their descriptors and local features."""
 
     features: list[LocalFeatures]
     rows: dict[str, Rows]
@@ -58,7 +58,7 @@ class DescribedPhotos:
 
 
 def measure(progress: Progress, *, places: int, seed: int) -> Report:
-    """`places` of the city `seed`, four photos of each; half as many queries."""
+    """Rerank on a generated city of `places` with four photos each and half as many queries."""
     extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
     report = Report(f"Reranking {places} generated places, seed {seed}")
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +83,7 @@ def measure(progress: Progress, *, places: int, seed: int) -> Report:
 def _draw_city(
     folder: Path, places: int, seed: int, progress: Progress
 ) -> tuple[list[Path], list[Path], list[Indices]]:
-    """Paths of the database and of the queries in the map, and the positives of each query."""
+    """Return paths of database and queries, and the positives of each query."""
     plan = make_plan(CityOptions(places, 4, max(1, places // 2), seed, 0, 0.1, 320, 240, False))
     bar = progress.add_task("drawing", total=len(plan.photos))
     write_city(plan, folder, lambda count: progress.advance(bar, count))
@@ -109,7 +109,7 @@ def _describe_city(
     queries: Sequence[Path],
     advance: Callable[[int], None],
 ) -> tuple[DescribedPhotos, DescribedPhotos]:
-    """Database and queries, with the shipped vocabulary and with one learnt on the database."""
+    """Describe database and queries, with the shipped and with a fitted vocabulary."""
     chosen = sample_photos(len(database), FIT_PHOTOS, extractor.backbone.width, SEED)
     fitted = fit_vocabulary(
         extractor,
@@ -199,14 +199,14 @@ def _rerank_scores(
 
 
 def _apply_rerank(ranked: Indices, scores: NDArray[np.float64], depth: int) -> Indices:
-    """The rankings with their first `depth` in the order of their scores."""
+    """Return the rankings with their first `depth` photos reordered by score."""
     order = np.argsort(-scores[:, :depth], axis=1, kind="stable")
     first = np.take_along_axis(ranked[:, :depth], order, axis=1)
     return np.concatenate([first, ranked[:, depth:]], axis=1)
 
 
 def _time_features(extractor: Extractor, paths: Sequence[Path]) -> float:
-    """Seconds of one core for reading, decoding and the network of one photo."""
+    """Return the seconds of one core for reading, decoding and the network, per photo."""
     took = []
     for _ in range(TIMING_ROUNDS):
         started = time.process_time()
@@ -217,7 +217,7 @@ def _time_features(extractor: Extractor, paths: Sequence[Path]) -> float:
 
 
 def _report_real_photos(report: Report, extractor: Extractor, folder: Path) -> None:
-    """The ranks of the true matches among all photos, before and after reranking all of them."""
+    """Report the ranks of the true matches before and after reranking all photos."""
     database = sorted((folder / "database").glob("*.jpg"))
     queries = [folder / "queries" / name for name in TRUE_MATCH]
     photos, asked = _describe_city(extractor, database, queries, lambda count: None)

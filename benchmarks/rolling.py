@@ -1,8 +1,8 @@
-"""A new release comes in, one process after the other, while people use the old one.
+"""Benchmark of a rolling restart under load: every process is restarted, one after the other.
 
-Every gateway, extractor, search worker and steward is stopped by SIGTERM, started and waited for,
-under uploads, queries and reads. The client does what a client of two gateways does: where one does
-not answer it asks the other one, once, and it waits as long as a `Retry-After` says, once.
+Each gateway, extractor, search worker and steward is stopped with SIGTERM and started again, under
+uploads, queries and reads. The client behaves as one of two gateways: if one does not respond, it
+tries the other once, and it waits once for the time of a `Retry-After`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ALL_SERVICES = (
     *("gateway-0", "gateway-1", "extractor-0", "extractor-1"),
     *("search-0-0", "search-0-1", "steward-0", "steward-1"),
 )
-PAUSE_SECONDS = 0.1  # of a client between two requests: a load, not a race for the processors
+PAUSE_SECONDS = 0.1  # between a client's requests, so that the CPU is not saturated
 TIMEOUT_SECONDS = 120.0
 BATCH = 4
 TEXTURES = 16
@@ -47,7 +47,7 @@ INITIAL_PHOTOS = 12
 
 
 class LoadClients:
-    """Threads that use two gateways, and count what they were refused."""
+    """Threads that send requests to two gateways and record failed ones."""
 
     def __init__(self, urls: Sequence[str], photos: Sequence[bytes]) -> None:
         self._callers = [HttpCaller(url) for url in urls]
@@ -71,7 +71,7 @@ class LoadClients:
         ]
 
     def begin(self, photos: int) -> None:
-        """Upload the first ones, so that there is something to ask for."""
+        """Upload the first photos, so that queries have results."""
         chance = random.Random(-1)
         for _ in range(photos):
             self._upload(chance)
@@ -149,7 +149,7 @@ class LoadClients:
     def _call(
         self, first: int, what: str, method: str, path: str, body: bytes | None = None, **head: str
     ) -> HttpResponse | None:
-        """The answer, if it is a success; None, and noted, where even the second try is none."""
+        """Return the response; record a failure and return None if the retry fails too."""
         self.requests[what] += 1
         at, other_left, wait_left = first, True, True
         while True:
@@ -181,7 +181,7 @@ class LoadClients:
 
 
 def measure(progress: Progress) -> Report:
-    """Restart everything once."""
+    """Restart every process once."""
     with tempfile.TemporaryDirectory() as folder, start_servers() as servers:
         bar = progress.add_task("restarting", total=len(ALL_SERVICES))
         return restart_under_load(
@@ -197,7 +197,7 @@ def restart_under_load(
     *,
     executed: bool = True,
 ) -> Report:
-    """The named services of two of each kind, one after the other. `executed`: see `Fleet`."""
+    """Restart the named services, two processes each, one by one. `executed`: see `Fleet`."""
     report = Report("Rolling restart under load")
     with Fleet(
         folder,
@@ -217,9 +217,9 @@ def restart_under_load(
         try:
             clients.begin(INITIAL_PHOTOS)
             for name in names:
-                begun = time.monotonic()
+                started_at = time.monotonic()
                 codes[name] = fleet[name].stop()
-                stopping[name] = time.monotonic() - begun
+                stopping[name] = time.monotonic() - started_at
                 fleet.start(name)
                 on_restarted()
         finally:

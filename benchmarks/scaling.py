@@ -1,7 +1,7 @@
-"""Do twice as many extractors describe twice as many photos, and none of them twice?
+"""Benchmark of horizontal scaling: throughput of 1, 2, 4 ... extractors, and duplicate work.
 
-The extractors sleep instead of computing, so that many of them fit on one machine and what is left
-is what the job table, the hints and publishing cost.
+The extractors sleep instead of computing, so that many fit on one machine. What remains is the cost
+of the job table, the Celery hints and publishing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TARGET_EFFICIENCY = 0.9
 CLIENTS = 4
 MAX_WARM_UP_ROUNDS = 10
-COMPACTION_DISABLED = 1_000_000  # chunks stay as the extractors wrote them
+COMPACTION_DISABLED = 1_000_000  # keeps the chunks as the extractors wrote them
 TIMEOUT_SECONDS = 900.0  # for one round
 
 
@@ -41,8 +41,10 @@ def measure(
     milliseconds: int,
     batch: int,
 ) -> Report:
-    """Throughput of each number of `workers`, with `photos` for each of them, which sleep
-    `milliseconds` a photo and take `batch` at once."""
+    """Measure the throughput for each number of `workers`, with `photos` photos per worker.
+
+    Workers sleep `milliseconds` per photo and take batches of `batch`.
+    """
     report = Report("Extractors that sleep")
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -93,17 +95,19 @@ def measure(
 
 
 def _warm_up(fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int) -> int:
-    """Until every extractor has described a batch, and has its decoders; how many it took."""
-    wanted = {str(extractor.process.pid) for extractor in extractors}
+    """Upload until every extractor has described a batch; return the number of photos used."""
+    expected_workers = {str(extractor.process.pid) for extractor in extractors}
     served: set[str] = set()
     for round_ in range(MAX_WARM_UP_ROUNDS):
         answers = _upload_photos(fleet, photos)
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
         jobs = load_jobs(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
         served |= {(job.worker or "").rpartition("-")[2] for job in jobs}
-        if wanted <= served:
+        if expected_workers <= served:
             return photos * (round_ + 1)
-    raise AssertionError(f"{len(wanted - served)} extractors take no work: {fleet.logs()}")
+    raise AssertionError(
+        f"{len(expected_workers - served)} extractors take no work: {fleet.logs()}"
+    )
 
 
 def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:
@@ -115,9 +119,9 @@ def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:
 def _measure_throughput(
     fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int, on_left: Any
 ) -> float:
-    """Photos per second, from the first claim to the last commit by the database's clock.
+    """Return photos per second from the first claim to the last commit, by the database's clock.
 
-    All photos wait before the first is claimed: the extractors stand still meanwhile.
+    All photos are queued before the first is claimed: the extractors are paused meanwhile.
     """
     for extractor in extractors:
         extractor.pause()

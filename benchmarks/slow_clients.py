@@ -1,9 +1,9 @@
-"""How long do `GET /maps` and an upload take while other clients are slow on purpose?
+"""Benchmark under slow-client attacks: latency of `GET /maps` and of uploads.
 
-Three attacks, one after the other and then at once: connections that send nothing, uploads that
-send a byte a second, and event streams. Server and clients are on this machine. The idle
-connections come from the address of the calls that are timed, the others from addresses of their
-own (127.0.0.0/8); all are opened again when the server closes them.
+Three attacks, one after the other and then at once: idle connections, uploads of one byte a second,
+and event streams. Server and clients run on this machine. The idle connections come from the
+address of the timed calls, the others from addresses of their own (127.0.0.0/8). All are reopened
+when the server closes them.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from shared.errors import Unavailable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_RATIO = 5.0  # of the p95 without an attack
+WANTED_RATIO = 5.0  # maximum p95 relative to the p95 without an attack
 WANTED_LOG_BYTES_PER_MINUTE = 1_000_000
 START_SECONDS = 60.0
-SETTLE_SECONDS = 10.0  # until the attack has opened what it can
-CALL_SECONDS = 30.0  # a call that takes longer has failed
-REOPEN_SECONDS = 5.0  # until a client comes back whose connection was closed
+SETTLE_SECONDS = 10.0  # time for the attack to open its connections
+CALL_SECONDS = 30.0  # timeout of a call
+REOPEN_SECONDS = 5.0  # delay before a closed connection is reopened
 WATCHED_JOBS = 50
-CALLERS = 5  # keys and addresses of the event streams: one key may have only a part of all
+CALLERS = 5  # keys and addresses of the event streams, whose number is limited per key
 OPEN_FILES = 1024
 BODY_BYTES = 5_000_000
-EXTRACTOR = "test-tiny-vlad"  # its jobs wait for a vocabulary, and so streams of them go on
+EXTRACTOR = "test-tiny-vlad"  # its jobs wait for a vocabulary, so their event streams stay open
 SLOW_ADDRESS, STREAM_ADDRESS = "127.0.1.1", "127.0.2.{}"  # of the clients
-ADDRESS = "127.0.0.1"  # of the idle connections and of the calls that are timed
+ADDRESS = "127.0.0.1"  # source address of the idle connections and of the timed calls
 
 
 @dataclass(slots=True)
 class Calls:
-    """What was timed during one phase."""
+    """Timings and failures of one phase."""
 
     maps: list[float] = field(default_factory=list)
     uploads: list[float] = field(default_factory=list)
@@ -63,7 +63,7 @@ class Calls:
 
 @dataclass(frozen=True, slots=True)
 class Attack:
-    """What a process of its own does to the server."""
+    """An attack on the server, which runs in a process of its own."""
 
     port: int
     idle: int
@@ -75,8 +75,10 @@ class Attack:
 
 
 def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, streams: int) -> Report:
-    """Each phase lasts `seconds`. The server may open 1,024 files, and has the default settings but
-    for its extractor."""
+    """Run each phase for `seconds`.
+
+    The server may open 1,024 files and has default settings except for its extractor.
+    """
     report = Report(f"While {idle:,} clients are idle, {bodies} bodies slow, {streams} watch jobs")
     photo = make_jpegs(1, (640, 480), 60_000)[0]
     phases = {
@@ -167,10 +169,10 @@ def _server(home: Path, log: Path) -> Iterator[RunningServer]:
 
 
 def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Calls:
-    """Both calls in turn, each over a connection of its own."""
+    """Make both calls in turn, each over a connection of its own."""
     calls = Calls()
-    size, began = log.stat().st_size, time.monotonic()
-    while (now := time.monotonic()) < began + seconds or not calls.uploads:
+    size, started_at = log.stat().st_size, time.monotonic()
+    while (now := time.monotonic()) < started_at + seconds or not calls.uploads:
         try:
             if len(calls.maps) <= len(calls.uploads):
                 _call(port, key, "GET", "/api/v1/maps")
@@ -183,12 +185,12 @@ def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Call
             (calls.maps if len(calls.maps) <= len(calls.uploads) else calls.uploads).append(
                 time.monotonic() - now
             )
-    calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - began) * 60
+    calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - started_at) * 60
     return calls
 
 
 def _upload(port: int, key: str, photo: bytes) -> str:
-    """The id of the photo's job."""
+    """Upload and return the id of the photo's job."""
     answer = _call(port, key, "POST", "/api/v1/upload", multipart_form(photo), **CONTENT_TYPE)
     job_id: str = answer["job_id"]
     return job_id
@@ -210,13 +212,13 @@ def _call(
 
 @contextlib.contextmanager
 def _under(attack: Attack) -> Iterator[None]:
-    """The attack in a process of its own, begun SETTLE_SECONDS ago."""
+    """Run the attack in a process of its own, started SETTLE_SECONDS before the block."""
     context = multiprocessing.get_context("spawn")
-    begun = context.Event()
-    process = context.Process(target=_attack, args=(attack, begun))
+    started = context.Event()
+    process = context.Process(target=_attack, args=(attack, started))
     process.start()
     try:
-        if not begun.wait(START_SECONDS):
+        if not started.wait(START_SECONDS):
             raise Unavailable("attack_not_begun", "The process of the slow clients did not start.")
         time.sleep(SETTLE_SECONDS)
         yield
@@ -225,10 +227,10 @@ def _under(attack: Attack) -> Iterator[None]:
         process.join()
 
 
-def _attack(attack: Attack, begun: Event) -> None:
+def _attack(attack: Attack, started: Event) -> None:
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    begun.set()
+    started.set()
     asyncio.run(_attack_together(attack))
 
 
@@ -264,7 +266,7 @@ async def _again(client: Callable[[], Awaitable[None]]) -> None:
 
 
 async def _hold(port: int, address: str, head: bytes, *, drips: bool = False) -> None:
-    """Until the server closes the connection."""
+    """Wait until the server closes the connection."""
     reader, writer = await asyncio.open_connection(ADDRESS, port, local_addr=(address, 0))
     try:
         writer.write(head)

@@ -1,4 +1,4 @@
-"""The main job, embedded: upload, describe, search by stored photo and by new photo."""
+"""Benchmark of the embedded server: upload, describe, search by stored photo and by new photo."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ START_TIMEOUT_SECONDS = 60.0
 
 
 def measure(progress: Progress, *, photos: int, queries: int) -> Report:
-    """On an empty embedded server. The photos are random textures of 320 x 240 pixels: timings need
-    no places."""
+    """Measure on an empty embedded server, with random textures of 320 x 240 pixels as photos."""
     with tempfile.TemporaryDirectory() as folder:
         made = _draw_photos(Path(folder, "photos"), photos)
         with (
@@ -50,7 +49,7 @@ def measure(progress: Progress, *, photos: int, queries: int) -> Report:
 
 @contextlib.contextmanager
 def _start_server(home: Path) -> Iterator[RunningServer]:
-    """A server in a process of its own: in ours it would share the interpreter with the client."""
+    """Start a server in a process of its own, so that it does not share the GIL with the client."""
     command = [str(Path(sys.executable).with_name("placewise")), "serve"]
     environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
@@ -78,13 +77,13 @@ def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress:
         progress.advance(bar)
         return time.perf_counter() - started, answer
 
-    begun = time.perf_counter()
+    started_at = time.perf_counter()
     with ThreadPoolExecutor(4) as pool:
         uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
-    uploaded = time.perf_counter() - begun
+    uploaded = time.perf_counter() - started_at
     for _, answer in uploads:
         client.wait_for(answer["job_id"])
-    searchable = time.perf_counter() - begun
+    searchable = time.perf_counter() - started_at
     stored = [
         timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
     ]

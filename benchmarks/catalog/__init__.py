@@ -1,5 +1,6 @@
-"""What every statement costs on a large catalog: `fill` it, make the real `calls`, `explain` each.
+"""Benchmark of the catalog: explains every SQL statement of the services on a large database.
 
-The statements are caught while the services' own functions run, so none can be forgotten here or
-differ from what is asked in earnest.
+`fill` creates the data, `command` calls the services' own functions, `explain` captures and
+explains the statements that these functions send. The statements are therefore complete and
+identical to those in production.
 """

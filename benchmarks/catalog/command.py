@@ -1,7 +1,4 @@
-"""`placewise bench catalog`.
-
-Everything that the services ask of the catalog, called as they call it.
-"""
+"""Command `placewise bench catalog`: makes every catalog call of the services and explains it."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ KNOWN_FULL_SCANS = (
 
 
 class FakeSearch:
-    """Answers every search with the same photos: here the join with the catalog counts."""
+    """Search client that returns the same photos for each query: only the catalog join counts."""
 
     def __init__(self, photo_ids: list[UUID]) -> None:
         self._hits = tuple(SearchHit(photo_id=photo_id, score=0.5) for photo_id in photo_ids)
@@ -83,7 +80,7 @@ class FakeSearch:
 def run_all_calls(
     catalog: Catalog, filled: SyntheticCatalog, explainer: Explainer, folder: Path
 ) -> Iterator[str]:
-    """Make every call once, on the largest map; yields each one's name before it is made."""
+    """Make every call once on the largest map; yields the name of each call before it is made."""
     for name, do in _all_calls(catalog, filled, folder):
         yield name
         with explainer.call(name):
@@ -140,10 +137,10 @@ def _gateway_requests(
     near = f"{photo.latitude},{photo.longitude}"
 
     def ask(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
-        wanted = options.pop("params", {})
-        params = wanted if path.startswith("/maps") else {"map": LARGEST_MAP, **wanted}
-        said = "&".join(f"{name}={str(value)[:40]}" for name, value in wanted.items())
-        label = f"{method} {_path_template(path)}{'?' if said else ''}{said}"
+        own_params = options.pop("params", {})
+        params = own_params if path.startswith("/maps") else {"map": LARGEST_MAP, **own_params}
+        query = "&".join(f"{name}={str(value)[:40]}" for name, value in own_params.items())
+        label = f"{method} {_path_template(path)}{'?' if query else ''}{query}"
 
         def call() -> None:
             answer = client.request(method, f"/api/v1{path}", params=params, **options)
@@ -274,13 +271,16 @@ def _path_template(path: str) -> str:
 
 
 def bench_catalog(
-    photos: Annotated[int, typer.Option(min=100_000, help="rows to make")] = 1_000_000,
+    photos: Annotated[
+        int, typer.Option(min=100_000, help="Number of photos to create.")
+    ] = 1_000_000,
     as_json: JsonOption = False,
 ) -> None:
-    """Fill a PostgreSQL with photos and explain every statement that the services send.
+    """Fill a PostgreSQL database with photos and explain every statement that the services send.
 
-    On the server of DATABASE_URL, in a database of its own, which is dropped in the end. Exit code
-    1 when a statement reads a large table from end to end, or far more than it returns.
+    Uses a temporary database on the server of DATABASE_URL, which is dropped at the end. The exit
+    code is 1 if a statement scans a large table sequentially or reads far more rows than it
+    returns.
     """
     with report_errors(as_json):
         url = make_url(read_settings().catalog_url())
@@ -329,7 +329,7 @@ def bench_catalog(
 
 @contextlib.contextmanager
 def _create_database(url: URL) -> Iterator[str]:
-    """The URL of a new database on the same server."""
+    """Create a database on the same server and return its URL."""
     name = f"placewise_bench_{new_id().hex}"
     admin = url.set(drivername="postgresql").render_as_string(hide_password=False)
     with psycopg.connect(admin, autocommit=True) as connection:

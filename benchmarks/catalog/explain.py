@@ -1,4 +1,4 @@
-"""The plan of every statement that is sent while a block runs, and what it read."""
+"""Captures the SQL statements that are sent inside a block, with their plans and rows read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_ROWS_READ_PER_RETURNED = 20
 
 @dataclass(frozen=True, slots=True)
 class StatementPlan:
-    """One statement. `read` is rows that scans have looked at, `milliseconds` the server's."""
+    """Plan of a statement: `read` is the number of rows scanned, `milliseconds` server time."""
 
     call: str
     sql: str
@@ -43,7 +43,7 @@ class StatementPlan:
 
 @dataclass
 class Explainer:
-    """Explains what goes through the catalog while `call` runs."""
+    """Explains the statements that are sent through the catalog during `call`."""
 
     catalog: Catalog
     small: bool = False
@@ -110,7 +110,7 @@ def _rows_read(node: dict[str, Any]) -> int:
 
 
 def _rows_returned(plan: dict[str, Any]) -> int:
-    """Rows that come out; of a change, those that it is applied to."""
+    """Return the number of result rows; for a data change, the number of affected rows."""
     if plan["Node Type"] == "ModifyTable":
         return max((_rows_returned(child) for child in plan.get("Plans", ())), default=1)
     return int(plan["Actual Rows"])

@@ -1,7 +1,7 @@
-"""A large catalog, made by the server itself: photos, descriptors, jobs and searches of ten maps.
+"""Fills a catalog by server-side SQL: photos, descriptors, jobs and searches of ten maps.
 
-The first map has seven of ten photos, the second a quarter, the eight others share the rest. Ids
-grow with time, as they do in earnest.
+The first map has 70 % of the photos, the second 25 %, and the other eight share the rest. Ids
+increase with time, as in production.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from shared.ids import new_id
 MAPS = 10
 LARGEST_MAP, SECOND_MAP = "map-0", "map-1"
 SLOT_ROWS = 1000
-WAITING_JOB_SHARE = 0.01  # of the photos: uploaded a moment ago, not described yet
+WAITING_JOB_SHARE = 0.01  # share of photos just uploaded and not described yet
 
 # The n-th row of a kind, from 30 days ago until now.
 CREATED_AT_SQL = "now() - interval '30 days' * (1 - n::float8 / :photos)"
@@ -97,7 +97,7 @@ FILL_STATEMENTS = {
 
 @dataclass(frozen=True, slots=True)
 class SyntheticCatalog:
-    """What lies there. `tables`: bytes of each table with its indexes."""
+    """Contents of the synthetic catalog. `tables`: bytes of each table including its indexes."""
 
     photos: int
     big: UUID
@@ -106,7 +106,7 @@ class SyntheticCatalog:
 
 
 def fill_catalog(catalog: Catalog, photos: int) -> SyntheticCatalog:
-    """Fill an empty, migrated PostgreSQL catalog, and let the planner look at it."""
+    """Fill an empty, migrated PostgreSQL catalog and run ANALYZE."""
     with catalog.write() as session:
         maps = [create_map(session, f"map-{n}", "test-tiny-avg").id for n in range(MAPS)]
         model = get_or_create_model(session, "bench", "0" * 64, "MIT", {})

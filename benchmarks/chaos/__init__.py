@@ -1,7 +1,7 @@
-"""The fault suite: photos are uploaded and asked for while parts die, then everything is counted.
+"""Fault-injection suite: components fail under uploads and queries, then invariants are checked.
 
-`faults` says what goes wrong, `traffic` uploads and asks meanwhile, `audit` counts, `run` does one
-fault after the other.
+`faults` defines the faults, `traffic` uploads and queries meanwhile, `run` injects one fault after
+the other and checks the invariants after each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["ChaosRun", "measure", "run_chaos"]
 
 
 def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int) -> Report:
-    """Every fault once, in the order that the seed decides."""
+    """Inject every fault once, in a random order that is determined by the seed."""
     faults = all_faults()
     bar = progress.add_task("breaking things", total=len(faults))
 

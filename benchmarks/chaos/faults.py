@@ -1,4 +1,4 @@
-"""What goes wrong. Each fault is a block: inside it, something is broken."""
+"""Faults of the fault-injection suite. Each is a context manager inside which a component fails."""
 
 from __future__ import annotations
 
@@ -26,15 +26,18 @@ CLOCK_OFFSETS_SECONDS = {
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """`broken(fleet, seconds)` is a block that breaks something when it begins and ends with it
-    repaired. What it breaks stays broken for `seconds` where the fault has a length."""
+    """A fault of the suite.
+
+    `broken(fleet, seconds)` is a context manager that breaks a component on entry and repairs it on
+    exit. Faults that have a duration last `seconds`.
+    """
 
     name: str
     inject: Callable[[Fleet, float], AbstractContextManager[None]]
 
 
 def all_faults() -> list[Fault]:
-    """In the order of the documentation; a run shuffles them."""
+    """Return all faults in the order of the documentation; a run shuffles them."""
     return [
         *(Fault(f"kill -9 of {name}", _kill_service(name)) for name in _ONE_SERVICE_OF_EACH),
         Fault("kill -9 of every service at once", _kill_all_services),

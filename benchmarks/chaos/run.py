@@ -1,7 +1,4 @@
-"""One fault after the other, and the counts after each.
-
-What is true after a fault, counted in the catalog and in the store.
-"""
+"""Runs the fault-injection suite and checks the invariants after each fault."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ from tests.support.clock import clock_off_by
 
 @dataclass(slots=True)
 class InvariantViolations:
-    """All of it has to be zero."""
+    """Numbers of violations of each invariant; all must be zero."""
 
     lost: int = 0
     """Acknowledged photos that the catalog or the store does not have, or that have no row."""
@@ -53,18 +50,18 @@ class InvariantViolations:
 
 
 def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
-    """Jobs that have not ended yet; `photos`: without those of questions."""
-    wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
+    """Count unfinished jobs; with `photos`, without the jobs of queries."""
+    conditions: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
     if photos:
-        wanted.append(Job.kind != JobKind.DESCRIBE)
+        conditions.append(Job.kind != JobKind.DESCRIBE)
     with catalog.read() as session:
-        return session.scalar(select(func.count()).select_from(Job).where(*wanted)) or 0
+        return session.scalar(select(func.count()).select_from(Job).where(*conditions)) or 0
 
 
 def check_invariants(
     catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
 ) -> InvariantViolations:
-    """Count; `acknowledged` gives the photo's id for the sha256 of each photo that was taken."""
+    """Count violations; `acknowledged` maps the sha256 of each acknowledged photo to its id."""
     counts = InvariantViolations()
     with catalog.read() as session:
         photos = {
@@ -87,24 +84,26 @@ def check_invariants(
     for sha256, photo_id in acknowledged.items():
         photo = photos.get(photo_id)
         if photo is None or photo.sha256 != sha256:
-            counts.details.append(f"{photo_id} was acknowledged, and the catalog has no such photo")
+            counts.details.append(f"acknowledged photo {photo_id} is not in the catalog")
         elif photo.object_key not in stored:
-            counts.details.append(f"{photo_id} was acknowledged, and its bytes are gone")
+            counts.details.append(f"acknowledged photo {photo_id} is not in the object store")
         elif not rows[photo_id]:
-            counts.details.append(f"{photo_id} was acknowledged, and has no descriptor")
+            counts.details.append(f"acknowledged photo {photo_id} has no descriptor")
         else:
             continue
         counts.lost += 1
-    by_bytes = Counter(photo.sha256 for photo in photos.values())
-    several = [sha256 for sha256, times in by_bytes.items() if times > 1]
-    doubled = [photo_id for photo_id, times in rows.items() if times > 1]
-    counts.twice = len(several) + len(doubled)
-    counts.details += [f"{sha256} is stored {by_bytes[sha256]} times" for sha256 in several]
-    counts.details += [f"{photo_id} has {rows[photo_id]} rows" for photo_id in doubled]
+    by_sha256 = Counter(photo.sha256 for photo in photos.values())
+    duplicates = [sha256 for sha256, times in by_sha256.items() if times > 1]
+    described_twice = [photo_id for photo_id, times in rows.items() if times > 1]
+    counts.twice = len(duplicates) + len(described_twice)
+    counts.details += [f"{sha256} is stored {by_sha256[sha256]} times" for sha256 in duplicates]
+    counts.details += [f"{photo_id} has {rows[photo_id]} rows" for photo_id in described_twice]
     for chunk in chunks:
         if not _is_intact(store, chunk):
             counts.torn += 1
-            counts.details.append(f"the chunk {chunk.object_key} is not what the catalog says")
+            counts.details.append(
+                f"chunk {chunk.object_key} does not match its hash in the catalog"
+            )
     return counts
 
 
@@ -116,18 +115,16 @@ def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:
     return hashlib.sha256(data).hexdigest() == chunk.sha256 and chunk.sha256.encode() in manifest
 
 
-RECOVERY_TIMEOUT_SECONDS = 180.0  # what has not recovered by then is counted as stuck
+RECOVERY_TIMEOUT_SECONDS = 180.0  # jobs that are unfinished after it count as stuck
 LEASE_SECONDS = 2.0
 POLL_SECONDS = 0.1
-QUERIES_PER_FAULT = (
-    10  # known photos that are asked for after each fault, beside those asked for meanwhile
-)
-MAX_FAULT_DELAY_SECONDS = 0.5  # at most: how long the fault waits for uploads to be under way
+QUERIES_PER_FAULT = 10  # queries after each fault, in addition to those during it
+MAX_FAULT_DELAY_SECONDS = 0.5  # the fault starts this long after the uploads at the latest
 
 
 @dataclass(slots=True)
 class FaultOutcome:
-    """After one fault. Everything but `refused` and `recovery_seconds` has to be zero."""
+    """Result of one fault. All values except `refused` and `recovery_seconds` must be zero."""
 
     fault: str
     counts: InvariantViolations
@@ -149,7 +146,7 @@ class FaultOutcome:
 
 @dataclass(slots=True)
 class ChaosRun:
-    """What became of a run, fault by fault."""
+    """Results of a run, by fault."""
 
     outcomes: list[FaultOutcome] = field(default_factory=list)
     asked: int = 0
@@ -172,10 +169,10 @@ def run_chaos(
     executed: bool = True,
     on_outcome: Callable[[FaultOutcome], object] = lambda outcome: None,
 ) -> ChaosRun:
-    """Upload `photos` in equal parts, one for each fault, in an order that the seed decides.
+    """Upload `photos` in equal parts, one per fault; the seed determines the order of the faults.
 
-    Faults that have a length last `fault_seconds`. Ends at the first fault after which something
-    is not as it has to be, with the services' logs in the run. `executed`: see `Fleet`.
+    Faults that have a duration last `fault_seconds`. The run ends at the first fault that leaves a
+    violation; the services' logs are then part of the result. `executed`: see `Fleet`.
     """
     moments = random.Random(seed)
     chosen = list(faults or all_faults())
@@ -218,7 +215,7 @@ def run_chaos(
 def _upload_by_thirds(
     traffic: Traffic, photos: int, place: int, faults: int
 ) -> Callable[[int], None]:
-    """Releases the first, second or third third of the part of the fault at `place`."""
+    """Release the first, second or third third of the photos of the fault at index `place`."""
 
     def upload(third: int) -> None:
         traffic.release((3 * place + third) * photos // (3 * faults))
@@ -234,7 +231,7 @@ def _run_fault(
     moments: random.Random,
     upload: Callable[[int], None],
 ) -> FaultOutcome:
-    """Photos are uploaded before the fault, while it lasts, and after it; then all is counted."""
+    """Upload photos before, during and after the fault, then check the invariants."""
     before = traffic.answers.copy()
     fell = len(fleet.crashed)
     upload(1)
@@ -251,7 +248,7 @@ def _run_fault(
     recovery_seconds = time.monotonic() - repaired
     traffic.mark_searchable()
     with traffic.pause_queries():
-        # Questions whose gateway died are answered to nobody, but answered.
+        # The jobs of queries whose gateway was killed still complete, although nobody waits.
         _wait_until(deadline, lambda: not count_unfinished_jobs(fleet.catalog))
         counts = check_invariants(fleet.catalog, fleet.store, traffic.acknowledged)
     for known in moments.sample(traffic.known, min(QUERIES_PER_FAULT, len(traffic.known))):

@@ -1,4 +1,4 @@
-"""Callers of the fleet: they upload until each photo is acknowledged, and ask where photos are."""
+"""Load on the fleet: uploads each photo until it is acknowledged, and sends queries."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ RETRYABLE_STATUSES = (429, 503, 507)
 
 
 class Traffic:
-    """Uploads the photos 0, 1, 2... as far as they are released, and asks for those that are known.
+    """Uploads the photos 0, 1, 2 ... as they are released, and queries with the searchable ones.
 
-    A call that fails is repeated at the next gateway.
+    A failed call is retried at the next gateway.
     """
 
     def __init__(self, urls: Sequence[str], seed: int) -> None:
@@ -76,7 +76,7 @@ class Traffic:
             client.close()
 
     def release(self, photos: int) -> None:
-        """Let so many photos be uploaded in all."""
+        """Allow this total number of photos to be uploaded."""
         self._released = photos
 
     @property
@@ -84,13 +84,13 @@ class Traffic:
         return len(self.acknowledged) >= self._released
 
     def mark_searchable(self) -> None:
-        """All is well: from now on every answer has to know what is acknowledged."""
+        """Require from now on that each result contains the acknowledged photos."""
         with self._lock:
             self.known = sorted(self._numbers.values())
 
     @contextlib.contextmanager
     def pause_queries(self) -> Iterator[None]:
-        """No question is under way while the block runs."""
+        """Context manager during which no query is in progress."""
         with self._asking:
             yield
 
@@ -128,7 +128,7 @@ class Traffic:
                     self.ask(number)
 
     def ask(self, number: int) -> None:
-        """Ask with the bytes of a known photo, and look whether the answer is right."""
+        """Query with the bytes of an acknowledged photo and check the result."""
         body = self._call(
             self._random.randrange(len(self._clients)),
             "/api/v1/similarity",
@@ -154,16 +154,16 @@ class Traffic:
     def _call(
         self, caller: int, path: str, wanted: Sequence[int], **options: Any
     ) -> dict[str, Any] | None:
-        """The answer's body; None when the caller should try again."""
+        """Return the response body; None if the caller should retry."""
         number = caller % len(self._clients)
-        begun = time.monotonic()
+        started_at = time.monotonic()
         try:
             answer = self._clients[number].post(path, **options)
         except httpx2.TransportError as error:
             self.answers["away"] += 1
             if isinstance(error, httpx2.ReadTimeout):
                 self.answers["unexpected"] += 1
-                seconds = time.monotonic() - begun
+                seconds = time.monotonic() - started_at
                 self.details.append(f"{path} did not answer in {seconds:.0f} s")
             return None
         if answer.status_code in wanted:

@@ -1,11 +1,11 @@
-"""A whole Placewise on this machine: real servers, every service in processes of its own.
+"""Starts a complete Placewise on this machine: real servers, and each service in its own process.
 
     with start_servers() as servers, Fleet(folder, servers, extractors=3) as fleet:
         fleet.start()
         fleet["extractor-1"].kill()
 
-The benchmarks and the fault suite run on it. It needs a checkout with the dev extra: the servers
-are those of the tests.
+The benchmarks and the fault-injection suite use it. It needs a checkout with the extra `dev`,
+because the servers are those of the tests.
 """
 
 from benchmarks.fleet.fleet import Fleet, Servers, start_servers

@@ -1,6 +1,6 @@
-"""A TCP proxy that can be told to misbehave as networks and full disks do.
+"""Fault injection: a TCP proxy that simulates network and disk faults, and duplicated messages.
 
-Delivers every Celery message twice, as Redis may after a lost acknowledgement.
+Duplicates model Redis, which may deliver a Celery message twice after a lost acknowledgement.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from redis.exceptions import RedisError
 from shared.jobs.wakeups import WakeupQueue
 
 CHUNK_BYTES = 65_536
-CUT_AFTER_BYTES = 700  # within a photo or a chunk, after the head of its request
-SLOW_DELAY_SECONDS = 0.05  # for each piece
+CUT_AFTER_BYTES = 700  # inside the body of a photo or chunk, after the request's headers
+SLOW_DELAY_SECONDS = 0.05  # per chunk of data
 SLOW_CHUNK_BYTES = 2_048
 DISK_FULL_RESPONSE = (
     b"HTTP/1.1 507 Insufficient Storage\r\nContent-Type: application/xml\r\n"
@@ -31,7 +31,7 @@ WRITE_METHODS = (b"PUT ", b"POST ")
 
 
 class ProxyMode(enum.Enum):
-    """How connections fare. A change of it ends those that stand."""
+    """Behaviour of connections. Changing it closes the open ones."""
 
     OPEN = "everything passes"
     REFUSED = "every connection ends at once"
@@ -45,7 +45,7 @@ CUT_MODES = {ProxyMode.CUT, ProxyMode.CUT_ANSWER}
 
 
 class FaultProxy:
-    """Listens on `port` and passes everything on to 127.0.0.1:`target`, as `mode` lets it."""
+    """TCP proxy from `port` to 127.0.0.1:`target`, with the behaviour of `mode`."""
 
     def __init__(self, port: int, target: int) -> None:
         self.port = port
@@ -78,7 +78,7 @@ class FaultProxy:
 
     @contextlib.contextmanager
     def in_mode(self, mode: ProxyMode, *, cut_after_bytes: int = CUT_AFTER_BYTES) -> Iterator[None]:
-        """While the block runs."""
+        """Context manager that sets the mode."""
         self._cut_after_bytes = cut_after_bytes
         self._set(mode)
         try:

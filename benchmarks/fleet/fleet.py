@@ -1,7 +1,4 @@
-"""Every service of a Placewise, started on real servers and kept alive.
-
-The real servers that a fleet runs on: PostgreSQL, Redis and an S3 store, nobody else's.
-"""
+"""Runs the services of a Placewise on dedicated servers: PostgreSQL, Redis and an S3 store."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ from tests.support.servers.handle import Handle
 
 @dataclass(frozen=True, slots=True)
 class Servers:
-    """Started, and each may be killed. Services reach them through proxies, which can fail."""
+    """The started servers, each of which can be killed. Services connect through fault proxies."""
 
     postgres: PostgresServer
     redis: RedisServer
@@ -50,7 +47,7 @@ class Servers:
 
     @property
     def processes(self) -> dict[str, Handle]:
-        """The servers themselves by name."""
+        """Server processes by name."""
         found = {
             "PostgreSQL": self.postgres.process,
             "Redis": self.redis.process,
@@ -59,19 +56,19 @@ class Servers:
         return {name: process for name, process in found.items() if process is not None}
 
     def proxied_database(self, url: str) -> str:
-        """The URL of a database of `postgres` as the services see it."""
+        """Return the URL of a PostgreSQL database through its proxy."""
         proxied = make_url(url).set(port=self.postgres_proxy.port)
         return proxied.render_as_string(hide_password=False)
 
     @property
     def proxied_redis_url(self) -> str:
-        """Redis as the services see it."""
+        """URL of Redis through its proxy."""
         proxied = make_url(self.redis.url).set(port=self.redis_proxy.port)
         return proxied.render_as_string(hide_password=False)
 
     @property
     def proxied_s3(self) -> S3Server:
-        """The store as the services see it."""
+        """Settings of the S3 store through its proxy."""
         return S3Server(
             f"127.0.0.1:{self.s3_proxy.port}",
             self.s3.access_key,
@@ -83,7 +80,7 @@ class Servers:
 
 @contextlib.contextmanager
 def start_servers() -> Iterator[Servers]:
-    """All three, until the block ends."""
+    """Context manager that starts all three servers."""
     with (
         start_postgres(own=True) as postgres,
         start_redis(own=True) as redis,
@@ -105,10 +102,10 @@ POLL_SECONDS = 0.2
 
 
 class Fleet:
-    """`gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA` and `steward-0..` by name.
+    """Services by name: `gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA`, `steward-0..`.
 
-    Settings are those of `shared.config.settings`; the tiny test extractor unless they say
-    otherwise.
+    Settings are those of `shared.config.settings`; the default extractor is the tiny test
+    extractor.
     """
 
     def __init__(
@@ -125,9 +122,11 @@ class Fleet:
         executed: bool = True,
         **settings: Any,
     ) -> None:
-        """`through_proxies`: reach the servers so that they can be made to fail, and slower.
+        """Create the fleet without starting it.
 
-        Without `executed` services start faster and are not what a user's are: for no figures.
+        `through_proxies`: connect to the servers through fault proxies, which is slower. Without
+        `executed`, services start faster but not as in production: do not measure performance with
+        it.
         """
         self._executed = executed
         self.servers = servers
@@ -208,7 +207,7 @@ class Fleet:
         self.catalog.close()
 
     def start(self, *names: str) -> None:
-        """The named services, or all; returns when they are ready."""
+        """Start the named services, or all, and wait until they are ready."""
         chosen = [self.services[name] for name in names] or list(self.services.values())
         for service in chosen:
             service.start()
@@ -225,7 +224,7 @@ class Fleet:
 
     @contextlib.contextmanager
     def without(self, name: str) -> Iterator[None]:
-        """The service is killed; when the block ends it is started again."""
+        """Context manager during which a service is killed; it is started again on exit."""
         self[name].kill()
         try:
             yield
@@ -233,7 +232,7 @@ class Fleet:
             self.start(name)
 
     def cpu_seconds(self) -> dict[str, float]:
-        """CPU time so far of each service that runs."""
+        """Return the CPU time used so far by each running service."""
         return {
             name: service.cpu_seconds()
             for name, service in self.services.items()
@@ -241,7 +240,7 @@ class Fleet:
         }
 
     def server_cpu_seconds(self) -> dict[str, float]:
-        """CPU time so far of each server."""
+        """Return the CPU time used so far by each server."""
         return {name: one.cpu_seconds() for name, one in self.servers.processes.items()}
 
     def logs(self) -> str:

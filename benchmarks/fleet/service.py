@@ -1,4 +1,4 @@
-"""One `placewise NAME` in a process of its own, which may be killed, paused and started again."""
+"""Runs one `placewise NAME` in a process that can be killed, paused and restarted."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ STOP_TIMEOUT_SECONDS = 60.0
 
 
 class ServiceProcess:
-    """`ready_url` answers 200 when it is at work; what serves no HTTP writes `ready_line` then.
+    """A service process with a supervisor.
 
-    While it is `wanted`, a supervisor starts it again (`start_if_ended`), as an orchestrator would.
-    `executed`: see tests/support/processes.py.
+    It is ready when `ready_url` returns 200; a service without HTTP writes `ready_line` instead.
+    While it is `wanted`, `restart_if_exited` restarts it, as an orchestrator would. `executed`: see
+    tests/support/processes.py.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class ServiceProcess:
             self._start()
 
     def restart_if_exited(self) -> bool:
-        """Start it again if it ought to run and doesn't; whether that was so."""
+        """Restart the process if it should run but has exited; return whether it was restarted."""
         with self._lock:
             if not self.wanted or self.running:
                 return False
@@ -86,7 +87,7 @@ class ServiceProcess:
         self.starts += 1
 
     def kill(self) -> None:
-        """SIGKILL, and nobody starts it again."""
+        """Send SIGKILL, without restart."""
         with self._lock:
             self.wanted = False
             if self._process is not None:
@@ -97,7 +98,7 @@ class ServiceProcess:
                 self._process.wait()
 
     def stop(self) -> int:
-        """SIGTERM, and wait; the exit code."""
+        """Send SIGTERM and wait; return the exit code."""
         with self._lock:
             self.wanted = False
             assert self._process is not None
@@ -115,7 +116,7 @@ class ServiceProcess:
         self._process.send_signal(number)
 
     def wait_until_ready(self) -> None:
-        """AssertionError with the end of its log where it does not come to that."""
+        """Wait for readiness; on timeout raise AssertionError with the end of the log."""
         deadline = time.monotonic() + START_TIMEOUT_SECONDS
         while not self._ready():
             assert time.monotonic() < deadline, f"{self.name} is not ready: {self.log()}"
@@ -129,7 +130,7 @@ class ServiceProcess:
         return False
 
     def cpu_seconds(self) -> float:
-        """User and system time of the process and its children so far."""
+        """Return user and system time of the process and its children so far."""
         return cpu_seconds_of(self.process.pid)
 
     def _log_since_start(self) -> bytes:

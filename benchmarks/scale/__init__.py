@@ -1,8 +1,8 @@
-"""What a map of a given size takes: photos, machines, bytes, money.
+"""Capacity planning: machines, storage and cost of a map of a given size.
 
-`inputs` are the numbers that everything is derived from, each with its source; `plan` derives;
-`limits` says at which size a part of the design breaks; `replacements` what would take its place;
-`this_machine` measures what a machine can be asked in seconds; `pages` writes it down.
+`inputs` are the assumptions, each with its source; `plan` derives the numbers; `limits` gives the
+size at which a part of the design fails; `replacements` lists alternatives; `this_machine` measures
+inputs on this machine; `pages` formats the result.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ __all__ = ["Inputs", "Sizing", "measure", "size_up"]
 
 
 def size_up(given: Sequence[str], measured: Report | None = None) -> Sizing:
-    """Everything that the inputs come to: the defaults, in their place what was measured here, in
-    its place the `NAME=VALUE` texts of `given`. Misconfigured (`unknown_input`) for what is none.
+    """Compute the sizing from default inputs, measured values, and `NAME=VALUE` overrides.
+
+    Raises:
+        Misconfigured: `unknown_input`.
     """
     found = {figure.what: figure.measured for figure in measured.figures} if measured else {}
     return Sizing(Inputs().with_values(found).with_values(Inputs.parse(given)))

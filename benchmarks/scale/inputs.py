@@ -1,4 +1,4 @@
-"""The numbers that the sizing starts from. Change one with `--set NAME=VALUE`."""
+"""Inputs of the capacity planning. Override one with `--set NAME=VALUE`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _built(value: float, unit: str, where: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """One of the numbers, as it is shown."""
+    """An input as it is displayed."""
 
     name: str
     value: float
@@ -39,7 +39,7 @@ class Input:
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Bytes are decimal: a GB has 10^9. Names carry the unit where it is not plain."""
+    """All inputs. Byte units are decimal (1 GB is 10^9 bytes); names contain the unit."""
 
     # Photos.
     photo_bytes: float = _assumed(500_000, "B", "an original of about two megapixels")
@@ -119,8 +119,12 @@ class Inputs:
             yield Input(each.name, values[each.name], about["unit"], about["kind"], about["source"])
 
     def with_values(self, values: Mapping[str, float]) -> Self:
-        """A copy with other values; Misconfigured (`unknown_input`) for a name that is none and
-        for a value that is not a positive number."""
+        """Return a copy with other values.
+
+        Raises:
+            Misconfigured: `unknown_input`, for an unknown name or a value that is not a positive
+                number.
+        """
         names = {each.name for each in fields(self)}
         for name, value in values.items():
             if name not in names:
@@ -134,7 +138,11 @@ class Inputs:
 
     @staticmethod
     def parse(given: Sequence[str]) -> dict[str, float]:
-        """`NAME=VALUE` texts; Misconfigured (`unknown_input`) for what is none."""
+        """Parse `NAME=VALUE` texts.
+
+        Raises:
+            Misconfigured: `unknown_input`.
+        """
         found = {}
         for text in given:
             name, _, value = text.partition("=")
@@ -150,7 +158,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Width:
-    """One of the two extractors that are sized, by the length of its descriptors."""
+    """One of the two extractors that are sized, by its descriptor dimension."""
 
     dimension: int
     extractor: str

@@ -1,4 +1,4 @@
-"""At how many photos a part of the design breaks, by the same inputs."""
+"""Limits of the design: the number of photos at which a part fails, from the same inputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.config.settings import Settings
 from shared.search_api.client import MAX_CONCURRENT_CALLS
 
 LOADING_SECONDS = 600.0
-STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: after which it is started again
+STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: it is restarted after this time
 CHANGE_SECONDS = 0.5  # services/steward/scheduler.py, "advance model changes"
 STATEMENT_SECONDS = float(Settings.model_fields["database_work_seconds"].default)
 FOLLOW_SECONDS = float(Settings.model_fields["search_follow_seconds"].default)
@@ -18,7 +18,7 @@ FOLLOW_SECONDS = float(Settings.model_fields["search_follow_seconds"].default)
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """`photos`: from how many on it doesn't hold; `formula` for it."""
+    """A limit: `photos` is the number from which on the part fails, `formula` its derivation."""
 
     what: str
     photos: float
@@ -26,7 +26,7 @@ class Limit:
 
 
 def limits(width: Width, i: Inputs) -> list[Limit]:
-    """Lowest first."""
+    """Return all limits, lowest first."""
     held = (4 * width.dimension + i.photo_columns_bytes) * i.generations_held
     per_machine = i.machine_ram_bytes * i.ram_used / held
     per_second = i.search_seconds / width.scan_seconds

@@ -1,4 +1,4 @@
-"""The sizing as tables, for the terminal and for `docs/scale.md`, and as JSON."""
+"""Formats the sizing as tables for the terminal and `docs/scale.md`, and as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Rows = list[list[str]]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """One table; `name` marks its place in docs/scale.md."""
+    """A table; `name` marks its place in docs/scale.md."""
 
     name: str
     title: str
@@ -40,7 +40,7 @@ class Sheet:
 
 
 class Sizing:
-    """Everything that the inputs come to."""
+    """All results of the sizing."""
 
     def __init__(self, inputs: Inputs) -> None:
         self.inputs = inputs
@@ -59,8 +59,11 @@ class Sizing:
         ]
 
     def put_into(self, page: str) -> str:
-        """A page of Markdown with its tables as they are now, each between two comments that
-        name it. Misconfigured (`table_missing`) when the page has no place for one."""
+        """Return a Markdown page with its tables replaced, each between two comments with its name.
+
+        Raises:
+            Misconfigured: `table_missing`, if the page has no place for a table.
+        """
         for sheet in self.sheets():
             begin, end = f"<!-- table {sheet.name} -->\n", f"\n<!-- end of {sheet.name} -->"
             before, found, rest = page.partition(begin)
@@ -158,7 +161,7 @@ class Sizing:
 
 
 def amount(value: float, unit: str) -> str:
-    """Three digits, and a unit that suits them: 393 kB, 1.97 TB, 2.2 h."""
+    """Format with three digits and a suitable unit: 393 kB, 1.97 TB, 2.2 h."""
     if unit == "B":
         return _scaled(value, (("PB", 1e15), ("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)))
     if unit == "s":
@@ -169,14 +172,14 @@ def amount(value: float, unit: str) -> str:
 
 
 def _scaled(value: float, units: Iterable[tuple[str, float]]) -> str:
-    """By the first unit that is not larger than the value, else by the last."""
+    """Scale by the first unit that is not larger than the value, else by the last."""
     *larger, smallest = units
     name, size = next((unit for unit in larger if value >= unit[1]), smallest)
     return f"{rounded(value / size)} {name}"
 
 
 def rounded(value: float) -> str:
-    """Three digits that count: 0.0116, 2.31, 45,700,000."""
+    """Format with three significant digits: 0.0116, 2.31, 45,700,000."""
     if value == 0:
         return "0"
     text = f"{float(f'{value:.3g}'):,.10f}".rstrip("0")

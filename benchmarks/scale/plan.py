@@ -1,4 +1,4 @@
-"""From photos and inputs to machines, bytes and money. Each number comes with its formula."""
+"""Derives machines, storage and cost from the number of photos and the inputs, with formulas."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from shared.storage.chunks import encode_rows
 MONTH_HOURS = 730.0
 DAY_SECONDS = 86_400.0
 MONTH_SECONDS = MONTH_HOURS * 3600
-MANIFEST_ROW_BYTES = 40  # a photo's id in the `.json` beside its chunk
+MANIFEST_ROW_BYTES = 40  # a photo's id in the chunk's `.json` manifest
 SLOT_ROWS = int(Settings.model_fields["slot_rows"].default)
 LEAST_CATALOG_RAM_BYTES = 8e9
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A derived number. `formula` names inputs and the numbers above it."""
+    """A derived number. `formula` names inputs and earlier numbers."""
 
     group: str
     what: str
@@ -32,7 +32,7 @@ class Number:
 
 @dataclass(slots=True)
 class Plan:
-    """All numbers for `photos` photos of one width, in the order in which they are derived."""
+    """All numbers for `photos` photos of one descriptor width, in the order of derivation."""
 
     photos: int
     width: Width
@@ -276,8 +276,7 @@ class Plan:
 
 
 def chunk_row_bytes(dimension: int) -> float:
-    """In the object store, for one photo: what `shared/storage/chunks.py` writes for a full
-    slot."""
+    """Object store bytes per photo, as `shared/storage/chunks.py` writes them for a full slot."""
     rows = np.zeros((2, dimension), np.float32)
     data = encode_rows(rows)
     header = len(data) - rows.nbytes

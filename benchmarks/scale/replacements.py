@@ -1,8 +1,8 @@
-"""Other ways to hold and scan rows of 98,304 dimensions, with what is known of their speed.
+"""Alternative ways to store and scan 98,304-dimensional descriptors, with their known speed.
 
-Only the first one is in the code. The others were measured alone, on drawn rows that resemble
-VLAD's (10,000 to 1,000,000 of them), with two threads on two cores of an EPYC with AVX-512 and
-VNNI; those on a GPU on paper only.
+Only the first one is implemented. The others were measured in isolation on synthetic rows that
+resemble VLAD's (10,000 to 1,000,000 of them), with two threads on two cores of an EPYC with AVX-512
+and VNNI; those on a GPU are estimates.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from benchmarks.scale.inputs import Inputs
 
 DIMENSION = 98_304
-GPU_BYTES_PER_SECOND = 0.8 * 4.8e12  # four fifths of an H200's
+GPU_BYTES_PER_SECOND = 0.8 * 4.8e12  # 80 % of an H200's memory bandwidth
 ON_PAPER = "on paper"
 ALONE = "measured alone, not built"
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """`memory_bytes` for one row; `row_seconds` of the first pass over all rows."""
+    """A scan: `memory_bytes` per row, `row_seconds` of the first pass over all rows."""
 
     name: str
     memory_bytes: float

@@ -1,4 +1,4 @@
-"""What a machine tells of itself in seconds: the speed of the scan, and what is beside the rows."""
+"""Measures inputs of the capacity planning on this machine: scan speed, memory besides the rows."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 CHUNK_ROWS = 1000
-CHUNKS = {7168: 20, 98_304: 2}  # 573 and 786 MB: far beyond every cache
+CHUNKS = {7168: 20, 98_304: 2}  # 573 and 786 MB: larger than any CPU cache
 ROUNDS = 7
 LISTED = 5000
 SEED = 20_261_121
 
 
 def measure(progress: Progress) -> Report:
-    """Figures named like the inputs that they stand for. Takes some seconds and a GB of memory."""
+    """Measure values named as the inputs that they replace; takes seconds and 1 GB of memory."""
     report = Report("This machine")
     bar = progress.add_task("measuring", total=len(CHUNKS) + 3)
     for dimension, chunks in CHUNKS.items():
@@ -57,7 +57,7 @@ def measure(progress: Progress) -> Report:
 
 
 def _scan_seconds(dimension: int, chunks: int) -> float:
-    """Of one row, in a search that compares all of them but the query's."""
+    """Return the seconds per row of a search that compares all rows with the query."""
     draw = np.random.default_rng(SEED)
     loaded = []
     for _ in range(chunks):
@@ -73,7 +73,7 @@ def _scan_seconds(dimension: int, chunks: int) -> float:
 
 
 def _facts(count: int) -> list[PhotoFilterValues]:
-    """Photos as a street has them: coordinates and a time, every third with a place, two tags."""
+    """Create typical metadata: coordinates, time, a place for every third photo, two tags."""
     return [
         PhotoFilterValues(
             photo_id=new_id(),
@@ -90,7 +90,7 @@ def _facts(count: int) -> list[PhotoFilterValues]:
 
 
 def _column_bytes() -> float:
-    """Of a row: arrays and the Python objects that they refer to."""
+    """Return the bytes per row of the arrays and of the Python objects that they refer to."""
     count = 5 * CHUNK_ROWS
     tracemalloc.start()
     try:
@@ -109,7 +109,7 @@ def _hash_rate() -> float:
 
 
 def _list_microseconds() -> float:
-    """Of one chunk's row, when a search worker lists a generation's chunks."""
+    """Return the microseconds per chunk row when a search worker lists a generation's chunks."""
     with TemporaryDirectory() as folder:
         catalog = Catalog(f"sqlite:///{Path(folder) / 'catalog.sqlite'}")
         try:
@@ -161,7 +161,7 @@ def _median_seconds(do: Callable[[], object]) -> float:
     do()  # the first one fills caches
     took = []
     for _ in range(ROUNDS):
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         do()
-        took.append(time.perf_counter() - begun)
+        took.append(time.perf_counter() - started_at)
     return statistics.median(took)

@@ -1,8 +1,9 @@
-"""How fast search is, next to what one would write without it, and whether it is ever wrong.
+"""Search benchmark: latency against baselines, correctness against brute force.
 
-`places` makes descriptors and `world` a map of them; `oracle` knows the right answers; `methods`
-are asked in `turns`, and `comparison` says what came of it. `cold`, `growth` and `load` measure
-what their names say; `memory` tells how fast memory is read, and how much of it was.
+`synthetic_map` creates descriptors and a map of them; `methods` holds the compared search methods
+and the brute-force ground truth; `comparison` times them in alternating turns. `cold_cache`,
+`growth` and `load` measure a cold page cache, the growth with the map, and concurrent load;
+`memory_traffic` measures memory bandwidth and the bytes that searches read.
 """
 
 from __future__ import annotations
@@ -40,10 +41,12 @@ def measure(
     load_seconds: float,
     folder: Path | None = None,
 ) -> Report:
-    """Every number of `photos` in every one of `dimensions`, `queries` of each kind. The largest
-    map of the longest descriptors is asked cold, too, and by many clients for `load_seconds`.
+    """Run the benchmark for every number of `photos` and every one of `dimensions`.
 
-    In a temporary folder below `folder`, on a real disk: 400 kB a photo of 98,304 dimensions.
+    Each kind of query is run `queries` times. The largest map of the longest descriptors is also
+    searched with a cold cache, and by many clients for `load_seconds`. Files are written to a
+    temporary folder below `folder`, which must be on a real disk: 400 kB per photo of 98,304
+    dimensions.
     """
     report = Report("Search", details={"comparisons": []})
     for dimension in sorted(dimensions, reverse=True):

@@ -1,4 +1,4 @@
-"""Queries whose rows are on the disk and in no cache."""
+"""Search latency when the descriptors are on disk and not in the page cache."""
 
 from __future__ import annotations
 
@@ -23,35 +23,34 @@ from benchmarks.search.methods import (
 from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
 from services.search.snapshot import Snapshot
 
-TARGET_SLOWDOWN = 5.0  # times a warm query, of the slowest in twenty
-MAX_CACHED_SHARE = 0.01  # of the rows' pages: else nothing was cold
+TARGET_SLOWDOWN = 5.0  # p95 of cold queries over p95 of warm ones
+MAX_CACHED_SHARE = 0.01  # of the rows' pages; with more the cache was not cold
 
 
 def measure_cold_cache(
     report: Report, world: SyntheticMap, city: SyntheticCity, queries: int, bar: Progress
 ) -> None:
-    """Each query warm, then with every row dropped from the page cache. The codes stay in memory.
+    """Time each query warm, then with all rows dropped from the page cache (not the codes).
 
-    A page that a process has mapped can't be dropped: its own mapping is given up first
-    (MADV_DONTNEED), then the file's pages are (posix_fadvise DONTNEED); `mincore` says what is
-    left.
+    A page that a process has mapped cannot be dropped. Its mapping is released first
+    (MADV_DONTNEED), then the file's pages (posix_fadvise DONTNEED); `mincore` reports what remains.
     """
-    gc.collect()  # mappings of those who were asked before
+    gc.collect()  # releases the mappings of earlier searches
     task = bar.add_task("cold", total=queries)
-    asked = city.revisits(len(world.photo_ids), queries)
+    query_rows = city.revisits(len(world.photo_ids), queries)
     pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
-    oracle = BruteForce.of(pieces, world.photo_ids, asked)
+    oracle = BruteForce.of(pieces, world.photo_ids, query_rows)
     worker = load_worker(world)
     snapshot = worker.snapshot(world.generation_id, world.version)
-    ours = PlacewiseSearch(world, worker, asked)
+    ours = PlacewiseSearch(world, worker, query_rows)
     warm, cold, cached, differ = [], [], [], 0
     for number in range(queries):
-        question = BenchmarkQuery(number, MATCHED_CASE.k)
-        ours.search(question)
-        warm.append(_time_search(ours, question)[0])
+        params = BenchmarkQuery(number, MATCHED_CASE.k)
+        ours.search(params)
+        warm.append(_time_search(ours, params)[0])
         drop_page_cache(snapshot, world)
         cached.append(cached_share(snapshot))
-        seconds, found = _time_search(ours, question)
+        seconds, found = _time_search(ours, params)
         cold.append(seconds)
         differ += not same_ranking(found, oracle.best(number, MATCHED_CASE.k))
         bar.advance(task)
@@ -68,7 +67,7 @@ def measure_cold_cache(
 def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
     """Drop the chunks' rows from the page cache."""
     for chunk in snapshot.chunks:
-        assert chunk.stored is not None, "a loaded chunk lies on the disk"
+        assert chunk.stored is not None, "a loaded chunk is on disk"
         chunk.stored.file.memory.madvise(mmap.MADV_DONTNEED)
     for path in world.chunk_paths():
         with path.open("rb") as file:
@@ -76,9 +75,9 @@ def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
 
 
 def cached_share(snapshot: Snapshot) -> float:
-    """The share of the rows' pages that are in memory."""
+    """Return the share of the rows' pages that are in memory."""
     libc = ctypes.CDLL(None, use_errno=True)
-    there = pages = 0
+    cached_pages = pages = 0
     for chunk in snapshot.chunks:
         assert chunk.stored is not None
         memory = chunk.stored.file.memory
@@ -88,12 +87,12 @@ def cached_share(snapshot: Snapshot) -> float:
         room = ctypes.c_void_p(found.ctypes.data)
         if libc.mincore(ctypes.c_void_p(address), ctypes.c_size_t(len(memory)), room) != 0:
             raise OSError(ctypes.get_errno(), "mincore")
-        there += int(np.count_nonzero(found & 1))
+        cached_pages += int(np.count_nonzero(found & 1))
         pages += count
-    return there / pages
+    return cached_pages / pages
 
 
-def _time_search(ours: PlacewiseSearch, question: BenchmarkQuery) -> tuple[float, Ranking]:
-    begun = time.perf_counter()
-    found = ours.search(question)
-    return time.perf_counter() - begun, found
+def _time_search(ours: PlacewiseSearch, params: BenchmarkQuery) -> tuple[float, Ranking]:
+    started_at = time.perf_counter()
+    found = ours.search(params)
+    return time.perf_counter() - started_at, found

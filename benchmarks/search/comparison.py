@@ -1,6 +1,6 @@
-"""What a comparison of methods has found, and what of it is wanted.
+"""Compares search methods on the same queries, and reports the results with their bounds.
 
-Every query through every method in turn: a busy machine is busy for all of them.
+Every query is run with all methods in turn, so that other load affects all of them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from shared.storage.chunks import Rows
 PLACEWISE_METHODS = (PlacewiseSearch.name, PlacewiseWorker.name)
 TARGET_MAP_SIZE = (10_000, 98_304)
 """Photos and dimension for which figures are wanted."""
-NOISE_FACTOR = 1.1  # of two medians of one run: less is the clock's noise
+NOISE_FACTOR = 1.1  # ratio of two medians of a run; smaller differences are timing noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ QUERY_CASES = (
 
 @dataclass(frozen=True, slots=True)
 class MethodTiming:
-    """What one method did in one case."""
+    """Timings of one method in one case."""
 
     case: str
     method: str
@@ -86,7 +86,7 @@ class MethodTiming:
 
 @dataclass(slots=True)
 class MethodComparison:
-    """All cases of one size of map."""
+    """All cases of one map size."""
 
     photos: int
     dimension: int
@@ -102,7 +102,7 @@ class MethodComparison:
         return next(row for row in self.rows if (row.case, row.method) == (case.name, method))
 
     def ratio(self, case: QueryCase, method: str) -> float:
-        """How many times longer the method takes than ours."""
+        """Return the method's time divided by that of Placewise."""
         return self.row(case, method).median_ms / self.row(case, PlacewiseSearch.name).median_ms
 
     def as_json(self) -> dict[str, object]:
@@ -133,7 +133,7 @@ class MethodComparison:
 
 
 def report_comparison(report: Report, compared: MethodComparison) -> None:
-    """Put what is wanted of a comparison into the report."""
+    """Add a comparison to the report, with the bounds that it must meet."""
     c = compared
     wanted = (c.photos, c.dimension) == TARGET_MAP_SIZE
     size = f"{c.photos:,} x {c.dimension:,}"
@@ -182,7 +182,7 @@ PAUSE_SECONDS = 0.05
 
 
 def load_worker(world: SyntheticMap) -> SearchWorker:
-    """A search worker that has loaded the map."""
+    """Return a search worker that has loaded the map."""
     worker = SearchWorker(world.catalog, world.store, world.settings)
     worker.sync()
     status = worker.status()
@@ -194,18 +194,18 @@ def load_worker(world: SyntheticMap) -> SearchWorker:
 def compare_methods(
     world: SyntheticMap, city: SyntheticCity, queries: int, progress: Progress
 ) -> MethodComparison:
-    """All cases with `queries` each."""
+    """Run all cases with `queries` queries each."""
     task = progress.add_task("asking", total=len(QUERY_CASES) * queries)
     photos = len(world.photo_ids)
-    asked = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
-    oracle = BruteForce.of(_stored_rows(world), world.photo_ids, asked)
+    query_rows = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
+    oracle = BruteForce.of(_stored_rows(world), world.photo_ids, query_rows)
     before = private_bytes()
     worker = load_worker(world)
     grown = private_bytes() - before
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
     draw = random.Random(city.seed)
-    with MemoryBandwidth() as speed, _make_methods(world, worker, asked) as (methods, ours):
+    with MemoryBandwidth() as speed, _make_methods(world, worker, query_rows) as (methods, ours):
         for case in QUERY_CASES:
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             took[case.name] = {method.name: [] for method in methods}
@@ -216,9 +216,9 @@ def compare_methods(
                 expected = oracle.best(number, case.k, case.min_score)
                 for method in draw.sample(methods, len(methods)):
                     time.sleep(PAUSE_SECONDS)
-                    begun = time.perf_counter()
+                    started_at = time.perf_counter()
                     found = method.search(question)
-                    took[case.name][method.name].append(time.perf_counter() - begun)
+                    took[case.name][method.name].append(time.perf_counter() - started_at)
                     right = same_ranking if method.name in PLACEWISE_METHODS else same_photos
                     differ[case.name, method.name] += not right(found, expected)
                 speed.sample()
@@ -295,7 +295,7 @@ def _make_methods(
 
 
 def _sign_codes_of(snapshot: Snapshot, rows: Rows) -> SignCodes:
-    """Those of the snapshot, or made here where it does without."""
+    """Return the snapshot's sign codes; compute them if it has none."""
     codes = [chunk.codes for chunk in snapshot.chunks if chunk.codes is not None]
     if len(codes) < len(snapshot.chunks):
         return encode_signs(rows)
@@ -305,6 +305,6 @@ def _sign_codes_of(snapshot: Snapshot, rows: Rows) -> SignCodes:
 
 
 def _stored_rows(world: SyntheticMap) -> Iterator[Rows]:
-    """The rows of each chunk, mapped from its file."""
+    """Map the rows of each chunk from its file."""
     for path in world.chunk_paths():
         yield np.load(path, mmap_mode="r")

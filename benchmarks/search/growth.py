@@ -1,4 +1,4 @@
-"""How the scan of the codes grows with the map; the codes are random words, made directly."""
+"""Scan time of the sign codes as the map grows; the codes are random words."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shared.codes.sign_codes import level_ends
 DIMENSION = 98_304
 MEASURED_SIZES = (100_000, 1_000_000)
 EXTRAPOLATED_SIZES = (3_000_000, 10_000_000)
-BLOCK_ROWS = 1000  # of a chunk
+BLOCK_ROWS = 1000  # rows per chunk
 ROUNDS = 15
 TARGET_RATIO = 1.3
 SEED = 20_261_121
@@ -28,7 +28,7 @@ SEED = 20_261_121
 def measure_growth(
     report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
 ) -> None:
-    """Scans and reads of the same codes, in turn."""
+    """Time scans and plain reads of the same codes in turn."""
     turn = get_rotation(DIMENSION)
     words = int(level_ends(turn.padded)[0])
     draw = np.random.default_rng(SEED)
@@ -40,14 +40,14 @@ def measure_growth(
     for rows in sizes:
         codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
         blocks = _blocks(codes)
-        asked = np.ones(rows, bool)
+        mask = np.ones(rows, bool)
         took = []
-        scan_first_level(blocks, [query], [asked])
+        scan_first_level(blocks, [query], [mask])
         with MemoryBandwidth(codes) as speed:
             for _ in range(ROUNDS):
-                begun = time.perf_counter()
-                scan_first_level(blocks, [query], [asked])
-                took.append(time.perf_counter() - begun)
+                started_at = time.perf_counter()
+                scan_first_level(blocks, [query], [mask])
+                took.append(time.perf_counter() - started_at)
                 speed.sample()
                 progress.advance(task)
         seconds = median(took)
@@ -77,7 +77,7 @@ def measure_growth(
 
 
 def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:
-    """Codes as a scan wants them: chunk by chunk, their first level only."""
+    """Return codes as the scan takes them: by chunk, the first level only."""
     begins = np.arange(0, len(codes), BLOCK_ROWS)
     nothing = np.empty(0, np.uint64)
     return SignCodeBlocks(

@@ -1,7 +1,7 @@
-"""Many clients at once, while photos are added, deleted and merged: is any answer wrong?
+"""Correctness under load: clients search while photos are added, deleted and merged.
 
-The search service runs in a process of its own, as in production. Every answer names the version
-of the map that it is of, and is compared with brute force on the photos that the map had then.
+The search service runs in a process of its own, as in production. Each response names the version
+of the map that it refers to, and is compared with brute force on the photos of that version.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ CLIENTS = 32
 QUERIES = 48
 OUT_OF_MAP_QUERIES = 16  # of them
 TOP_KS = (1, 10, 100)
-ADDED_PHOTOS = 240  # photos that are added meanwhile
+ADDED_PHOTOS = 240  # photos that are added during the load
 CHANGE_SECONDS = 0.25
 CHANGES_PER_MERGE = 20
-MAX_SIMILARITY = 0.8  # how much of another photo is in one that is added
+MAX_SIMILARITY = 0.8  # maximum share of another photo's content in an added photo
 SEED = 20_261_121
 JSON_HEADERS = {"Content-Type": "application/json"}
 
@@ -57,7 +57,7 @@ class SearchObservation:
 
 @dataclass(slots=True)
 class LoadOutcome:
-    """What clients and the one who changes the map have seen."""
+    """Responses and changes recorded during the load."""
 
     answered: list[SearchObservation] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -69,7 +69,7 @@ class LoadOutcome:
     seconds: float = 0.0
 
     def live_at(self, version: int) -> int:
-        """The number of the entry of `live`. ValueError for a version before the first."""
+        """Return a version's index in `live`; ValueError for a version before the first."""
         found = bisect.bisect_right(self.versions, version) - 1
         if found < 0:
             raise ValueError(f"version {version} is older than all")
@@ -79,7 +79,7 @@ class LoadOutcome:
 def measure_load(
     report: Report, world: SyntheticMap, city: SyntheticCity, seconds: float, progress: Progress
 ) -> None:
-    """CLIENTS ask for `seconds`."""
+    """Run CLIENTS clients for `seconds`."""
     photos = len(world.photo_ids)
     paths = world.chunk_paths()
     queries = np.concatenate(
@@ -115,8 +115,7 @@ def measure_load(
 
 
 def count_wrong_answers(outcome: LoadOutcome, oracle: BruteForce) -> int:
-    """Answers that are not those of brute force on the version that they name, or that name one
-    older than they had to know."""
+    """Count responses that differ from brute force on their version, or are too old."""
     expected: dict[tuple[int, int, int], Ranking] = {}
     wrong = 0
     for answered in outcome.answered:
@@ -152,14 +151,14 @@ def _run_load(
             _send_query(world, caller, keys, number, TOP_KS[number], outcome)
         outcome.answered.clear()
         with ThreadPoolExecutor(CLIENTS + 1) as pool_of_threads:
-            begun = time.monotonic()
+            started_at = time.monotonic()
             calls = [
                 pool_of_threads.submit(_client_loop, world, caller, keys, number, outcome, stop)
                 for number in range(CLIENTS)
             ]
             calls.append(pool_of_threads.submit(_change_loop, world, pool, outcome, stop))
             try:
-                while (spent := time.monotonic() - begun) < seconds:
+                while (spent := time.monotonic() - started_at) < seconds:
                     progress.update(task, completed=spent)
                     if any(call.done() for call in calls):
                         break  # one of them has died: its error is raised below
@@ -168,7 +167,7 @@ def _run_load(
                 stop.set()
             for call in calls:
                 call.result()
-            outcome.seconds = time.monotonic() - begun
+            outcome.seconds = time.monotonic() - started_at
     return outcome
 
 
@@ -195,10 +194,10 @@ def _send_query(
 ) -> None:
     least = outcome.versions[-1]
     body = world.request(keys[query], k, least).model_dump_json().encode()
-    begun = time.perf_counter()
+    started_at = time.perf_counter()
     try:
         answer = caller.call("POST", "/search", body, **JSON_HEADERS)
-        took = time.perf_counter() - begun
+        took = time.perf_counter() - started_at
         if answer.status == 200:
             response = SearchResponse.model_validate_json(answer.body)
             outcome.answered.append(SearchObservation(query, k, least, response, took))
@@ -211,7 +210,7 @@ def _send_query(
 def _change_loop(
     world: SyntheticMap, pool: Rows, outcome: LoadOutcome, stop: threading.Event
 ) -> None:
-    """Add a photo, delete another one, merge what was added from time to time."""
+    """Add a photo, delete another one, and merge the added chunks from time to time."""
     draw = random.Random(SEED)
     slot = len(world.photo_ids)  # far beyond those that are there
     added = turn = 0
@@ -238,7 +237,7 @@ def _record_version(outcome: LoadOutcome, version: int, live: NDArray[np.bool_])
 
 
 def _similar_rows(queries: Rows, others: Rows) -> Rows:
-    """(POOL, dimension): photos that answer the queries more or less."""
+    """Return (POOL, dimension) rows of photos that match the queries to different degrees."""
     draw = np.random.default_rng(SEED)
     rows = queries[draw.integers(len(queries), size=ADDED_PHOTOS)]
     for row in rows:  # one after the other: the pool alone is large enough
@@ -251,7 +250,7 @@ def _similar_rows(queries: Rows, others: Rows) -> Rows:
 
 @contextlib.contextmanager
 def _start_search_service(world: SyntheticMap) -> Iterator[ServiceProcess]:
-    """`placewise search` on the map."""
+    """Start `placewise search` on the map."""
     (port,) = free_ports(1)
     home = world.settings.placewise_home
     service = ServiceProcess(

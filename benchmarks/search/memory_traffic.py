@@ -1,4 +1,4 @@
-"""How fast this machine reads memory, what a search reads of it, and how much a process holds."""
+"""Measures memory bandwidth, the bytes that a search reads, and the memory of a process."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from services.search import kernels
 from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
-STREAM_BYTES = 256_000_000  # beyond every cache
+STREAM_BYTES = 256_000_000  # larger than any CPU cache
 
 Words = NDArray[np.uint64]
 
 
 @numba_jit(REORDERED_FASTMATH)
 def _xor_words(words: Words) -> np.uint64:
-    """Something that depends on every word; four streams at once, which is faster than one."""
+    """Return a value that depends on every word; four streams at once are faster than one."""
     quarter = words.shape[0] // 4
     a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
     d = words[3 * quarter :]
@@ -39,14 +39,14 @@ def _xor_words(words: Words) -> np.uint64:
 
 
 class MemoryBandwidth:
-    """How fast memory is read: by one thread, and by one on each core; the faster is the floor.
+    """Measures memory bandwidth by one thread, and by one thread per core; the faster counts.
 
-    A context manager. Samples are taken between other measurements, so that what disturbs one
-    disturbs the other.
+    A context manager. Samples are taken between other measurements, so that other load on the
+    machine affects both.
     """
 
     def __init__(self, words: Words | None = None) -> None:
-        """What is read: these words, or some that lie in no cache."""
+        """Read these words, or by default some that do not fit into any CPU cache."""
         self._words = np.ones(STREAM_BYTES // 8, np.uint64) if words is None else words.ravel()
         cores = len(os.sched_getaffinity(0))
         self._parts = np.array_split(self._words, cores)
@@ -56,16 +56,16 @@ class MemoryBandwidth:
 
     def sample(self) -> None:
         """Read everything once in each way."""
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         _xor_words(self._words)
         alone = time.perf_counter()
         list(self._pool.map(_xor_words, self._parts))
-        self._took[0].append(alone - begun)
+        self._took[0].append(alone - started_at)
         self._took[1].append(time.perf_counter() - alone)
 
     @property
     def bytes_per_second(self) -> float:
-        """The median of the faster way. StatisticsError before the first sample."""
+        """Median rate of the faster way. StatisticsError before the first sample."""
         return self._words.nbytes / min(map(median, self._took))
 
     def __enter__(self) -> Self:
@@ -77,14 +77,14 @@ class MemoryBandwidth:
 
 @dataclass(slots=True)
 class ByteCounter:
-    """Bytes of codes and rows that were read."""
+    """Number of bytes of codes and rows read."""
 
     size_bytes: int = 0
 
 
 @contextlib.contextmanager
 def count_bytes_read() -> Iterator[ByteCounter]:
-    """Counts what searches by codes read while the block runs: their loops are told which rows."""
+    """Count the bytes that searches by codes read inside the block, by wrapping their loops."""
     count = ByteCounter()
 
     lock = threading.Lock()
@@ -114,14 +114,14 @@ def count_bytes_read() -> Iterator[ByteCounter]:
 
 
 def _distance_bytes(
-    _blocks: Any, _first: Any, asked: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
+    _blocks: Any, _first: Any, mask: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
 ) -> int:
-    rows = np.count_nonzero(asked[..., begin:end].reshape(-1, end - begin).any(axis=0))
+    rows = np.count_nonzero(mask[..., begin:end].reshape(-1, end - begin).any(axis=0))
     return 8 * int(query.shape[-1]) * int(rows)
 
 
 def private_bytes() -> int:
-    """Memory of this process that is no file's: what mapped files take is the system's cache."""
+    """Return the private memory of this process, without the page cache of mapped files."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("RssAnon:"):
             return 1024 * int(line.split()[1])

@@ -1,16 +1,16 @@
-"""A map as the services keep it: a catalog, a store, chunks of 1,000 rows, photos.
+"""Synthetic map as the services store it: catalog, object store, chunks of 1,000 rows, photos.
 
-Descriptors like those of VLAD on walks through a city, made without a photo.
+The descriptors resemble those of VLAD on walks through a city and are generated without photos.
 
-A descriptor is 64 blocks, one for each visual word, each of length 1 or empty, divided by the root
-of how many are not. What a block holds lies mostly in a subspace of its own with a power law of
-strengths; a direction that all photos share, and channels that are stronger than others, come on
-top. Photos of one walk follow each other as an AR(1) process; its steps are small while they show
-one place, and large from place to place. Walks differ in how many photos show a place: 1, 3 or 30.
+A descriptor has 64 blocks, one per visual word, each of unit length or empty, divided by the square
+root of the number of blocks that are not empty. A block lies mostly in a subspace of its own with a
+power law of variances; a direction common to all photos, and channels of higher variance, are
+added. The photos of a walk are an AR(1) process whose steps are small within a place and large
+between places. Walks differ in the number of photos per place: 1, 3 or 30.
 
-The figures are set to what was measured at 98,304 dimensions on descriptors of photos' features:
-photos of different places have cosines of about 0.09 +- 0.03, a place that is seen again 0.35 to
-0.75, the tenth best photo of a query out of the map less than 0.2.
+The parameters are fitted to measurements at 98,304 dimensions on descriptors of photos' features:
+photos of different places have cosines of about 0.09 +- 0.03, a revisited place 0.35 to 0.75, and
+the tenth best photo of a query from outside the map less than 0.2.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CHUNK_ROWS = 1000
 
 @dataclass(slots=True)
 class SyntheticMap:
-    """One map in a folder, changed as the extractor, the gateway and the steward change it."""
+    """A map in a folder, which is changed as extractor, gateway and steward change it."""
 
     settings: Settings
     catalog: Catalog
@@ -61,13 +61,12 @@ class SyntheticMap:
 
     @property
     def version(self) -> int:
-        """The map's, now."""
+        """Current version of the map."""
         with self.catalog.read() as session:
             return session.get_one(Map, self.map_id).version
 
     def add(self, rows: Rows, slot: int | None = None) -> int:
-        """Publish a chunk of new photos, in a slot of its own unless one is named; the version
-        that has them."""
+        """Publish a chunk of new photos, by default in a new slot; return the map's version."""
         chunk_id, photo_ids = new_id(), [new_id() for _ in rows]
         written = write_chunk(
             self.store,
@@ -110,7 +109,7 @@ class SyntheticMap:
         return version
 
     def delete(self, photo_id: UUID) -> int:
-        """The version from which on the photo is gone."""
+        """Delete a photo; return the version from which on it is gone."""
         with self.catalog.write() as session:
             lock_map(session, self.map_id)
             version = increment_map_version(session, self.map_id)
@@ -118,11 +117,11 @@ class SyntheticMap:
         return version
 
     def merge(self, slot: int) -> bool:
-        """Write the slot's chunks into one, as the steward does."""
+        """Merge the slot's chunks into one, as the steward does."""
         return merge_slot(self.catalog, self.store, self.generation_id, slot)
 
     def chunk_paths(self) -> list[Path]:
-        """The files of the live chunks."""
+        """Return the files of the live chunks."""
         with self.catalog.read() as session:
             keys = [chunk.object_key for chunk in list_live_chunks(session, self.generation_id)]
         return [self.store.path(key) for key in keys]
@@ -130,7 +129,7 @@ class SyntheticMap:
     def request(
         self, object_key: str, k: int, min_version: int, min_score: float | None = None
     ) -> SearchRequest:
-        """A question with a row that `ask_with` has stored."""
+        """Build a search request for a row that `store_query` has stored."""
         return SearchRequest(
             map_id=self.map_id,
             generation_id=self.generation_id,
@@ -142,7 +141,7 @@ class SyntheticMap:
         )
 
     def store_query(self, row: Row) -> str:
-        """Store a query's descriptor, as a `describe` job does; its key."""
+        """Store a query's descriptor, as a `describe` job does; return its key."""
         key = f"queries/{new_id()}.npy"
         self.store.put(key, encode_rows(row[np.newaxis]))
         return key
@@ -165,7 +164,7 @@ class SyntheticMap:
 def create_synthetic_map(
     home: Path, dimension: int, *, search_memory_budget: int
 ) -> Iterator[SyntheticMap]:
-    """An empty map in the folder `home`, in a SQLite catalog."""
+    """Create an empty map in the folder `home`, in a SQLite catalog."""
     chosen = Settings(
         _env_file=None, placewise_home=home, search_memory_budget=search_memory_budget
     )
@@ -197,8 +196,10 @@ def create_synthetic_map(
 
 
 def required_memory_bytes(photos: int, dimension: int) -> int:
-    """SEARCH_MEMORY_BUDGET for the codes of so many photos, or their rows where search does
-    without codes; other rows stay mapped files."""
+    """Return the SEARCH_MEMORY_BUDGET for the codes of so many photos.
+
+    If search does not use codes, it is that of their rows. Other rows stay memory-mapped.
+    """
     return max(photos * get_rotation(dimension).padded // 8, MIN_CODED_BYTES)
 
 
@@ -207,12 +208,12 @@ WALK_PHOTOS = 250
 PHOTOS_PER_PLACE = (1, 3, 30)
 """Of walk number n: the entry n modulo 3."""
 
-SUBSPACE = 110  # dimensions of a block's subspace, at most; half of the block's own
-DECAY = 0.6  # the strength of its i-th direction is i^-DECAY
-SHARED = 0.42  # strength of the shared direction, against 1 of the subspace
-NOISE = 0.5  # of what no other photo repeats
-EMPTY_BELOW = -0.583  # of a normal deviate: 28 % of the blocks
-WORD_COUNT_SPREAD = 0.22  # how much photos differ in the number of their words
+SUBSPACE = 110  # maximum dimension of a block's subspace; otherwise half of the block's width
+DECAY = 0.6  # the standard deviation of its i-th direction is i^-DECAY
+SHARED = 0.42  # strength of the shared direction relative to the subspace
+NOISE = 0.5  # strength of the noise of a single photo
+EMPTY_BELOW = -0.583  # threshold of a normal deviate; leaves 28 % of the blocks empty
+WORD_COUNT_SPREAD = 0.22  # spread of the number of words per photo
 STRONG_CHANNELS = 0.01
 STRENGTH = 9.0  # of their noise
 
@@ -221,14 +222,14 @@ NEXT_PLACE_CORRELATION = 0.85
 MIN_CHANGE, MAX_CHANGE = 0.05, 0.6
 """Of the appearance of a place that is seen again: the share of the latent variance."""
 
-OUT_OF_MAP_WALKS = 1_000_000  # numbers of walks that are in no map
+OUT_OF_MAP_WALKS = 1_000_000  # first number of walks that are in no map
 
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class Latents:
-    """What n photos show, before noise."""
+    """Latent content of n photos, before noise."""
 
     looks: Floats
     """(n, BLOCKS, subspace): normal deviates."""
@@ -237,7 +238,7 @@ class Latents:
 
 
 class SyntheticCity:
-    """Photos of one dimension, the same for the same seed; 64 must divide the dimension."""
+    """Generates descriptors of one dimension (a multiple of 64), deterministic for a seed."""
 
     def __init__(self, dimension: int, seed: int) -> None:
         if dimension % BLOCKS:
@@ -255,7 +256,7 @@ class SyntheticCity:
         self._channels = NOISE * _normalise(np.where(strong, np.float32(STRENGTH), np.float32(1.0)))
 
     def chunks(self, photos: int, chunk_rows: int) -> Iterator[Rows]:
-        """The map's first `photos` descriptors, (n, dimension) of length 1, in pieces."""
+        """Yield the map's first `photos` descriptors in pieces of (n, dimension), L2-normalised."""
         waiting: list[Rows] = []
         made = 0
         for walk in range(-(-photos // WALK_PHOTOS)):
@@ -270,7 +271,7 @@ class SyntheticCity:
             yield rest
 
     def revisits(self, photos: int, count: int) -> Rows:
-        """(count, dimension): places of the map seen again, changed little or much."""
+        """Return (count, dimension) descriptors of revisited places, more or less changed."""
         draw = self._draw(OUT_OF_MAP_WALKS, 2)
         rows = np.empty((count, self.dimension), np.float32)
         walks = photos // WALK_PHOTOS
@@ -288,7 +289,7 @@ class SyntheticCity:
         return rows
 
     def out_of_map_rows(self, count: int) -> Rows:
-        """(count, dimension): photos of other walks, whose places are not in the map."""
+        """Return (count, dimension) descriptors of other walks, whose places are not in the map."""
         rows = np.empty((count, self.dimension), np.float32)
         for number in range(count):
             draw = self._draw(OUT_OF_MAP_WALKS + 1 + number, 0)
@@ -296,7 +297,7 @@ class SyntheticCity:
         return rows
 
     def walk(self, number: int) -> Latents:
-        """The photos of a walk, one after the other."""
+        """Yield the photos of a walk in order."""
         draw = self._draw(number, 0)
         found = self._fresh(WALK_PHOTOS, draw)
         of_a_place = PHOTOS_PER_PLACE[number % len(PHOTOS_PER_PLACE)]
@@ -307,7 +308,7 @@ class SyntheticCity:
         return found
 
     def describe(self, latents: Latents, draw: np.random.Generator) -> Rows:
-        """(n, dimension) descriptors of length 1."""
+        """Return (n, dimension) L2-normalised descriptors."""
         count = len(latents.looks)
         rows = draw.standard_normal((count, BLOCKS, self._width), np.float32)
         rows *= self._channels
@@ -323,7 +324,7 @@ class SyntheticCity:
         return rows.reshape(count, self.dimension)
 
     def _fresh(self, count: int, draw: np.random.Generator) -> Latents:
-        """Photos that have nothing in common."""
+        """Return photos that have nothing in common."""
         looks = draw.standard_normal((count, BLOCKS, self._subspace), np.float32)
         rich = draw.standard_normal((count, 1), np.float32)
         words = draw.standard_normal((count, BLOCKS), np.float32)
@@ -332,7 +333,7 @@ class SyntheticCity:
         )
 
     def _changed(self, photos: Latents, share: float, draw: np.random.Generator) -> Latents:
-        """The same places, `share` of what they look like another."""
+        """Return the same places with the share `share` of their appearance replaced."""
         new = self._fresh(len(photos.looks), draw)
         keep = math.sqrt(1 - share)
         return Latents(
@@ -345,11 +346,11 @@ class SyntheticCity:
 
 
 def _complement(keep: float) -> np.float32:
-    """What a new deviate is multiplied with, so that the variance stays 1."""
+    """Return the factor of new noise that keeps the variance at 1."""
     return np.float32(math.sqrt(1 - keep**2))
 
 
 def _normalise(rows: Floats) -> Floats:
-    """Each row of length 1."""
+    """L2-normalise each row."""
     found: Floats = rows / np.linalg.norm(rows, axis=-1, keepdims=True)
     return found

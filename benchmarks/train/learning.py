@@ -1,7 +1,8 @@
-"""Whether a network learns places: against itself untrained, where it has never been.
+"""Recall gained by training over the untrained network, on places that were not trained on.
 
-It learns in the school quarter of a generated city. It is asked in that city's map quarter (other
-streets of the same style) and in another city of another catalogue (other walls, colours, windows).
+The network is trained in the school quarter of a generated city. It is evaluated in that city's map
+quarter (other streets of the same style) and in another city with another catalogue (other walls,
+colours, windows).
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class RecallGain:
-    """R@k as shares; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
+    """R@k from 0 to 1; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
 
     untrained: float
     trained: float
@@ -66,18 +67,18 @@ class RecallGain:
 
 
 class BarDisplay(NullDisplay):
-    """A run's progress as bars of a benchmark."""
+    """Display of a run that shows its progress as bars of the benchmark."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__()
         self._progress = progress
         self._bars: dict[str, Any] = {}
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         if what not in self._bars:
-            self._bars[what] = self._progress.add_task(what, total=most)
-        self._progress.update(self._bars[what], completed=done, total=most)
-        if done >= most:
+            self._bars[what] = self._progress.add_task(what, total=total)
+        self._progress.update(self._bars[what], completed=done, total=total)
+        if done >= total:
             self._progress.remove_task(self._bars.pop(what))
 
 
@@ -91,7 +92,7 @@ def measure_learning(
     device: Device,
     seed: int,
 ) -> dict[str, RecallGain]:
-    """By where it was asked: `other streets` and `another catalogue`."""
+    """Return the gain by evaluation set: `other streets` and `another catalogue`."""
     width, height = PHOTO_SIZE
     here = CityOptions(places, VIEWS, places, seed, 0, 0.0, width, height)
     elsewhere = replace(here, seed=seed + 1, catalogue_seed=1, train=False)
@@ -99,18 +100,18 @@ def measure_learning(
         "other streets": _draw_city(progress, here, folder / "here"),
         "another catalogue": _draw_city(progress, elsewhere, folder / "elsewhere"),
     }
-    said = _training_arguments(
+    arguments = _training_arguments(
         folder / "here", folder / "runs", epochs, image_size, workers, device, seed
     )
     report = run.run(
-        build_arguments({**said, "run_name": "gem"}), BarDisplay(progress), StopRequest()
+        build_arguments({**arguments, "run_name": "gem"}), BarDisplay(progress), StopRequest()
     )
     trained = load_checkpoint(Path(report["best"]["path"])).model
     seed_everything(seed)
-    untrained = make_model(build_arguments(said), NullDisplay(), resuming=False)
+    untrained = make_model(build_arguments(arguments), NullDisplay(), resuming=False)
     return {
-        where: measure_gain(untrained, trained, asked, image_size, device)
-        for where, asked in sets.items()
+        name: measure_gain(untrained, trained, evaluation_set, image_size, device)
+        for name, evaluation_set in sets.items()
     }
 
 
@@ -122,23 +123,23 @@ def measure_gain(
     device: Device,
     k: int = 1,
 ) -> RecallGain:
-    """What the one network finds among its first k beyond the other, on the same queries."""
-    found = []
+    """Return the difference of recall@k of two networks on the same queries."""
+    within = []
     for model in (untrained, trained):
         describe = ModelDescriber(
             model.to(device.torch_device), device.torch_device, (image_size, image_size)
         )
         ranked = evaluate_recall(describe, evaluation_set, ks=(k,)).ranked.indices
         hits = compute_hits(ranked, evaluation_set.positives)[:, :k]
-        found.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
+        within.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
     (difference,) = paired_differences(
-        found[1], found[0], cluster_queries(evaluation_set.queries).of
+        within[1], within[0], cluster_queries(evaluation_set.queries).labels
     )
     assert difference.low is not None
     assert difference.high is not None
     return RecallGain(
-        float(found[0].mean()),
-        float(found[1].mean()),
+        float(within[0].mean()),
+        float(within[1].mean()),
         difference.mean,
         difference.low,
         difference.high,
@@ -156,15 +157,15 @@ def measure_grid(
     device: Device,
     seed: int,
 ) -> tuple[Table, list[dict[str, str]]]:
-    """Three aggregators x two losses on the city that `measure_learning` has drawn."""
-    said = _training_arguments(
+    """Train three aggregators x two losses on the city that `measure_learning` has generated."""
+    arguments = _training_arguments(
         folder / "here", folder / "grid", epochs, image_size, workers, device, seed
     )
-    del said["default_root_dir"]
+    del arguments["default_root_dir"]
     plan = GridPlan(
         tuple(
             PlannedRun(
-                f"{aggregator['agg_arch']}-{loss}", {**said, **aggregator, "loss_name": loss}
+                f"{aggregator['agg_arch']}-{loss}", {**arguments, **aggregator, "loss_name": loss}
             )
             for aggregator in AGGREGATORS
             for loss in LOSSES
@@ -206,7 +207,7 @@ def _training_arguments(
         "pretrained": False,
         "layers_to_freeze": -1,
         "agg_arch": "GeM",
-        "augmentation": "none",  # the sessions' light and weather are enough to begin with
+        "augmentation": "none",  # light and weather already differ between the sessions
         "image_size": image_size,
         "batch_size": PLACES_PER_BATCH,
         "img_per_place": 4,

@@ -1,4 +1,4 @@
-"""Photos a second: read, learned from, and the time that the one waits for the other."""
+"""Training throughput: photos loaded and trained on per second, share of time spent waiting."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ IMAGE_PIXELS = 224
 STORED_PHOTO_SIZE = (960, 1280)
 """height and width of a photo as cameras and street view give them"""
 DISTINCT_PHOTOS = 32
-"""photos drawn; they are read again and again, from the page cache"""
+"""number of generated photos; they are read repeatedly, from the page cache"""
 PHOTOS_PER_PLACE = 4
 PLACES_PER_BATCH = 8
 WARM_UP_BATCHES = 2
@@ -42,18 +42,22 @@ WARM_UP_BATCHES = 2
 
 @dataclass(frozen=True, slots=True)
 class TrainingThroughput:
+    """Rates in photos per second."""
+
     reading: dict[str, float]
-    """photos a second, by how"""
+    """loading and augmentation, by method"""
     network: float
-    """photos a second through forward, loss, backward and step, alone"""
+    """forward, loss, backward and optimizer step, without loading"""
     training: float
+    """loading and training together"""
     share_waiting: float
+    """share of the training time spent waiting for photos"""
 
 
 def measure_throughput(
     progress: Progress, folder: Path, photos: int, workers: int, device: Device
 ) -> TrainingThroughput:
-    """Over so many photos; the first batches, in which workers start, are left out."""
+    """Measure over this number of photos, without the first batches, in which workers start."""
     files = _draw_photos(folder)
     places = [
         TrainingPlace(
@@ -63,14 +67,14 @@ def measure_throughput(
     ]
     bar = progress.add_task("photos a second", total=4)
     reading = {}
-    for what, read in (
+    for method, load in (
         ("decoded in full, one process", _decode_full),
         ("one process", _decode_draft),
     ):
-        began = time.perf_counter()
+        started_at = time.perf_counter()
         for file in files:
-            read(file)
-        reading[what] = len(files) / (time.perf_counter() - began)
+            load(file)
+        reading[method] = len(files) / (time.perf_counter() - started_at)
         progress.advance(bar)
     reading["with its workers"] = _measure_reading(_batches(places, workers, device))
     progress.advance(bar)
@@ -106,20 +110,20 @@ def _decode_draft(path: Path) -> None:
 
 
 def _batches(places: list[TrainingPlace], workers: int, device: Device) -> ResumableDataLoader:
-    plan = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
-    photos = PlaceDataset(plan, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
-    pinned = device.accelerator == "gpu"
-    return ResumableDataLoader(plan, photos, num_workers=workers, pin_memory=pinned)
+    sampler = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
+    dataset = PlaceDataset(sampler, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
+    pin_memory = device.accelerator == "gpu"
+    return ResumableDataLoader(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
 
 
 def _measure_reading(batches: ResumableDataLoader) -> float:
-    given = iter(batches)
+    iterator = iter(batches)
     for _ in range(WARM_UP_BATCHES):
-        next(given)
-    began, count = time.perf_counter(), 0
-    for batch in given:
+        next(iterator)
+    started_at, count = time.perf_counter(), 0
+    for batch in iterator:
         count += len(batch.photos)
-    return count / (time.perf_counter() - began)
+    return count / (time.perf_counter() - started_at)
 
 
 def _measure_training(
@@ -143,32 +147,32 @@ def _measure_training(
         value.backward()
         optimizer.step()
 
-    given = iter(batches)
+    iterator = iter(batches)
     for _ in range(WARM_UP_BATCHES):
-        batch = next(given)
+        batch = next(iterator)
         step(batch.photos, batch.labels)
     repeats = max(2, (len(batches) - WARM_UP_BATCHES) // 2)
     _synchronise(device)
-    began = time.perf_counter()
+    started_at = time.perf_counter()
     for _ in range(repeats):
         step(batch.photos, batch.labels)
     _synchronise(device)
-    network = repeats * len(batch.photos) / (time.perf_counter() - began)
-    given = iter(_batches(places, workers, device))
+    network = repeats * len(batch.photos) / (time.perf_counter() - started_at)
+    iterator = iter(_batches(places, workers, device))
     for _ in range(WARM_UP_BATCHES):
-        batch = next(given)
+        batch = next(iterator)
         step(batch.photos, batch.labels)
     count, waited = 0, 0.0
     _synchronise(device)
-    began = asked = time.perf_counter()
-    for batch in given:
-        waited += time.perf_counter() - asked
+    started_at = wait_started_at = time.perf_counter()
+    for batch in iterator:
+        waited += time.perf_counter() - wait_started_at
         step(batch.photos, batch.labels)
         count += len(batch.photos)
         # The device has nothing to do from here until the next batch is there.
         _synchronise(device)
-        asked = time.perf_counter()
-    seconds = time.perf_counter() - began
+        wait_started_at = time.perf_counter()
+    seconds = time.perf_counter() - started_at
     return network, count / seconds, waited / seconds
 
 

@@ -110,7 +110,9 @@ def estimate_place(
         radius_m: Photos within this radius in metres show the same place.
     """
     state = calibration.state if calibration else "uncalibrated"
-    evidence = compute_evidence(unfiltered_ranking, radius_m, ranking[0].spot) if ranking else None
+    evidence = (
+        compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
+    )
     if evidence is None:
         reason = (
             "No photo of the map matches the filter."

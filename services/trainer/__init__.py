@@ -1,1 +1,1 @@
-"""The trainer: GSV-Cities training of place models, and their evaluation."""
+"""The trainer: metric-learning training of place descriptors on GSV-Cities, and validation."""

@@ -1,16 +1,13 @@
-"""Every argument of `placewise train`: one class, from which flags, YAML keys and the help come.
+"""Arguments of `placewise train`: definition, parsing, validation, and YAML input and output.
 
-The predecessor's arguments (aliyassine26/gsv-cities, `src/configs/args.py`) keep their names,
-meanings and defaults, `warmpup_steps` included.
+`TrainingArguments` is the single definition. Command-line flags, YAML keys and the help text are
+generated from it. The arguments of the original GSV-Cities code (aliyassine26/gsv-cities,
+`src/configs/args.py`) keep their names, meanings and defaults, including the misspelt
+`warmpup_steps`.
 
-Text of a flag or of a YAML file -> what an argument means by it.
-
-Lists and dicts are JSON. The predecessor's published commands write some of them as Python does,
-`(320, 320)` and `['sfxs_val']`, so both are read.
-
-From flags and YAML files to checked arguments, and back to a file.
-
-A key that is not known is an error that names the nearest known one.
+Lists and dicts are JSON. The published GSV-Cities commands write some of them in Python notation,
+`(320, 320)` and `['sfxs_val']`, so both notations are accepted. An unknown key is an error that
+suggests the closest known key.
 """
 
 from __future__ import annotations
@@ -32,9 +29,12 @@ FALSE_WORDS = frozenset(("false", "no", "off", "0"))
 
 
 def parse_bool(value: Any) -> Any:
-    """`True`, `false`, `yes`, `0` ... -> bool; what is no text stays for pydantic to judge.
+    """Parse `True`, `false`, `yes`, `0` ... as a bool.
 
-    Raises ValueError for any other text: a non-empty text is not simply true.
+    Values that are not strings are returned unchanged, for pydantic to validate.
+
+    Raises:
+        ValueError: for any other text. A non-empty string is not silently true.
     """
     if not isinstance(value, str):
         return value
@@ -47,27 +47,33 @@ def parse_bool(value: Any) -> Any:
 
 
 def parse_literal(value: Any) -> Any:
-    """JSON or Python notation -> list, tuple, dict or number; ValueError for what is neither."""
+    """Parse JSON or Python literal notation as a list, tuple, dict or number.
+
+    Values that are not strings are returned unchanged.
+
+    Raises:
+        ValueError: if the text is in neither notation.
+    """
     if not isinstance(value, str):
         return value
     text = value.strip()
-    for read in (json.loads, ast.literal_eval):
+    for parse in (json.loads, ast.literal_eval):
         try:
-            return read(text)
+            return parse(text)
         except (ValueError, SyntaxError):
             continue
     raise ValueError(f"{value!r} is neither JSON nor Python notation")
 
 
 def parse_names(value: Any) -> Any:
-    """As `parse_literal`; a bare word, or several with commas between, is a list of names."""
+    """Parse a list of names: a literal, a bare word, or words separated by commas."""
     if isinstance(value, str) and re.fullmatch(r"[\w.\- ]+(,[\w.\- ]+)*", value.strip()):
         return [name.strip() for name in value.split(",")]
     return parse_literal(value)
 
 
 def parse_image_size(value: Any) -> Any:
-    """`(320, 320)`, `[320, 320]`, `320 320`, `320x320` (H W) and `320` (both) -> (H, W)."""
+    """Parse `(320, 320)`, `[320, 320]`, `320 320`, `320x320` or `320` as (height, width)."""
     if isinstance(value, str):
         numbers = re.fullmatch(r"\s*(\d+)(?:\s*[x, ]\s*(\d+))?\s*", value)
         if numbers:
@@ -79,7 +85,7 @@ def parse_image_size(value: Any) -> Any:
 
 
 def parse_number_or_text(value: Any) -> Any:
-    """`32` -> 32, `[0]` -> [0], `16-mixed` -> "16-mixed"."""
+    """Parse a literal if the text is one, else return the text: `32` -> 32, `16-mixed` as it is."""
     if not isinstance(value, str):
         return value
     try:
@@ -96,7 +102,7 @@ CITIES = (
 )
 # fmt: on
 MIN_IMAGE_PIXELS = 32
-"""pixels of a side: below, a residual network's last map is smaller than one position"""
+"""Minimum side in pixels; below it a ResNet's last feature map is smaller than one position."""
 
 Bool = Annotated[bool, BeforeValidator(parse_bool)]
 NameList = Annotated[tuple[str, ...], BeforeValidator(parse_names)]
@@ -113,71 +119,81 @@ EVALUATION, CHECKPOINTS, MACHINE, RUN = "Evaluation", "Checkpoints", "Machine", 
 
 
 class TrainingArguments(BaseModel):
-    """What one training run is told. Lengths in pixels are (height, width)."""
+    """Validated arguments of one training run. Sizes in pixels are (height, width)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, protected_namespaces=())
 
     data_root: Path | None = _argument(
-        DATA, None, "Folder of the training set, as `placewise datasets check` recognises it."
+        DATA, None, "Folder of the training set, in a layout that `placewise datasets check` knows."
     )
     eval_roots: Annotated[tuple[Path, ...], BeforeValidator(parse_literal)] = _argument(
-        DATA, (), "JSON list of folders with the evaluation sets; empty: data_root."
+        DATA, (), "JSON list of folders with the evaluation sets. Empty: data_root."
     )
     cities: NameList = _argument(
-        DATA, CITIES, "The cities to learn from, in that order; left out: all in the folder."
+        DATA, CITIES, "Cities to train on, in this order. If omitted: all cities in the folder."
     )
-    batch_size: int = _argument(DATA, 64, "Places in a batch.", ge=1)
-    img_per_place: int = _argument(DATA, 2, "Photos of each place in a batch.", ge=1)
-    min_img_per_place: int = _argument(DATA, 2, "Places with fewer photos are left out.", ge=1)
+    batch_size: int = _argument(DATA, 64, "Number of places per batch.", ge=1)
+    img_per_place: int = _argument(DATA, 2, "Number of photos per place in a batch.", ge=1)
+    min_img_per_place: int = _argument(DATA, 2, "Skip places with fewer photos than this.", ge=1)
     shuffle_all: Bool = _argument(
-        DATA, False, "Mix the places of all cities; else batches go city by city."
+        DATA, False, "Shuffle places across cities. False: shuffle within each city, in turn."
     )
     random_sample_from_each_place: Bool = _argument(
-        DATA, True, "Draw a place's photos at random; else its first ones."
+        DATA, True, "Sample a place's photos at random. False: take its first photos."
     )
-    image_size: HeightWidth = _argument(DATA, (320, 320), "Height and width of a photo, pixels.")
-    num_workers: int = _argument(DATA, 8, "Processes that read photos; 0: none of their own.", ge=0)
-    show_data_stats: Bool = _argument(DATA, True, "Print what the data sets hold before training.")
+    image_size: HeightWidth = _argument(
+        DATA, (320, 320), "Height and width of training photos, in pixels."
+    )
+    num_workers: int = _argument(
+        DATA, 8, "Number of data loader processes. 0: load in the main process.", ge=0
+    )
+    show_data_stats: Bool = _argument(DATA, True, "Print data set statistics before training.")
     augmentation: Literal["randaugment", "none"] = _argument(
-        DATA, "randaugment", "What photos go through before the network learns from them."
+        DATA, "randaugment", "Data augmentation of training photos: randaugment or none."
     )
     on_bad_image: Literal["skip", "error"] = _argument(
-        DATA, "skip", "A photo that does not decode: left out, named and counted; or an error."
+        DATA, "skip", "Photos that cannot be decoded: skip (and report them) or error."
     )
 
     backbone_arch: str = _argument(MODEL, "resnet18", "Name of the backbone.")
-    pretrained: Bool = _argument(MODEL, True, "Begin with ImageNet weights.")
+    pretrained: Bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
     weights: Path | None = _argument(
-        MODEL, None, "File with the backbone's weights; else the hub's cache."
+        MODEL, None, "File with the backbone's weights. If omitted: the torch.hub cache."
     )
     layers_to_freeze: int = _argument(
-        MODEL, 2, "Freeze up to and with this layer; -1: none.", ge=-1
+        MODEL, 2, "Freeze layers up to and including this one. -1: freeze none.", ge=-1
     )
-    layers_to_crop: IntList = _argument(MODEL, (), "JSON list: 4 drops layer4, 3 also layer3.")
+    layers_to_crop: IntList = _argument(
+        MODEL, (), "JSON list of layers to remove: 4 removes layer4, 3 also removes layer3."
+    )
     agg_arch: str = _argument(MODEL, "AVG", "Name of the aggregator.")
     agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
-        MODEL, {}, "JSON dict: the aggregator's own arguments; channels and map are inferred."
+        MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."
     )
 
     lr: float = _argument(OPTIMISATION, 2e-4, "Learning rate.", gt=0)
-    optimizer: Literal["adam", "adamw", "sgd"] = _argument(OPTIMISATION, "adam", "Which optimiser.")
+    optimizer: Literal["adam", "adamw", "sgd"] = _argument(
+        OPTIMISATION, "adam", "Optimizer: adam, adamw or sgd."
+    )
     weight_decay: float = _argument(OPTIMISATION, 0.0, "Weight decay.", ge=0)
-    momentum: float = _argument(OPTIMISATION, 0.9, "Of sgd.", ge=0, lt=1)
+    momentum: float = _argument(OPTIMISATION, 0.9, "Momentum of the sgd optimizer.", ge=0, lt=1)
     warmpup_steps: int = _argument(
         OPTIMISATION,
         600,
-        "Steps in which the learning rate rises linearly; also --warmup_steps.",
+        "Number of linear learning-rate warm-up steps. Alias: --warmup_steps.",
         ge=0,
     )
     milestones: IntList = _argument(
         OPTIMISATION, (5, 10, 15, 25), "JSON list of epochs at which lr is multiplied by lr_mult."
     )
-    lr_mult: float = _argument(OPTIMISATION, 0.3, "The factor of each milestone.", gt=0)
-    max_epochs: int = _argument(OPTIMISATION, 1, "Epochs to learn.", ge=1)
+    lr_mult: float = _argument(OPTIMISATION, 0.3, "Learning-rate factor per milestone.", gt=0)
+    max_epochs: int = _argument(OPTIMISATION, 1, "Number of epochs.", ge=1)
     max_steps: int | None = _argument(
-        OPTIMISATION, None, "End after so many steps, also within an epoch.", ge=1
+        OPTIMISATION, None, "Maximum number of steps; training may end within an epoch.", ge=1
     )
-    seed: int = _argument(OPTIMISATION, 1, "Of weights, sampling and augmentation.", ge=0)
+    seed: int = _argument(
+        OPTIMISATION, 1, "Random seed of weights, sampling and augmentation.", ge=0
+    )
 
     loss_name: str = _argument(LOSS, "MultiSimilarityLoss", "Name of the loss.")
     miner_name: str = _argument(LOSS, "MultiSimilarityMiner", "Name of the miner, or none.")
@@ -186,83 +202,95 @@ class TrainingArguments(BaseModel):
     )
 
     val_set_names: NameList = _argument(
-        EVALUATION, ("sfxs_val",), "Sets measured while learning; left out: the folder's own."
+        EVALUATION, ("sfxs_val",), "Validation sets. If omitted: those found in the folder."
     )
     test_set_names: NameList = _argument(
         EVALUATION,
         ("sfxs_test", "tokyoxs_test"),
-        "Sets measured by the phases test and all; left out: the folder's own.",
+        "Test sets of the phases test and all. If omitted: those found in the folder.",
     )
     test_image_size: Annotated[
         Literal["same", "native"] | HeightWidth, BeforeValidator(parse_image_size)
     ] = Field(
         "same",
-        description="same as image_size, native (one photo at a time), or H W in pixels.",
+        description="Test photo size: same as image_size, native (batches of one), or H W pixels.",
         json_schema_extra={"group": EVALUATION},
     )
-    faiss_gpu: Bool = _argument(EVALUATION, True, "Search by faiss on the GPU.")
-    check_val_every_n_epoch: int = _argument(EVALUATION, 1, "Epochs between validations.", ge=1)
+    faiss_gpu: Bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
+    check_val_every_n_epoch: int = _argument(
+        EVALUATION, 1, "Validate every n epochs, and after the last.", ge=1
+    )
     num_sanity_val_steps: int = _argument(
-        EVALUATION, 0, "Validation batches tried before training; -1: all.", ge=-1
+        EVALUATION, 0, "Number of validation batches run before training. -1: all.", ge=-1
     )
 
     experiment_phase: Literal["train", "test", "all"] = _argument(
-        RUN, "train", "train, test (a checkpoint), or all: train, then test the best."
+        RUN, "train", "train, test (a checkpoint), or all: train, then test the best checkpoint."
     )
     model_path: Path | None = _argument(
-        RUN, None, "Checkpoint that the phase test measures, and that training begins with."
+        RUN, None, "Checkpoint to test (phase test) or to initialise training from."
     )
-    default_root_dir: str = _argument(RUN, "./LOGS/", "Folder of the runs.")
-    run_name: str | None = _argument(RUN, None, "Folder of this run below it; left out: by time.")
+    default_root_dir: str = _argument(RUN, "./LOGS/", "Root folder of the runs.")
+    run_name: str | None = _argument(
+        RUN, None, "Folder name of this run. If omitted: a timestamp and the model's name."
+    )
     logger: NameList = _argument(
-        RUN, ("tensorboard", "csv"), "csv, tensorboard, wandb, mlflow (a list), or none."
+        RUN, ("tensorboard", "csv"), "List of csv, tensorboard, wandb and mlflow, or none."
     )
-    log_every_n_steps: int = _argument(RUN, 20, "Steps between two lines of the logs.", ge=1)
-    fast_dev_run: Bool = _argument(RUN, False, "Try one batch of everything; keep nothing.")
+    log_every_n_steps: int = _argument(RUN, 20, "Number of steps between log entries.", ge=1)
+    fast_dev_run: Bool = _argument(
+        RUN, False, "Run one batch of training and validation as a check; write no files."
+    )
 
     monitor: str = _argument(
-        CHECKPOINTS, "sfxs_val/R1", "The metric that decides which checkpoints are best."
+        CHECKPOINTS, "sfxs_val/R1", "Metric by which the best checkpoints are chosen."
     )
-    mode: Literal["min", "max"] = _argument(CHECKPOINTS, "max", "Whether more of it is better.")
+    mode: Literal["min", "max"] = _argument(
+        CHECKPOINTS, "max", "Direction of the monitored metric: max or min."
+    )
     save_top_k: int = _argument(
-        CHECKPOINTS, 3, "How many best checkpoints stay; -1: all, 0: none.", ge=-1
+        CHECKPOINTS, 3, "Number of best checkpoints to keep. -1: all, 0: none.", ge=-1
     )
     save_weights_only: Bool = _argument(
-        CHECKPOINTS, True, "Best checkpoints without the optimiser; last.ckpt always has all."
+        CHECKPOINTS, True, "Save best checkpoints without optimizer state; last.ckpt has it always."
     )
     filename: str = _argument(
         CHECKPOINTS,
         "{backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{R1:.4f}]_R5[{R5:.4f}]",
-        "Name of a best checkpoint; R1 is the monitored set's, others by SET/R1.",
+        "Name template of the best checkpoints. R1 is the monitored set's; SET/R1 names others.",
     )
     auto_insert_metric_name: Bool = _argument(
-        CHECKPOINTS, False, "Write a metric's name before its figure."
+        CHECKPOINTS, False, "Insert each metric's name before its value in the file name."
     )
 
     accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _argument(
-        MACHINE, "gpu", "What computes."
+        MACHINE, "gpu", "Training accelerator: gpu, cuda, mps, cpu or auto."
     )
     devices: Annotated[int | str | tuple[int, ...], BeforeValidator(parse_number_or_text)] = Field(
-        (0,), description="Which one: [0], or 1 for any.", json_schema_extra={"group": MACHINE}
+        (0,),
+        description="Device to train on: its index as [0], or 1 for any.",
+        json_schema_extra={"group": MACHINE},
     )
     precision: Annotated[int | str, BeforeValidator(parse_number_or_text)] = Field(
-        32, description="32, 16-mixed or bf16-mixed.", json_schema_extra={"group": MACHINE}
+        32,
+        description="Floating-point precision: 32, 16-mixed or bf16-mixed.",
+        json_schema_extra={"group": MACHINE},
     )
     reload_dataloaders_every_n_epochs: int = _argument(
-        DATA, 1, "Epochs between two shufflings of the places; 0: shuffled once.", ge=0
+        DATA, 1, "Reshuffle the places every n epochs. 0: shuffle once.", ge=0
     )
 
     @field_validator("image_size")
     @classmethod
     def _check_image_size(cls, size: tuple[int, int]) -> tuple[int, int]:
         if min(size) < MIN_IMAGE_PIXELS:
-            raise ValueError(f"each side must be {MIN_IMAGE_PIXELS} pixels or more")
+            raise ValueError(f"height and width must be {MIN_IMAGE_PIXELS} pixels or more")
         return size
 
     @field_validator("filename", "default_root_dir")
     @classmethod
     def _unescape_underscores(cls, text: str) -> str:
-        # The predecessor's command writes `\_` inside double quotes, where a shell keeps both.
+        # The published GSV-Cities command writes `\_` in double quotes; a shell keeps the backslash
         return text.replace("\\_", "_")
 
     @field_validator("model_path", "weights", "run_name", mode="before")
@@ -278,90 +306,106 @@ class TrainingArguments(BaseModel):
             if name not in known:
                 raise ValueError(f"{name!r} is unknown; known: {', '.join(known)}")
         if "none" in names and len(names) > 1:
-            raise ValueError("none can't stand beside another logger")
+            raise ValueError("none cannot be combined with other loggers")
         return tuple(name for name in names if name != "none")
 
 
 def argument_group(name: str) -> str:
-    """The heading of the help under which an argument stands."""
+    """Return the help panel of an argument."""
     extra = TrainingArguments.model_fields[name].json_schema_extra
     assert isinstance(extra, dict)
     return str(extra["group"])
 
 
 def is_boolean(name: str) -> bool:
-    """Whether the argument is true or false."""
+    """Return whether the argument is a boolean."""
     return TrainingArguments.model_fields[name].annotation is bool
 
 
 ALIASES = {"warmup_steps": "warmpup_steps"}
-"""how one would spell it: how the predecessor does"""
+"""Correct spelling -> the name in the GSV-Cities code"""
 ARGUMENT_NAMES = tuple(TrainingArguments.model_fields)
 
 
 def resolve_name(name: str) -> str:
-    """`batch-size`, `batch_size` -> `batch_size`; InvalidRequest (`unknown_argument`) otherwise."""
-    wanted = name.replace("-", "_")
-    wanted = ALIASES.get(wanted, wanted)
-    if wanted in ARGUMENT_NAMES:
-        return wanted
+    """Return an argument's canonical name: hyphens become underscores, aliases are resolved.
+
+    Raises:
+        InvalidRequest: `unknown_argument`.
+    """
+    canonical = name.replace("-", "_")
+    canonical = ALIASES.get(canonical, canonical)
+    if canonical in ARGUMENT_NAMES:
+        return canonical
     raise InvalidRequest(
-        "unknown_argument", f"There is no argument {name!r}.{suggest_name(wanted, ARGUMENT_NAMES)}"
+        "unknown_argument", f"Unknown argument {name!r}.{suggest_name(canonical, ARGUMENT_NAMES)}"
     )
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
-    """` Did you mean ...?` where something is near, else the list of what is known."""
+    """Return ` Did you mean ...?` with the closest known name, else a list of all known names."""
     names = list(known)
     by_lower = {each.lower(): each for each in names}
-    near = difflib.get_close_matches(name.lower(), by_lower, n=1)
-    if near:
-        return f" Did you mean {by_lower[near[0]]}?"
+    matches = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    if matches:
+        return f" Did you mean {by_lower[matches[0]]}?"
     return f" Known: {', '.join(names)}."
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file's mapping of arguments.
+    """Load arguments from a YAML file, keyed by canonical name.
 
-    Raises NotFound (`config_not_found`), InvalidRequest (`bad_config` for what is no mapping,
-    `unknown_argument` for a key).
+    Raises:
+        NotFound: `config_not_found`.
+        InvalidRequest: `bad_config` if the file is not a mapping, `unknown_argument` for a key.
     """
-    values = load_mapping(path)
-    return resolve_keys(values, str(path))
+    return resolve_keys(load_mapping(path), str(path))
 
 
 def load_mapping(path: Path) -> dict[str, Any]:
-    """A YAML file's mapping, whatever its keys; the errors of `load_yaml` but the last."""
-    import yaml  # of the extra `trainer`; the help is shown without it
+    """Load a mapping with any string keys from a YAML file.
+
+    Raises:
+        NotFound: `config_not_found`.
+        InvalidRequest: `bad_config` if the file is not a mapping.
+    """
+    import yaml  # part of the extra `trainer`; `--help` must work without it
 
     try:
         loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise NotFound("config_not_found", f"Can't read {path}: {error.strerror}.") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InvalidRequest("bad_config", f"{path} is no YAML: {error}") from error
+        raise InvalidRequest("bad_config", f"{path} is not valid YAML: {error}") from error
     if loaded is None:
         return {}
     if not isinstance(loaded, dict) or not all(isinstance(key, str) for key in loaded):
-        raise InvalidRequest("bad_config", f"{path}: names with values are needed (`lr: 0.0002`).")
+        raise InvalidRequest(
+            "bad_config", f"{path} must be a mapping of names to values, such as `lr: 0.0002`."
+        )
     return loaded
 
 
 def resolve_keys(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """The values under their arguments' names; InvalidRequest names the place for one unknown."""
-    found: dict[str, Any] = {}
+    """Replace each key with the argument's canonical name.
+
+    Raises:
+        InvalidRequest: `unknown_argument`; the message begins with `source`.
+    """
+    resolved: dict[str, Any] = {}
     for key, value in values.items():
         try:
-            found[resolve_name(key)] = value
+            resolved[resolve_name(key)] = value
         except InvalidRequest as error:
             raise InvalidRequest(error.code, f"{source}: {error.detail}") from error
-    return found
+    return resolved
 
 
 def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
-    """Checked arguments; a later layer overrides an earlier one.
+    """Merge and validate arguments; later layers override earlier ones.
 
-    Raises InvalidRequest (`bad_argument`) that names each argument that can't be so.
+    Raises:
+        InvalidRequest: `bad_argument`; the message names each invalid argument and its value.
     """
     merged: dict[str, Any] = {}
     for layer in layers:
@@ -369,22 +413,22 @@ def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     try:
         return TrainingArguments(**merged)
     except ValidationError as error:
-        faults = [
-            f"--{fault['loc'][0]}: {fault['msg'].removeprefix('Value error, ')} "
-            f"(got {fault['input']!r})"
-            for fault in error.errors()
+        messages = [
+            f"--{detail['loc'][0]}: {detail['msg'].removeprefix('Value error, ')} "
+            f"(got {detail['input']!r})"
+            for detail in error.errors()
         ]
-        raise InvalidRequest("bad_argument", "; ".join(dict.fromkeys(faults))) from error
+        raise InvalidRequest("bad_argument", "; ".join(dict.fromkeys(messages))) from error
 
 
 def to_plain_dict(arguments: TrainingArguments) -> dict[str, Any]:
-    """Every argument as text, numbers, lists and dicts: what YAML and JSON hold."""
+    """Return every argument as JSON-compatible values."""
     plain: dict[str, Any] = arguments.model_dump(mode="json")
     return plain
 
 
 def save_yaml(arguments: TrainingArguments, path: Path) -> None:
-    """The file from which the same run can be made."""
+    """Write every argument to a YAML file that `--config` accepts, to reproduce the run."""
     import yaml
 
     text = yaml.safe_dump(to_plain_dict(arguments), sort_keys=False, allow_unicode=True)

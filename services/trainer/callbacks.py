@@ -1,9 +1,8 @@
-"""What happens around a run's steps: keeping, measuring, stopping, counting.
+"""Lightning callback of a training run: checkpoints, validation, graceful stop, and timing.
 
-Everything is kept in `on_train_batch_end`, also at an epoch's end. There the state of Lightning's
-loops is always the same: one step is done and the next one has not begun.
-
-The evaluation sets of a run, measured as `placewise evaluate` measures them.
+All state is saved in `on_train_batch_end`, also at the end of an epoch. At that point the state of
+Lightning's loops is always the same: one step is complete and the next has not begun. Validation
+computes recall@k with the code that `placewise evaluate` uses.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ ProgressCallback = Callable[[str, int, int], None]
 
 
 class Validator:
-    """Measures a network on sets, one after the other.
+    """Computes the recalls of a network on evaluation sets.
 
-    Validation photos have the size that the training's have; `for_tests` uses `test_image_size`.
+    Validation photos are resized to `image_size`, test photos to `test_image_size`.
     """
 
     def __init__(
@@ -52,49 +51,60 @@ class Validator:
     ) -> None:
         self._arguments = arguments
         self._device = device
-        self._told = on_progress
+        self._on_progress = on_progress
         self._stop = stop
 
     def measure(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
     ) -> dict[str, Recalls]:
-        """By the sets' names. Raises RunStopped, and what describing and searching raise."""
+        """Evaluate the network on each set.
+
+        Args:
+            model: (B, 3, H, W) float32 -> (B, D); its training mode is restored afterwards.
+            sets: the evaluation sets.
+            for_tests: use `test_image_size` instead of `image_size`.
+
+        Returns:
+            Recalls by set name.
+
+        Raises:
+            RunStopped: a stop was requested; also raises what describing and searching raise.
+        """
         size = self._test_size() if for_tests else self._arguments.image_size
         describe = ModelDescriber(
             model, self._device, size, batch_photos=1 if size is None else BATCH_PHOTOS
         )
-        found = {}
+        recalls = {}
         for each in sets:
 
-            def told(what: str, done: int, most: int, name: str = each.name) -> None:
+            def on_progress(what: str, done: int, total: int, name: str = each.name) -> None:
                 self._stop.check()
-                self._told(f"{name}: {what}", done, most)
+                self._on_progress(f"{name}: {what}", done, total)
 
-            asked = evaluate_recall(
-                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=told
+            result = evaluate_recall(
+                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=on_progress
             )
-            found[each.name] = asked.recalls
-        return found
+            recalls[each.name] = result.recalls
+        return recalls
 
     def sanity_check(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int
     ) -> None:
-        """Measure the first batches of each set, -1: all, so that a fault in them shows early."""
-        most = batches * BATCH_PHOTOS if batches >= 0 else None
-        begun = [
+        """Evaluate the first `batches` of each set (-1: all), to find errors before training."""
+        limit = batches * BATCH_PHOTOS if batches >= 0 else None
+        truncated = [
             replace(
                 each,
-                database=each.database[:most],
-                queries=each.queries[:most],
+                database=each.database[:limit],
+                queries=each.queries[:limit],
                 positives=tuple(
-                    found if most is None else found[found < most]
-                    for found in each.positives[:most]
+                    rows if limit is None else rows[rows < limit] for rows in each.positives[:limit]
                 ),
             )
             for each in sets
         ]
         if batches:
-            self.measure(model, begun)
+            self.measure(model, truncated)
 
     def _test_size(self) -> tuple[int, int] | None:
         size = self._arguments.test_image_size
@@ -104,11 +114,14 @@ class Validator:
 
 
 def flatten_recalls(recalls_by_set: dict[str, Recalls]) -> dict[str, float]:
-    """`SET/R1`, `SET/R5` ... -> shares from 0 to 1; a query without a positive counts as missed."""
+    """Return recalls as metrics `SET/R1`, `SET/R5` ..., from 0 to 1.
+
+    A query without a positive counts as a miss.
+    """
     return {
-        f"{name}/R{k}": share
-        for name, one in recalls_by_set.items()
-        for k, share in one.recall_all.items()
+        f"{name}/R{k}": recall
+        for name, recalls in recalls_by_set.items()
+        for k, recall in recalls.recall_all.items()
     }
 
 
@@ -116,7 +129,10 @@ MAX_BAD_PHOTO_WARNINGS = 10
 
 
 class TrainingCallback(lightning.Callback):
-    """Drives `kept`, `validation` and `history` of one run. Raises RunStopped out of `fit`."""
+    """Saves checkpoints, validates, records the history, and stops the run on request.
+
+    Raises RunStopped from `Trainer.fit` after the state has been saved.
+    """
 
     def __init__(
         self,
@@ -124,8 +140,8 @@ class TrainingCallback(lightning.Callback):
         folder: Path,
         batches: ResumableDataLoader,
         sets: Sequence[EvaluationSet],
-        validation: Validator,
-        kept: TopKCheckpoints,
+        validator: Validator,
+        checkpoints: TopKCheckpoints,
         history: TrainingHistory,
         stop: StopRequest,
         display: Display,
@@ -134,27 +150,27 @@ class TrainingCallback(lightning.Callback):
         self._folder = folder
         self._batches = batches
         self._sets = sets
-        self._validation = validation
-        self._kept = kept
+        self._validator = validator
+        self._checkpoints = checkpoints
         self._history = history
         self._stop = stop
         self._display = display
-        self._random_state: dict[str, Any] | None = None
-        self._began = 0.0
+        self._rng_state: dict[str, Any] | None = None
+        self._started_at = 0.0
         self._last_saved_step = -1
 
     def state_dict(self) -> dict[str, Any]:
         return rng_state()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._random_state = state_dict
+        self._rng_state = state_dict
 
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         self._stop.install_handlers()
-        if self._random_state is not None:
-            restore_rng_state(self._random_state)
+        if self._rng_state is not None:
+            restore_rng_state(self._rng_state)
         self._start_timer()
 
     def on_train_batch_end(
@@ -169,17 +185,19 @@ class TrainingCallback(lightning.Callback):
         self._record_undecodable(batch)
         self._history.images += len(batch.photos)
         epoch = trainer.current_epoch
-        most = self._arguments.max_steps
-        ends = self._arguments.fast_dev_run or (most is not None and trainer.global_step >= most)
-        self._show(pl_module, epoch, batch_idx + 1)
-        if trainer.is_last_batch or ends:
+        max_steps = self._arguments.max_steps
+        is_last_step = self._arguments.fast_dev_run or (
+            max_steps is not None and trainer.global_step >= max_steps
+        )
+        self._show_progress(pl_module, epoch, batch_idx + 1)
+        if trainer.is_last_batch or is_last_step:
             self._stop_timer()
-            self._end_epoch(trainer, pl_module, ends)
+            self._end_epoch(trainer, pl_module, is_last_step)
             self._start_timer()
-        if ends:
+        if is_last_step:
             trainer.should_stop = True
-        elif self._stop.asked:
-            self._keep(trainer)
+        elif self._stop.is_requested:
+            self._save_last(trainer)
             self._stop.check()
 
     def on_exception(
@@ -191,33 +209,33 @@ class TrainingCallback(lightning.Callback):
         self._stop_timer()
 
     def _end_epoch(
-        self, trainer: lightning.Trainer, learner: MetricLearningModule, ends: bool
+        self, trainer: lightning.Trainer, module: MetricLearningModule, is_last_step: bool
     ) -> None:
         if self._arguments.fast_dev_run:
             return
         epoch = trainer.current_epoch
-        # Before the sets are measured, which may take long and be interrupted.
-        self._keep(trainer)
-        if not is_validation_epoch(epoch, self._arguments) and not ends:
+        # Saved before validation, which may take long and may be interrupted.
+        self._save_last(trainer)
+        if not is_validation_epoch(epoch, self._arguments) and not is_last_step:
             return
-        found = flatten_recalls(self._validation.measure(learner.model, self._sets))
+        metrics = flatten_recalls(self._validator.measure(module.model, self._sets))
         for logger in trainer.loggers:
-            logger.log_metrics({**found, "epoch": epoch}, trainer.global_step)
+            logger.log_metrics({**metrics, "epoch": epoch}, trainer.global_step)
         record_epoch(
-            EpochRecord(epoch, trainer.global_step, learner.last_loss, found),
+            EpochRecord(epoch, trainer.global_step, module.last_loss, metrics),
             self._history,
-            self._kept,
+            self._checkpoints,
             trainer.save_checkpoint,
             self._display,
         )
         self._history.save(self._folder)
 
-    def _keep(self, trainer: lightning.Trainer) -> None:
+    def _save_last(self, trainer: lightning.Trainer) -> None:
         if self._last_saved_step == trainer.global_step:
             return
         self._stop_timer()
         self._history.save(self._folder)
-        self._kept.save_last(trainer.save_checkpoint)
+        self._checkpoints.save_last(trainer.save_checkpoint)
         self._last_saved_step = trainer.global_step
         self._start_timer()
 
@@ -228,52 +246,54 @@ class TrainingCallback(lightning.Callback):
             self._history.bad_photos[path] = reason
             count = len(self._history.bad_photos)
             if count <= MAX_BAD_PHOTO_WARNINGS:
-                self._display.warn(f"{path} is left out, it does not decode: {reason}")
+                self._display.warn(f"Skipped {path}: it cannot be decoded: {reason}")
             elif count == MAX_BAD_PHOTO_WARNINGS + 1:
-                self._display.warn("More photos do not decode; metrics.json names them all.")
+                self._display.warn("More photos cannot be decoded; metrics.json lists all of them.")
 
-    def _show(self, learner: MetricLearningModule, epoch: int, done: int) -> None:
-        accuracy = "" if learner.last_accuracy is None else f"  b_acc {learner.last_accuracy:.2f}"
+    def _show_progress(self, module: MetricLearningModule, epoch: int, done: int) -> None:
+        accuracy = "" if module.last_accuracy is None else f"  b_acc {module.last_accuracy:.2f}"
         self._display.progress(
             f"epoch {epoch + 1}/{self._arguments.max_epochs}",
             done,
             len(self._batches),
-            f"loss {learner.last_loss:.4f}{accuracy}",
+            f"loss {module.last_loss:.4f}{accuracy}",
         )
 
     def _start_timer(self) -> None:
-        self._began = time.perf_counter()
+        self._started_at = time.perf_counter()
         self._batches.seconds_waited = 0.0
 
     def _stop_timer(self) -> None:
-        if self._began:
-            self._history.seconds += time.perf_counter() - self._began
+        if self._started_at:
+            self._history.seconds += time.perf_counter() - self._started_at
             self._history.seconds_waited += self._batches.seconds_waited
-        self._began = 0.0
+        self._started_at = 0.0
 
 
 def is_validation_epoch(epoch: int, arguments: TrainingArguments) -> bool:
-    """Every so many epochs, and after the last."""
-    done = epoch + 1
-    return done % arguments.check_val_every_n_epoch == 0 or done >= arguments.max_epochs
+    """Return whether validation follows this epoch: every n epochs, and after the last one."""
+    epochs_done = epoch + 1
+    return (
+        epochs_done % arguments.check_val_every_n_epoch == 0 or epochs_done >= arguments.max_epochs
+    )
 
 
 def record_epoch(
     epoch: EpochRecord,
     history: TrainingHistory,
-    kept: TopKCheckpoints,
+    checkpoints: TopKCheckpoints,
     save: SaveCheckpoint,
     display: Display,
 ) -> None:
-    """An epoch's figures: into the history, on the display, and its checkpoint among the best."""
+    """Record an epoch's metrics: in the history, on the display, and among the best checkpoints."""
     history.epochs.append(epoch)
-    is_best = kept.save_if_best(save, epoch.figures, epoch.number, epoch.step)
-    history.best = list(kept.best)
-    figures = "  ".join(
-        f"{name} {share:.1%}" for name, share in epoch.figures.items() if _is_headline_metric(name)
+    is_best = checkpoints.save_if_best(save, epoch.figures, epoch.number, epoch.step)
+    history.best = list(checkpoints.best)
+    headline = "  ".join(
+        f"{name} {value:.1%}" for name, value in epoch.figures.items() if _is_headline_metric(name)
     )
-    place = " (kept)" if is_best else ""
-    display.info(f"epoch {epoch.number + 1}: loss {epoch.loss:.4f}  {figures}{place}")
+    suffix = " (checkpoint saved)" if is_best else ""
+    display.info(f"epoch {epoch.number + 1}: loss {epoch.loss:.4f}  {headline}{suffix}")
 
 
 def _is_headline_metric(name: str) -> bool:

@@ -1,13 +1,17 @@
-"""The checkpoints of a run: the best few by a metric, and `last.ckpt` with the full state.
+"""Checkpointing: top-k checkpoints by a metric, `last.ckpt`, name templates, and RNG state.
 
-Names of checkpoints and folders from templates with figures in them.
+`last.ckpt` holds the full training state, including the state of every random number generator
+that a step may use, so that a resumed run continues exactly.
+
+Names of checkpoints and run folders are templates with fields in braces:
 
     {backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{sfxs_val/R1:.4f}]
 
-A field is an argument's name, `epoch`, `step` or a metric. `self.` and `model.` before it, which
-the predecessor's commands write, mean the same. `R1` alone is the monitored set's.
+A field is the name of an argument, `epoch`, `step` or a metric. A prefix `self.` or `model.`, as in
+the GSV-Cities commands, is ignored. `R1` without a set is the monitored set's.
 
-Random numbers of the steps themselves: seeded, kept in checkpoints, restored.
+Lightning's `ModelCheckpoint` is not used. It also saves in hooks other than `on_train_batch_end`,
+in which the state of the loops differs, so that a resumed run would not be identical.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ import torch
 from shared.errors import InvalidRequest
 
 FIELD = r"\{(?P<name>[^{}:]+)(?P<format>:[^{}]*)?\}"
-# With what belongs to it: `_R1[...]`, `-loss=...`.
+# A field with its label and brackets: `_R1[...]`, `-loss=...`.
 LABELLED_FIELD = re.compile(
     rf"(?P<before>[_\-. ]?(?:[A-Za-z][A-Za-z0-9]*)?[\[(=]?)?{FIELD}(?P<after>[\])])?"
 )
@@ -35,10 +39,21 @@ FIELD_ALIASES = {"encoder_arch": "backbone_arch"}
 
 
 class CheckpointNameTemplate:
-    """A template whose fields are known to be those that a run has.
+    """Name template of checkpoints, with its fields checked against the run's metrics.
 
-    `dropped` are the fields that no run of these sets logs: they drop out, with the label and the
-    brackets around them.
+    Args:
+        template: text with fields in braces, each with an optional format: `{epoch:02d}`.
+        fixed: the run's arguments, which are filled in at once.
+        metrics: names of the metrics that the run logs, such as `sfxs_val/R1`.
+        monitored_set: the set of metrics without a set's name.
+        insert_names: write `name=value` instead of the value.
+
+    Attributes:
+        dropped_fields: fields that the run does not log. They are removed from the template
+            together with their label and brackets.
+
+    Raises:
+        InvalidRequest: `bad_argument` if no field and no text remains, or a format does not fit.
     """
 
     def __init__(
@@ -54,7 +69,7 @@ class CheckpointNameTemplate:
         self.dropped_fields: list[str] = []
         self._insert_names = insert_names
 
-        def settle(match: re.Match[str]) -> str:
+        def resolve_field(match: re.Match[str]) -> str:
             name = _strip_owner(match["name"])
             if f"{monitored_set}/{name}" in known:
                 name = f"{monitored_set}/{name}"
@@ -68,31 +83,35 @@ class CheckpointNameTemplate:
             self.dropped_fields.append(match["name"])
             return ""
 
-        self._template = LABELLED_FIELD.sub(settle, template)
+        self._template = LABELLED_FIELD.sub(resolve_field, template)
         if not self._template.strip("_-. "):
             raise InvalidRequest(
                 "bad_argument",
-                f"--filename: nothing is left of {template!r}; known: {_join_names(known)}",
+                f"--filename {template!r} has no known field. Known: {', '.join(sorted(known))}.",
             )
 
-    def format_name(self, figures: Mapping[str, Any]) -> str:
-        """The name with these figures; `/` becomes `-`: a name is no path."""
+    def format_name(self, values: Mapping[str, Any]) -> str:
+        """Fill in metrics, `epoch` and `step`. Path separators become `-`."""
 
         def fill(match: re.Match[str]) -> str:
-            figure = _format_value(figures[match["name"]], match["format"])
-            return f"{match['name']}={figure}" if self._insert_names else figure
+            text = _format_value(values[match["name"]], match["format"])
+            return f"{match['name']}={text}" if self._insert_names else text
 
         return safe_filename(re.sub(FIELD, fill, self._template))
 
 
 def format_folder(template: str, fixed: Mapping[str, Any]) -> str:
-    """A folder's path with arguments in it; InvalidRequest (`bad_argument`) for other fields."""
+    """Fill arguments into the template of a folder's path.
+
+    Raises:
+        InvalidRequest: `bad_argument` for a field that is not an argument.
+    """
 
     def fill(match: re.Match[str]) -> str:
         name = _strip_owner(match["name"])
         if name not in fixed:
             raise InvalidRequest(
-                "bad_argument", f"--default_root_dir: {name!r} is no argument of a run."
+                "bad_argument", f"--default_root_dir: {name!r} is not a training argument."
             )
         return safe_filename(_format_value(fixed[name], match["format"]))
 
@@ -100,7 +119,7 @@ def format_folder(template: str, fixed: Mapping[str, Any]) -> str:
 
 
 def safe_filename(text: str) -> str:
-    """The text as a part of a file's name on every system."""
+    """Replace the characters that are not allowed in a file name on every platform by `-`."""
     return re.sub(r'[/\\:*?"<>|\x00-\x1f]', "-", text)
 
 
@@ -111,30 +130,29 @@ def _strip_owner(name: str) -> str:
     return FIELD_ALIASES.get(name, name)
 
 
-def _format_value(value: Any, form: str | None) -> str:
+def _format_value(value: Any, spec: str | None) -> str:
     try:
-        return format(value, (form or ":")[1:])
+        return format(value, (spec or ":")[1:])
     except (ValueError, TypeError) as error:
         raise InvalidRequest(
-            "bad_argument", f"--filename: {value!r} can't be written as {form!r}: {error}."
+            "bad_argument", f"--filename: cannot format {value!r} as {spec!r}: {error}."
         ) from error
-
-
-def _join_names(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names))
 
 
 LAST_CHECKPOINT = "last.ckpt"
 TRAINING_STATE_KEYS = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "MixedPrecision")
-"""what a checkpoint of weights alone does not hold"""
+"""Keys that a weights-only checkpoint does not have"""
 
 SaveCheckpoint = Callable[[Path, bool], None]
-"""Writes the present state to a path; True: the weights alone"""
+"""Called with a path and `weights_only`; writes the current state"""
 
 
 @dataclass
 class TopKCheckpoints:
-    """Which checkpoints stay in `folder`. Files appear whole, or not at all."""
+    """Keeps the `top_k` best checkpoints in a folder, and `last.ckpt`.
+
+    Files are written atomically: to a temporary name, synced, then renamed.
+    """
 
     folder: Path
     name: CheckpointNameTemplate
@@ -143,28 +161,30 @@ class TopKCheckpoints:
     top_k: int
     weights_only: bool
     best: list[tuple[float, str]] = field(default_factory=list)
-    """Score and file name, the best first; of equal ones the earlier"""
+    """Score and file name, best first; ties keep the order of saving"""
 
     def save_last(self, save: SaveCheckpoint) -> Path:
-        """Write the full state from which training goes on."""
+        """Write the full training state to `last.ckpt`, for resuming."""
         return self._write(save, LAST_CHECKPOINT, weights_only=False)
 
     def save_if_best(
         self, save: SaveCheckpoint, metrics: dict[str, float], epoch: int, step: int
     ) -> bool:
-        """Keep the present weights if they are among the best; whether they are.
+        """Save a checkpoint if its score is among the `top_k` best, and remove the worst.
 
-        A score that is not a number is never among them.
+        A score of NaN is never saved.
+
+        Returns:
+            Whether the checkpoint was saved.
         """
         score = metrics.get(self.monitor, math.nan)
-        ranked = [kept for kept in self.best if not self._is_better(score, kept[0])]
-        place = len(ranked)
-        if math.isnan(score) or self.top_k == 0 or 0 < self.top_k <= place:
+        rank = sum(not self._is_better(score, stored) for stored, _ in self.best)
+        if math.isnan(score) or self.top_k == 0 or 0 < self.top_k <= rank:
             return False
-        filled = self.name.format_name({**metrics, "epoch": epoch, "step": step})
-        name = self._unique_name(f"{filled}.ckpt")
+        stem = self.name.format_name({**metrics, "epoch": epoch, "step": step})
+        name = self._unique_name(f"{stem}.ckpt")
         self._write(save, name, weights_only=self.weights_only)
-        self.best.insert(place, (score, name))
+        self.best.insert(rank, (score, name))
         while 0 < self.top_k < len(self.best):
             (self.folder / self.best.pop()[1]).unlink(missing_ok=True)
         return True
@@ -181,13 +201,13 @@ class TopKCheckpoints:
         return score > than if self.mode == "max" else score < than
 
     def _unique_name(self, name: str) -> str:
-        """The name, numbered where an earlier checkpoint already has it."""
+        """Append a version number if the name is taken."""
         taken = {file for _, file in self.best} | {LAST_CHECKPOINT}
-        free, number = name, 1
-        while free in taken:
-            number += 1
-            free = f"{name.removesuffix('.ckpt')}-v{number}.ckpt"
-        return free
+        candidate, version = name, 1
+        while candidate in taken:
+            version += 1
+            candidate = f"{name.removesuffix('.ckpt')}-v{version}.ckpt"
+        return candidate
 
     def _write(self, save: SaveCheckpoint, name: str, *, weights_only: bool) -> Path:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -201,7 +221,7 @@ class TopKCheckpoints:
 
 
 def copy_checkpoint(source: Path, path: Path, weights_only: bool) -> None:
-    """The checkpoint at another path; True: without what only training needs."""
+    """Copy a checkpoint; with `weights_only`, without the training state."""
     stored = torch.load(source, map_location="cpu", weights_only=True)
     if weights_only:
         stored = {key: value for key, value in stored.items() if key not in TRAINING_STATE_KEYS}
@@ -209,14 +229,17 @@ def copy_checkpoint(source: Path, path: Path, weights_only: bool) -> None:
 
 
 def seed_everything(seed: int) -> None:
-    """torch's, numpy's and Python's own generators; the sampler and augmentation have theirs."""
+    """Seed the global generators of torch, numpy and Python.
+
+    The sampler and the augmentation have generators of their own.
+    """
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
 
 
 def rng_state() -> dict[str, Any]:
-    """Of every generator that a step may draw from, in plain types and tensors."""
+    """Return the state of the global generators, in plain types and tensors."""
     name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
     version, words, gauss_next = random.getstate()
     return {
@@ -229,7 +252,10 @@ def rng_state() -> dict[str, Any]:
 
 
 def restore_rng_state(state: dict[str, Any]) -> None:
-    """The inverse of `rng_state`; GPUs that are not there any more are left out."""
+    """Restore what `rng_state` returned.
+
+    CUDA generators are restored only if the number of GPUs is the same.
+    """
     torch.set_rng_state(state["torch"].cpu())
     if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all([each.cpu() for each in state["cuda"]])

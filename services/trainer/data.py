@@ -1,11 +1,8 @@
-"""Batches of photos for training: read by workers ahead of their use, resumable inside an epoch.
+"""Training data: batch sampler, dataset, augmentation, and a data loader that resumes mid-epoch.
 
-Which photos make up which batch: P places x K photos, decided by the seed alone.
-
-An epoch's batches are a function of (seed, epoch), not of what was drawn before: a run that goes on
-in the middle of an epoch, with however many workers, gets what it would have got.
-
-What a photo goes through before the network learns from it.
+A batch holds P places x K photos. The batches of an epoch are a function of (seed, epoch) only, not
+of earlier random draws. A run that resumes in the middle of an epoch, with any number of workers,
+gets the same batches as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -28,29 +25,38 @@ from shared.datasets.open_dataset import TrainingPlace
 from shared.errors import Unprocessable
 from shared.imaging.decode import decode_resized
 
-ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # what a stream of random numbers is for
+ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # keep the random streams independent
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceSample:
-    """One place in a batch."""
+    """The photos of one place that are part of a batch."""
 
     place: int
-    """index among the training set's places"""
+    """index into the training set's places"""
     photos: tuple[int, ...]
-    """indices among the place's photos"""
+    """indices into the place's photos"""
     seed: int
-    """of the augmentation of these photos"""
+    """seed of the augmentation of these photos"""
 
 
 @dataclass(frozen=True)
 class PlaceBatchSampler:
-    """Batches of places, as the predecessor samples them.
+    """Samples batches of P places x K photos, as the GSV-Cities code does.
 
-    `shuffle_all` False keeps the cities' order and shuffles the places inside each: a batch then
-    holds (almost) one city, whose places are hard to tell apart. Places are shuffled anew every
-    `reshuffle_every_epochs`; 0: once. With `random_photos` the photos of a place are drawn without
-    replacement, in every epoch; else they are its first ones. The last batch may be smaller.
+    The last batch of an epoch may be smaller.
+
+    Attributes:
+        places: the places of the training set.
+        places_per_batch: P.
+        photos_per_place: K.
+        shuffle_all: shuffle all places. If false, cities keep their order and places are shuffled
+            within each city; a batch then (almost) always holds one city, whose places are hard
+            to distinguish.
+        random_photos: in every epoch, draw a place's photos without replacement. If false, use its
+            first K photos.
+        reshuffle_every_epochs: number of epochs between shuffles of the places; 0: shuffle once.
+        seed: seed of the order, the photos and the augmentation.
     """
 
     places: Sequence[TrainingPlace]
@@ -65,21 +71,23 @@ class PlaceBatchSampler:
         return -(-len(self.places) // self.places_per_batch)
 
     def batches(self, epoch: int, start: int = 0) -> Iterator[list[PlaceSample]]:
-        """The epoch's batches from number `start` on."""
+        """Yield the epoch's batches, beginning with batch number `start`."""
         order = self.order(epoch)
         for number in range(start, len(self)):
             first = number * self.places_per_batch
             rng = np.random.default_rng((self.seed, PHOTO_STREAM, epoch, number))
             seeds = np.random.default_rng((self.seed, AUGMENT_STREAM, epoch, number))
             yield [
-                PlaceSample(int(place), self._photos(int(place), rng), int(seeds.integers(2**63)))
+                PlaceSample(
+                    int(place), self._sample_photos(int(place), rng), int(seeds.integers(2**63))
+                )
                 for place in order[first : first + self.places_per_batch]
             ]
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """The indices of all places as the epoch goes through them."""
-        every = self.reshuffle_every_epochs
-        rng = np.random.default_rng((self.seed, ORDER_STREAM, epoch // every if every else 0))
+        """Return the indices of all places in the order of the epoch, (places,) int64."""
+        interval = self.reshuffle_every_epochs
+        rng = np.random.default_rng((self.seed, ORDER_STREAM, epoch // interval if interval else 0))
         if self.shuffle_all:
             return rng.permutation(len(self.places))
         return np.concatenate([rng.permutation(indices) for indices in self._indices_by_city()])
@@ -90,7 +98,7 @@ class PlaceBatchSampler:
             by_city.setdefault(place.city, []).append(index)
         return [np.array(indices, np.int64) for indices in by_city.values()]
 
-    def _photos(self, place: int, rng: np.random.Generator) -> tuple[int, ...]:
+    def _sample_photos(self, place: int, rng: np.random.Generator) -> tuple[int, ...]:
         count = len(self.places[place].photos)
         if not self.random_photos:
             return tuple(range(self.photos_per_place))
@@ -111,30 +119,32 @@ _randaugment = tv.RandAugment(
 
 
 def apply_randaugment(image: Image.Image, seed: int) -> Image.Image:
-    """Three operations of RandAugment (Cubuk et al. 2020), the same for the same seed."""
-    # RandAugment draws from the global generator, which is the training's own elsewhere.
+    """Apply RandAugment (Cubuk et al. 2020) with three operations, deterministic for a seed."""
+    # RandAugment draws from the global generator, which the training steps also use.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        changed: Image.Image = _randaugment(image)
-    return changed
+        augmented: Image.Image = _randaugment(image)
+    return augmented
 
 
 def to_tensor(image: Image.Image) -> Tensor:
-    """RGB -> (3, H, W) float32, normalised by ImageNet's means and deviations."""
+    """Convert an RGB image to (3, H, W) float32, normalised with ImageNet's mean and std."""
     pixels = torch.from_numpy(np.array(image, np.uint8)).permute(2, 0, 1)
     mean = torch.tensor(IMAGENET_MEAN)[:, None, None]
-    deviation = torch.tensor(IMAGENET_STD)[:, None, None]
-    return (pixels.float() / 255 - mean) / deviation
+    std = torch.tensor(IMAGENET_STD)[:, None, None]
+    return (pixels.float() / 255 - mean) / std
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
+    """Photos and place labels of one training step."""
+
     photos: Tensor
-    """(n, 3, H, W) float32; n is P x K without the photos that do not decode"""
+    """(n, 3, H, W) float32; n is P x K minus the photos that cannot be decoded"""
     labels: Tensor
     """(n,) int64 place ids"""
     undecodable: tuple[tuple[str, str], ...] = ()
-    """path and reason of each photo left out"""
+    """path and reason of each skipped photo"""
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         return Batch(
@@ -148,87 +158,98 @@ class Batch:
 
 
 class PlaceDataset(Dataset[Batch]):
-    """The photos of one `PlaceSample`, decoded, augmented, normalised.
+    """Decodes, augments and normalises the photos of one `PlaceSample`.
 
-    A photo that does not decode is left out and named in `bad`, or is Unprocessable
-    (`undecodable_photo`) with `bad_is_error`.
+    A photo that cannot be decoded is skipped and listed in `Batch.undecodable`.
+
+    Raises:
+        Unprocessable: `undecodable_photo`, if `fail_on_undecodable` is set.
     """
 
     def __init__(
         self,
-        plan: PlaceBatchSampler,
+        sampler: PlaceBatchSampler,
         image_size: tuple[int, int],
         *,
         augment: bool = True,
         fail_on_undecodable: bool,
     ) -> None:
-        self._places = plan.places
+        self._places = sampler.places
         self._image_size = image_size
         self._augment = augment
         self._fail_on_undecodable = fail_on_undecodable
 
-    def __getitem__(self, draw: PlaceSample) -> Batch:
-        place = self._places[draw.place]
+    def __getitem__(self, sample: PlaceSample) -> Batch:
+        place = self._places[sample.place]
         photos: list[Tensor] = []
-        bad: list[tuple[str, str]] = []
-        for position, number in enumerate(draw.photos):
-            path = place.photos[number]
+        undecodable: list[tuple[str, str]] = []
+        for position, index in enumerate(sample.photos):
+            path = place.photos[index]
             try:
                 image = decode_resized(path, self._image_size)
             except Unprocessable as error:
                 if self._fail_on_undecodable:
                     raise undecodable_photo_error(str(path), error.detail) from error
-                bad.append((str(path), error.detail))
+                undecodable.append((str(path), error.detail))
                 continue
             if self._augment:
-                image = apply_randaugment(image, draw.seed + position)
+                image = apply_randaugment(image, sample.seed + position)
             photos.append(to_tensor(image))
         empty = torch.empty((0, 3, *self._image_size))
         return Batch(
             torch.stack(photos) if photos else empty,
             torch.full((len(photos),), place.place_id, dtype=torch.int64),
-            tuple(bad),
+            tuple(undecodable),
         )
 
 
 def undecodable_photo_error(path: str, reason: str) -> Unprocessable:
+    """Return the error for a photo that cannot be decoded."""
     return Unprocessable(
         "undecodable_photo",
-        f"{path} does not decode: {reason}. Mend or remove it, or leave such photos out: "
+        f"{path} cannot be decoded: {reason}. Repair or remove it, or skip such photos with "
         "--on_bad_image skip.",
     )
 
 
-def collate_batches(parts: list[Batch]) -> Batch:
-    """Places one after the other."""
+def collate_batches(places: list[Batch]) -> Batch:
+    """Concatenate the photos of several places."""
     return Batch(
-        torch.cat([part.photos for part in parts]),
-        torch.cat([part.labels for part in parts]),
-        tuple(each for part in parts for each in part.undecodable),
+        torch.cat([place.photos for place in places]),
+        torch.cat([place.labels for place in places]),
+        tuple(each for place in places for each in place.undecodable),
     )
 
 
 class ResumableDataLoader:
-    """All batches of one epoch after the other; Lightning takes it for a data loader.
+    """Data loader whose position inside an epoch is part of the checkpoint.
 
-    Its state is the number of batches that were handed out, so that training goes on behind them.
-    `seconds_waited` counts how long whoever takes batches has waited for them.
+    Lightning saves `state_dict`, the epoch and the number of batches already yielded; a resumed run
+    begins with the next batch. torch's DataLoader has no such state.
+
+    Attributes:
+        seconds_waited: total time for which the consumer has waited for batches, in seconds.
     """
 
     def __init__(
-        self, plan: PlaceBatchSampler, photos: PlaceDataset, *, num_workers: int, pin_memory: bool
+        self,
+        batch_sampler: PlaceBatchSampler,
+        dataset: PlaceDataset,
+        *,
+        num_workers: int,
+        pin_memory: bool,
     ) -> None:
-        self.plan = plan
-        self.sampler = self  # where Lightning tells the epoch: set_epoch
+        self._batch_sampler = batch_sampler
+        self.sampler = self  # Lightning calls `loader.sampler.set_epoch`
         self.seconds_waited = 0.0
-        self._photos = photos
+        self._dataset = dataset
         self._num_workers = num_workers
         self._pin_memory = pin_memory
         self._epoch = 0
         self._batches_yielded = 0
 
     def __len__(self) -> int:
-        return len(self.plan)
+        return len(self._batch_sampler)
 
     def set_epoch(self, epoch: int) -> None:
         if epoch != self._epoch:
@@ -241,23 +262,25 @@ class ResumableDataLoader:
         self._epoch, self._batches_yielded = state["epoch"], state["given"]
 
     def __iter__(self) -> Iterator[Batch]:
-        # A generator: nothing is read before the first batch is taken, when the epoch is known.
-        if self._batches_yielded >= len(self.plan):
+        # A generator: workers start with the first `next`, after Lightning has called set_epoch.
+        if self._batches_yielded >= len(self._batch_sampler):
             self._batches_yielded = 0
         loader: DataLoader[Batch] = DataLoader(
-            self._photos,
-            batch_sampler=_RemainingBatches(self.plan, self._epoch, self._batches_yielded),
+            self._dataset,
+            batch_sampler=_RemainingBatches(
+                self._batch_sampler, self._epoch, self._batches_yielded
+            ),
             num_workers=self._num_workers,
             collate_fn=collate_batches,
             pin_memory=self._pin_memory,
             worker_init_fn=_init_worker if self._num_workers else None,
-            generator=torch.Generator(),  # else it draws from that of the steps
+            generator=torch.Generator(),  # else it would draw from the training's global generator
         )
         batches = iter(loader)
         while True:
-            began = time.perf_counter()
+            started_at = time.perf_counter()
             batch = next(batches, None)
-            self.seconds_waited += time.perf_counter() - began
+            self.seconds_waited += time.perf_counter() - started_at
             if batch is None:
                 return
             self._batches_yielded += 1
@@ -265,19 +288,19 @@ class ResumableDataLoader:
 
 
 class _RemainingBatches:
-    """The rest of an epoch as torch's loader asks for it: lists of what to read."""
+    """Batch sampler over the remaining batches of one epoch, for torch's DataLoader."""
 
-    def __init__(self, plan: PlaceBatchSampler, epoch: int, start: int) -> None:
-        self._plan, self._epoch, self._start = plan, epoch, start
+    def __init__(self, sampler: PlaceBatchSampler, epoch: int, start: int) -> None:
+        self._sampler, self._epoch, self._start = sampler, epoch, start
 
     def __len__(self) -> int:
-        return len(self._plan) - self._start
+        return len(self._sampler) - self._start
 
     def __iter__(self) -> Iterator[list[PlaceSample]]:
-        return self._plan.batches(self._epoch, self._start)
+        return self._sampler.batches(self._epoch, self._start)
 
 
-def _init_worker(number: int) -> None:
-    # Ctrl-C is for the parent, which ends its workers after it has kept the run.
+def _init_worker(worker_id: int) -> None:
+    # The parent handles Ctrl-C: it saves the run, then ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""The training set and the evaluation sets that a run's arguments mean."""
+"""Selection of the training set and the evaluation sets from a run's arguments."""
 
 from __future__ import annotations
 
@@ -19,67 +19,73 @@ from shared.errors import InvalidRequest, NotFound
 
 @dataclass(frozen=True, slots=True)
 class EvaluationSets:
-    """Evaluation sets of a run; a test set that the phase does not need is not opened."""
+    """Evaluation sets of a run. Sets that the phase does not use are not opened."""
 
     validation: tuple[EvaluationSet, ...]
-    """empty for the phase test"""
+    """empty in the phase test"""
     test: tuple[EvaluationSet, ...]
-    """empty for the phase train"""
+    """empty in the phase train"""
     names: dict[str, tuple[str, ...]]
-    """what val_set_names and test_set_names mean in this folder"""
+    """resolved values of val_set_names and test_set_names"""
 
 
 def select_training_set(arguments: TrainingArguments) -> TrainingSet:
-    """The places to learn from; cities that were not named are all that the folder has.
+    """Open the training set; without explicit `cities`, all cities of the folder.
 
-    Raises InvalidRequest (`data_root_missing`), and what `open_training_set` raises.
+    Raises:
+        InvalidRequest: `data_root_missing`; also raises what `open_training_set` raises.
     """
-    named = "cities" in arguments.model_fields_set
+    is_explicit = "cities" in arguments.model_fields_set
     return open_training_set(
         _require_data_root(arguments),
-        arguments.cities if named else None,
+        arguments.cities if is_explicit else None,
         min_photos=arguments.min_img_per_place,
     )
 
 
 def select_evaluation_sets(arguments: TrainingArguments) -> EvaluationSets:
-    """The sets to validate and to test on, as far as the phase needs them.
+    """Open the validation and test sets that the phase uses.
 
-    A set that was named must be there. Where none was, those of the default names are taken, or
-    else the folder's own: for validation those with `val` in their names, for tests those with
-    `test`, and all where no name says what it is for.
+    Sets that are named explicitly must exist. Otherwise the sets with the default names are used;
+    if there are none, those with `val` in their names for validation and `test` for tests; if there
+    are none of these either, all sets of the folder.
 
-    Raises NotFound (`set_missing`, which lists the known ones), InvalidRequest
-    (`data_root_missing`).
+    Raises:
+        NotFound: `set_missing`; the message lists the available sets.
+        InvalidRequest: `data_root_missing`.
     """
     roots = arguments.eval_roots or (_require_data_root(arguments),)
-    there: dict[str, Path] = {}
+    available: dict[str, Path] = {}
     for root in roots:
         for name in evaluation_set_names(root):
-            there.setdefault(name, root)
+            available.setdefault(name, root)
     names = {
-        "val_set_names": _resolve_set_names(arguments, "val_set_names", "val", there),
-        "test_set_names": _resolve_set_names(arguments, "test_set_names", "test", there),
+        "val_set_names": _resolve_set_names(arguments, "val_set_names", "val", available),
+        "test_set_names": _resolve_set_names(arguments, "test_set_names", "test", available),
     }
     opened: dict[str, EvaluationSet] = {}
 
-    def chosen(argument: str) -> tuple[EvaluationSet, ...]:
+    def open_sets(argument: str) -> tuple[EvaluationSet, ...]:
         for name in names[argument]:
-            if name not in there:
+            if name not in available:
                 raise NotFound(
                     "set_missing",
                     f"--{argument}: there is no set {name!r} in "
                     f"{', '.join(str(root) for root in roots)}."
-                    + (suggest_name(name, there) if there else " No set was recognised there."),
+                    + (
+                        suggest_name(name, available)
+                        if available
+                        else " No evaluation set was recognised there."
+                    ),
                 )
             if name not in opened:
-                opened[name] = open_evaluation_set(there[name], name)
+                opened[name] = open_evaluation_set(available[name], name)
         return tuple(opened[name] for name in names[argument])
 
     phase = arguments.experiment_phase
     return EvaluationSets(
-        validation=chosen("val_set_names") if phase != "test" else (),
-        test=chosen("test_set_names") if phase != "train" else (),
+        validation=open_sets("val_set_names") if phase != "test" else (),
+        test=open_sets("test_set_names") if phase != "train" else (),
         names=names,
     )
 
@@ -98,7 +104,7 @@ def _resolve_set_names(
 
 
 def summarise_training_set(training_set: TrainingSet) -> dict[str, Any]:
-    """What reports say of it, and what a resumed run compares."""
+    """Return the training set's entry in reports; a resumed run compares its fingerprint."""
     return {
         "name": training_set.name,
         "layout": training_set.layout,
@@ -110,7 +116,7 @@ def summarise_training_set(training_set: TrainingSet) -> dict[str, Any]:
 
 
 def summarise_evaluation_set(evaluation_set: EvaluationSet) -> dict[str, Any]:
-    """What stands beside every figure of the set."""
+    """Return the metadata that is reported with every metric of the set."""
     return {
         "database": len(evaluation_set.database),
         "queries": len(evaluation_set.queries),
@@ -125,7 +131,8 @@ def _require_data_root(arguments: TrainingArguments) -> Path:
     if arguments.data_root is None:
         raise InvalidRequest(
             "data_root_missing",
-            "--data_root DIR is needed: the folder of the data set, as `placewise datasets check "
-            "DIR` recognises it. `placewise datasets synth DIR` draws one to try things on.",
+            "--data_root DIR is required: the folder of the data set, in a layout that `placewise "
+            "datasets check DIR` recognises. `placewise datasets synth DIR` generates a data set "
+            "for a first try.",
         )
     return arguments.data_root

@@ -1,17 +1,16 @@
-"""Many runs, one after the other: what is finished stays, what was interrupted goes on.
+"""Grid search: plans training runs from a YAML file and executes them sequentially.
 
-The runs of a grid, as its YAML file says them.
+Finished runs are skipped, interrupted runs are resumed, failed runs are retried. The format:
 
     base: {lr: 0.0002}                   # arguments of every run
-    grid:                                # every combination
+    grid:                                # Cartesian product
       agg_arch: [AVG, GeM]
       loss: [{loss_name: NTXentLoss}, {loss_name: FastAPLoss, miner_name: AngularMiner}]
-    runs:                                # or one by one
+    runs:                                # additional single runs
       - {name: baseline, agg_arch: GeM, published: {sfxs_val/R1: 63.59}}
-    fingerprints: {sfxs_val: 0123...}    # of the sets that the published figures were made on
+    fingerprints: {sfxs_val: 0123...}    # of the sets that published results were measured on
 
-A value of an axis that is a mapping sets several arguments; then the axis's own name is only a
-label.
+A value that is a mapping sets several arguments; the name of its axis is then only a label.
 """
 
 from __future__ import annotations
@@ -45,30 +44,39 @@ from shared.errors import Conflict, InvalidRequest, PlacewiseError
 
 GRID_KEYS = ("base", "grid", "runs", "fingerprints")
 RESERVED_ARGUMENTS = ("default_root_dir", "run_name")
-"""which the grid gives to each run itself"""
+"""Arguments that the grid sets for each run"""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
+    """A run of a grid: its name and its arguments."""
+
     name: str
     arguments: dict[str, Any]
     published: dict[str, float] = field(default_factory=dict)
-    """SET/R1 -> per cent, of somebody else's run with these settings"""
+    """SET/R1 -> published result of these settings, in per cent"""
 
 
 @dataclass(frozen=True, slots=True)
 class GridPlan:
+    """The runs of a grid."""
+
     runs: tuple[PlannedRun, ...]
     fingerprints: dict[str, str]
-    """of the sets on which the published figures were made; empty: not known"""
+    """set name -> fingerprint of the set that published results were measured on; may be empty"""
 
 
 def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
-    """The plan in a YAML file, with arguments that override every run's.
+    """Load a grid from a YAML file and validate the arguments of all runs.
 
-    Every run's arguments and names are checked before the first begins. Raises NotFound
-    (`config_not_found`), InvalidRequest (`bad_grid`, `unknown_argument`, `bad_argument`), and what
-    an unknown backbone, aggregator, loss or miner is.
+    Args:
+        path: the YAML file.
+        overrides: arguments that override those of every run.
+
+    Raises:
+        NotFound: `config_not_found`.
+        InvalidRequest: `bad_grid`, `unknown_argument`, `bad_argument`. Also raises the errors of
+            an unknown backbone, aggregator, loss or miner.
     """
     stored = load_mapping(path)
     for key in stored:
@@ -85,10 +93,10 @@ def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
     if not runs:
         raise _grid_error(path, "it has neither `grid` nor `runs`: there is nothing to train")
     names = [run.name for run in runs]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
         raise _grid_error(
-            path, f"several runs are called {', '.join(twice)}: give each a name of its own"
+            path, f"several runs are called {', '.join(duplicates)}; run names must be unique"
         )
     fingerprints = _require_mapping(path, "fingerprints", stored.get("fingerprints"))
     return GridPlan(tuple(runs), {name: str(value) for name, value in fingerprints.items()})
@@ -98,15 +106,15 @@ def _expand_grid(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, 
     options: list[list[tuple[str, dict[str, Any]]]] = []
     for axis, values in axes.items():
         if not isinstance(values, list) or not values:
-            raise _grid_error(path, f"grid, {axis}: a list of values is needed")
+            raise _grid_error(path, f"grid, {axis}: must be a list of values")
         options.append([_axis_option(path, axis, value) for value in values])
-    found: list[tuple[str, dict[str, Any], Any]] = []
-    for chosen in itertools.product(*options) if options else ():
+    runs: list[tuple[str, dict[str, Any], Any]] = []
+    for combination in itertools.product(*options) if options else ():
         arguments: dict[str, Any] = {}
-        for _, values in chosen:
+        for _, values in combination:
             arguments |= values
-        found.append(("-".join(label for label, _ in chosen), arguments, {}))
-    return found
+        runs.append(("-".join(label for label, _ in combination), arguments, {}))
+    return runs
 
 
 def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]]:
@@ -120,39 +128,39 @@ def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]
 
 
 def _listed_runs(path: Path, runs: Any) -> list[tuple[str, dict[str, Any], Any]]:
-    found = []
+    listed = []
     for number, entry in enumerate(runs if isinstance(runs, list) else [runs], start=1):
         values = dict(_require_mapping(path, f"runs, {number}", entry))
         name = str(values.pop("name", f"{number:02d}"))
         published = _require_mapping(path, f"{name}, published", values.pop("published", None))
-        found.append((name, resolve_keys(values, f"{path}, runs, {name}"), published))
-    return found
+        listed.append((name, resolve_keys(values, f"{path}, runs, {name}"), published))
+    return listed
 
 
 def _plan_run(path: Path, name: str, values: dict[str, Any], published: Any) -> PlannedRun:
-    given = [key for key in RESERVED_ARGUMENTS if key in values]
-    if given:
+    reserved = [key for key in RESERVED_ARGUMENTS if key in values]
+    if reserved:
         raise _grid_error(
-            path, f"{', '.join(given)} can't be given: each run has its folder in --out"
+            path, f"{', '.join(reserved)} cannot be set: each run has its folder in --out"
         )
     try:
         arguments = build_arguments(values)
         build_model_config(arguments)
         make_loss(arguments.loss_name)
         make_miner(arguments.miner_name, arguments.miner_margin)
-        figures = {str(key): float(value) for key, value in published.items()}
+        published_metrics = {str(key): float(value) for key, value in published.items()}
     except PlacewiseError as error:
         raise type(error)(error.code, f"{path}, {name}: {error.detail}") from error
     except (TypeError, ValueError) as error:
-        raise _grid_error(path, f"{name}, published: numbers are needed") from error
-    return PlannedRun(safe_filename(name), values, figures)
+        raise _grid_error(path, f"{name}, published: values must be numbers") from error
+    return PlannedRun(safe_filename(name), values, published_metrics)
 
 
 def _require_mapping(path: Path, location: str, value: Any) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise _grid_error(path, f"{location}: names with values are needed")
+        raise _grid_error(path, f"{location}: must be a mapping of names to values")
     return value
 
 
@@ -166,38 +174,43 @@ Json = dict[str, Any]
 
 
 class RunState(StrEnum):
+    """State of a run, determined from the files in its folder."""
+
     FINISHED = "finished"
-    """its summary is there"""
+    """has metrics.json"""
     INTERRUPTED = "interrupted"
-    """it has a last.ckpt to go on from"""
+    """has last.ckpt and can be resumed"""
     FAILED = "failed"
-    """it ended with an error; it is tried again"""
+    """ended with an error; will be retried"""
     WAITING = "waiting"
-    """it has not made a step"""
+    """has not completed a step"""
 
 
 @dataclass(frozen=True, slots=True)
 class RunOutcome:
+    """State of a run, with its report or its error."""
+
     run: PlannedRun
     state: RunState
     report: Json | None = None
     """`metrics.json` of a finished run"""
     error: Json | None = None
-    """`code` and `detail` of a failed one"""
+    """`code` and `detail` of a failed run"""
 
 
 @dataclass(frozen=True, slots=True)
 class RunFunctions:
-    """How one run is made; `services.trainer.run` has both."""
+    """Functions that start and resume a run: `run` and `resume` of `services.trainer.run`."""
 
     begin: Callable[..., Json]
     resume: Callable[..., Json]
 
 
 def load_outcome(planned: PlannedRun, out: Path) -> RunOutcome:
-    """How far the run of this plan is in its folder below `out`.
+    """Determine the state of a planned run from its folder below `out`.
 
-    Raises Conflict (`grid_run_differs`) for one that was made with other arguments.
+    Raises:
+        Conflict: `grid_run_differs`, if the folder's run has other arguments.
     """
     folder = out / planned.name
     if (folder / CONFIG_FILE).is_file():
@@ -222,39 +235,50 @@ def run_grid(
     stop: StopRequest,
     after_each: Callable[[list[RunOutcome]], None],
 ) -> list[RunOutcome]:
-    """Make every run that is not finished; one that fails is named and the others go on.
+    """Execute all unfinished runs sequentially. A failed run does not stop the others.
 
-    `after_each` is told all outcomes so far. Raises RunStopped when the end was asked for, and what
-    `load_outcome` raises.
+    Args:
+        plan: the runs.
+        out: root folder of the runs.
+        trainer: functions that start and resume a run.
+        display: receives messages and progress.
+        stop: requests a graceful stop.
+        after_each: called with all outcomes after each run.
+
+    Returns:
+        The outcomes in the order of the plan.
+
+    Raises:
+        RunStopped: a stop was requested; also raises what `load_outcome` raises.
     """
     outcomes = [load_outcome(planned, out) for planned in plan.runs]
-    for number, before in enumerate(outcomes):
-        planned = before.run
-        title = f"run {number + 1} of {len(outcomes)}, {planned.name}"
-        if before.state is RunState.FINISHED:
-            display.info(f"{title}: finished before")
+    for index, outcome in enumerate(outcomes):
+        planned = outcome.run
+        title = f"run {index + 1} of {len(outcomes)}, {planned.name}"
+        if outcome.state is RunState.FINISHED:
+            display.info(f"{title}: already finished")
             continue
-        display.info(f"{title}: {'goes on' if before.state is RunState.INTERRUPTED else 'begins'}")
-        outcomes[number] = _run_one(before, out / planned.name, trainer, display, stop)
+        is_interrupted = outcome.state is RunState.INTERRUPTED
+        display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
+        outcomes[index] = _execute_run(planned, out / planned.name, trainer, display, stop)
         after_each(outcomes)
     return outcomes
 
 
-def _run_one(
-    before: RunOutcome, folder: Path, trainer: RunFunctions, display: Display, stop: StopRequest
+def _execute_run(
+    planned: PlannedRun, folder: Path, trainer: RunFunctions, display: Display, stop: StopRequest
 ) -> RunOutcome:
-    planned = before.run
     (folder / FAILED_FILE).unlink(missing_ok=True)
     try:
         if (folder / CHECKPOINTS_FOLDER / LAST_CHECKPOINT).is_file():
             report = trainer.resume(folder, {}, display, stop)
         else:
             _remove_unstarted(folder)
-            own = {"default_root_dir": str(folder.parent), "run_name": folder.name}
-            report = trainer.begin(build_arguments(planned.arguments, own), display, stop)
+            reserved = {"default_root_dir": str(folder.parent), "run_name": folder.name}
+            report = trainer.begin(build_arguments(planned.arguments, reserved), display, stop)
     except RunStopped:
         raise
-    # A run that needs too much memory, say, must not take the night's others with it.
+    # Any error, such as running out of memory, must not stop the remaining runs.
     except Exception as error:
         reason = {
             "code": error.code if isinstance(error, PlacewiseError) else type(error).__name__,
@@ -269,23 +293,23 @@ def _run_one(
 
 
 def _remove_unstarted(folder: Path) -> None:
-    """Remove what a run left that never made a step."""
+    """Remove the folder of a run that never completed a step."""
     if (folder / CONFIG_FILE).is_file():
         shutil.rmtree(folder)
 
 
 def _check_same_arguments(planned: PlannedRun, folder: Path) -> None:
-    made = to_plain_dict(build_arguments(load_yaml(folder / CONFIG_FILE)))
-    wanted = to_plain_dict(build_arguments(planned.arguments))
-    # Names of sets and paths are resolved when a run begins: they need not read alike.
+    stored = to_plain_dict(build_arguments(load_yaml(folder / CONFIG_FILE)))
+    expected = to_plain_dict(build_arguments(planned.arguments))
+    # Paths and cities are resolved when a run starts, so their stored values may differ.
     differing = [
         name
         for name in planned.arguments
-        if name not in ("data_root", "eval_roots", "cities") and made[name] != wanted[name]
+        if name not in ("data_root", "eval_roots", "cities") and stored[name] != expected[name]
     ]
     if differing:
         raise Conflict(
             "grid_run_differs",
-            f"{folder} was made with another {', '.join(differing)} than the grid says now. Give "
+            f"The run in {folder} has a different {', '.join(differing)} than the grid. Use "
             "another --out, rename the run, or remove that folder.",
         )

@@ -1,7 +1,7 @@
-"""The runs of a grid side by side: as rows, CSV and markdown.
+"""Leaderboard of a grid's runs, as rows, CSV and Markdown.
 
-A published figure stands beside one's own only where the set's fingerprint is that of the published
-one: else the two are figures of different things.
+A published result is shown only if the evaluation set has the fingerprint of the published one.
+Otherwise the two results are not comparable.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Row = dict[str, str]
 
 
 def leaderboard(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> list[Row]:
-    """One row for each run, the best first by its own metric; those without figures come last."""
+    """Build a row per run, best first by the monitored metric; runs without metrics come last."""
     ranked = sorted(outcomes, key=lambda outcome: -_score(outcome))
     comparable = _comparable_sets(plan, outcomes)
     rows = [_row(outcome, comparable) for outcome in ranked]
@@ -29,7 +29,7 @@ def leaderboard(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> list[Row]:
 
 
 def write_leaderboard(rows: Sequence[Row], out: Path) -> None:
-    """`leaderboard.csv` and `leaderboard.md` in the folder."""
+    """Write `leaderboard.csv` and `leaderboard.md` to a folder."""
     columns = list(rows[0])
     with (out / "leaderboard.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
@@ -44,17 +44,17 @@ def _row(outcome: RunOutcome, comparable: set[str]) -> Row:
     row: Row = {"run": outcome.run.name}
     if outcome.report is None:
         row |= {name: str(outcome.run.arguments.get(name, "")) for name in SETTING_COLUMNS}
-        why = f": {outcome.error['code']}" if outcome.error else ""
-        return {**row, "state": f"{outcome.state}{why}"}
+        code = f": {outcome.error['code']}" if outcome.error else ""
+        return {**row, "state": f"{outcome.state}{code}"}
     report = outcome.report
     row |= {name: str(report["arguments"][name]) for name in SETTING_COLUMNS}
     row["state"] = str(outcome.state)
-    figures = {**_best_epoch(report)["figures"], **_test_metrics(report)}
-    for metric, share in figures.items():
-        set_name, _, at = metric.rpartition("/")
-        if int(at.removeprefix("R")) not in SHOWN_KS:
+    metrics = {**_best_epoch(report)["figures"], **_test_metrics(report)}
+    for metric, value in metrics.items():
+        set_name, _, recall_name = metric.rpartition("/")
+        if int(recall_name.removeprefix("R")) not in SHOWN_KS:
             continue
-        row[metric] = f"{share:.2%}".removesuffix("%")
+        row[metric] = f"{value:.2%}".removesuffix("%")
         if metric in outcome.run.published and set_name in comparable:
             row[f"{metric} published"] = f"{outcome.run.published[metric]:.2f}"
     row["dimension"] = str(report["best"]["dimension"])
@@ -65,12 +65,12 @@ def _row(outcome: RunOutcome, comparable: set[str]) -> Row:
 
 
 def _comparable_sets(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> set[str]:
-    found = set()
+    comparable = set()
     for outcome in outcomes:
-        for name, about in (outcome.report or {}).get("sets", {}).items():
-            if plan.fingerprints.get(name) == about["fingerprint"]:
-                found.add(name)
-    return found
+        for name, metadata in (outcome.report or {}).get("sets", {}).items():
+            if plan.fingerprints.get(name) == metadata["fingerprint"]:
+                comparable.add(name)
+    return comparable
 
 
 def _best_epoch(report: dict[str, Any]) -> dict[str, Any]:
@@ -82,19 +82,19 @@ def _best_epoch(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def _test_metrics(report: dict[str, Any]) -> dict[str, float]:
-    """A test's figures; they stand above a validation's of the same set."""
+    """Return test metrics, which take precedence over validation metrics of the same set."""
     return {
-        f"{name}/R{k}": share
-        for name, one in report["test"].items()
-        for k, share in one["recall"].items()
-        if share is not None
+        f"{name}/R{k}": recall
+        for name, result in report["test"].items()
+        for k, recall in result["recall"].items()
+        if recall is not None
     }
 
 
 def _score(outcome: RunOutcome) -> float:
     if outcome.state is not RunState.FINISHED or outcome.report is None:
         return float("-inf")
-    figure = _best_epoch(outcome.report)["figures"].get(outcome.report["monitor"])
-    if figure is None:
+    value = _best_epoch(outcome.report)["figures"].get(outcome.report["monitor"])
+    if value is None:
         return float("-inf")
-    return float(figure) if outcome.report["arguments"]["mode"] == "max" else -float(figure)
+    return float(value) if outcome.report["arguments"]["mode"] == "max" else -float(value)

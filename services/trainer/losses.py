@@ -1,10 +1,8 @@
-"""Losses by name, with the settings of the predecessor's published runs.
+"""Metric-learning losses by name, with the settings of the published GSV-Cities runs.
 
-All are pytorch-metric-learning's. Two of them compute here what the library computes, by other
-sums: with the hundreds of thousands of triplets that a miner may find in 400 photos, the library's
-own take gigabytes.
-
-Losses and miners are chosen by name.
+All losses come from pytorch-metric-learning. AngularLoss and NTXentLoss are reimplemented with
+equal results and less memory: a miner may find hundreds of thousands of triplets in 400 photos, for
+which the library's versions allocate gigabytes.
 """
 
 from __future__ import annotations
@@ -23,13 +21,14 @@ from shared.errors import Unprocessable
 
 
 def match_name(name: str, known: Sequence[str], *, suffix: str, argument: str) -> str:
-    """The one of `known` that `name` means, in capitals or not, with or without the suffix.
+    """Return the element of `known` that equals `name`, ignoring case and the suffix.
 
-    Unprocessable: `unknown_loss` or `unknown_miner`, by the suffix; it lists the known ones.
+    Raises:
+        Unprocessable: `unknown_loss` or `unknown_miner`, by the suffix; lists the known names.
     """
-    wanted = name.strip().lower().removesuffix(suffix.lower())
+    key = name.strip().lower().removesuffix(suffix.lower())
     for candidate in known:
-        if candidate.lower().removesuffix(suffix.lower()) == wanted:
+        if candidate.lower().removesuffix(suffix.lower()) == key:
             return candidate
     raise Unprocessable(
         f"unknown_{suffix.lower()}",
@@ -38,11 +37,11 @@ def match_name(name: str, known: Sequence[str], *, suffix: str, argument: str) -
 
 
 class AngularLoss(losses.AngularLoss):  # type: ignore[misc]
-    """Wang et al. 2017 (ICCV, "Deep Metric Learning with Angular Loss").
+    """Angular loss of Wang et al. 2017 (ICCV, "Deep Metric Learning with Angular Loss").
 
     Mean over the pairs (a, p) of log(1 + sum over the batch's photos n of other places of
-    exp(4 tan^2(alpha) (a + p).n - 2 (1 + tan^2(alpha)) a.p)). A pair that comes in many triplets
-    counts as often, but is computed once.
+    exp(4 tan^2(alpha) (a + p).n - 2 (1 + tan^2(alpha)) a.p)). A pair that occurs in several
+    triplets is computed once and weighted by its number of occurrences.
     """
 
     def compute_loss(
@@ -51,22 +50,24 @@ class AngularLoss(losses.AngularLoss):  # type: ignore[misc]
         a1, p, a2, n = loss_and_miner_utils.convert_to_pairs(indices_tuple, labels, ref_labels)
         if not len(a1) or not len(a2):
             return dict(self.zero_losses())
-        (anchors, positives), of_pair = torch.unique(
+        (anchors, positives), pair_index = torch.unique(
             torch.stack([a1, p]), dim=1, return_inverse=True
         )
-        found: dict[str, Any] = super().compute_loss(
+        result: dict[str, Any] = super().compute_loss(
             embeddings, labels, (anchors, positives, a2, n), ref_emb, ref_labels
         )
-        found["loss"] |= {"losses": found["loss"]["losses"][of_pair], "indices": (a1, p)}
-        return found
+        result["loss"] |= {"losses": result["loss"]["losses"][pair_index], "indices": (a1, p)}
+        return result
 
 
 class NTXentLoss(losses.NTXentLoss):  # type: ignore[misc]
-    """van den Oord et al. 2018 (InfoNCE); Chen et al. 2020 (SimCLR) name it so.
+    """Normalised temperature-scaled cross entropy (InfoNCE).
+
+    van den Oord et al. 2018; Chen et al. 2020 (SimCLR) introduced the name NT-Xent.
 
     Mean over the pairs (a, p) of -log(e^(s_ap / t) / (e^(s_ap / t) + sum over the negatives n of a
-    of e^(s_an / t))), s the cosine. The sum over an anchor's negatives is the same for all of its
-    pairs, and computed once.
+    of e^(s_an / t))), with s the cosine similarity and t the temperature. The sum over an anchor's
+    negatives is shared by all of its pairs and computed once.
     """
 
     def _compute_loss(self, pos_pairs: Any, neg_pairs: Any, indices_tuple: Any) -> dict[str, Any]:
@@ -79,11 +80,11 @@ class NTXentLoss(losses.NTXentLoss):  # type: ignore[misc]
             largest = negatives.new_zeros(anchors)
             largest.scatter_reduce_(0, a2, negatives, "amax", include_self=False)
         sums = negatives.new_zeros(anchors).index_add(0, a2, (negatives - largest[a2]).exp())
-        some = sums > 0
-        # Where there are no negatives, the loss is 0; a 1 keeps its gradient from being NaN.
-        of_anchor = largest + torch.where(some, sums, 1.0).log()
-        found = torch.where(some[a1], softplus(of_anchor[a1] - positives), 0.0)
-        return {"loss": {"losses": found, "indices": (a1, p), "reduction_type": "pos_pair"}}
+        has_negatives = sums > 0
+        # Without negatives the loss is 0; log(1) instead of log(0) avoids a NaN gradient.
+        log_sums = largest + torch.where(has_negatives, sums, 1.0).log()
+        pair_losses = torch.where(has_negatives[a1], softplus(log_sums[a1] - positives), 0.0)
+        return {"loss": {"losses": pair_losses, "indices": (a1, p), "reduction_type": "pos_pair"}}
 
 
 LOSSES: dict[str, Callable[[], nn.Module]] = {
@@ -103,10 +104,15 @@ LOSSES: dict[str, Callable[[], nn.Module]] = {
 
 
 def make_loss(name: str) -> nn.Module:
-    """The loss: called with (B, D) float32 rows, (B,) labels, and what a miner found or None; all
-    pairs of the batch where that is None.
+    """Create a loss by name.
 
-    `name`: a key of LOSSES, in capitals or not, with or without `Loss`. Unprocessable:
-    `unknown_loss`.
+    The loss is called with (B, D) float32 embeddings, (B,) labels, and the indices that a miner
+    returned; None uses all pairs of the batch.
+
+    Args:
+        name: a key of LOSSES, in any case, with or without `Loss`.
+
+    Raises:
+        Unprocessable: `unknown_loss`.
     """
     return LOSSES[match_name(name, tuple(LOSSES), suffix="Loss", argument="loss_name")]()

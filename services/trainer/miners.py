@@ -1,7 +1,7 @@
-"""Miners by name, with the settings of the predecessor's published runs.
+"""Pair and triplet miners by name, with the settings of the published GSV-Cities runs.
 
-A miner looks for the pairs or triplets of a batch that a loss is to learn from. All are
-pytorch-metric-learning's, but for the angular one.
+A miner selects the informative pairs or triplets of a batch for the loss. All miners come from
+pytorch-metric-learning except `AngularMiner`, which needs less memory than the library's.
 """
 
 from __future__ import annotations
@@ -24,36 +24,46 @@ MAX_BLOCK_VALUES = 1 << 22  # 16 MB of float32
 
 
 class AngularMiner(nn.Module):
-    """All triplets (a, p, n) with atan(|a - p| / (2 |n - (a + p) / 2|)) > angle: the angle
-    at n in the triangle of Wang et al. 2017.
+    """Selects all triplets (a, p, n) with atan(|a - p| / (2 |n - (a + p) / 2|)) > angle.
 
-    The same triplets in the same order as `miners.AngularMiner`, which copies three rows for each
-    of them; here the distances to the centre of each pair are taken, some pairs at a time.
+    This is the angle at n in the triangle of Wang et al. 2017. The result has the same triplets in
+    the same order as `miners.AngularMiner`. The library's version copies three rows per triplet;
+    this one computes the distances to the centre of each pair, in blocks of pairs.
     """
 
     def __init__(self, angle: float, max_block_values: int = MAX_BLOCK_VALUES) -> None:
-        """`angle` in degrees; no intermediate result has more than `max_block_values` numbers,
-        unless one pair's has."""
+        """Create the miner.
+
+        Args:
+            angle: minimum angle, in degrees.
+            max_block_values: maximum number of values in an intermediate tensor; exceeded only
+                if a single pair needs more.
+        """
         super().__init__()
         self.tangent = math.tan(math.radians(angle))
         self.max_block_values = max_block_values
 
     @torch.no_grad()
     def forward(self, rows: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """(B, D) unit rows, (B,) labels -> indices of anchors, positives and negatives."""
+        """Return the indices of anchors, positives and negatives, each (triplets,) int64.
+
+        Args:
+            rows: (B, D) L2-normalised embeddings.
+            labels: (B,) place labels.
+        """
         a, p, _, _ = loss_and_miner_utils.get_all_pairs_indices(labels)
-        at_once = max(1, self.max_block_values // max(rows.shape))
-        found = []
-        for anchors, positives in zip(a.split(at_once), p.split(at_once), strict=True):
+        block_pairs = max(1, self.max_block_values // max(rows.shape))
+        blocks = []
+        for anchors, positives in zip(a.split(block_pairs), p.split(block_pairs), strict=True):
             sides = (rows[anchors] - rows[positives]).norm(dim=1, keepdim=True)
             centres = (rows[anchors] + rows[positives]) / 2
-            # By differences: products cancel where a negative is close to the centre.
-            to_centre = torch.cdist(centres, rows, compute_mode="donot_use_mm_for_euclid_dist")
-            wide = sides > 2 * self.tangent * to_centre
-            wide &= labels[anchors].unsqueeze(1) != labels
-            pair, negatives = torch.where(wide)
-            found.append((anchors[pair], positives[pair], negatives))
-        return tuple(torch.cat(part) for part in zip(*found, strict=True))
+            # The matrix-product form loses precision where a negative is close to the centre.
+            distances = torch.cdist(centres, rows, compute_mode="donot_use_mm_for_euclid_dist")
+            selected = sides > 2 * self.tangent * distances
+            selected &= labels[anchors].unsqueeze(1) != labels
+            pair, negatives = torch.where(selected)
+            blocks.append((anchors[pair], positives[pair], negatives))
+        return tuple(torch.cat(part) for part in zip(*blocks, strict=True))
 
 
 MINERS: dict[str, Callable[[float], nn.Module]] = {
@@ -65,7 +75,7 @@ MINERS: dict[str, Callable[[float], nn.Module]] = {
     ),
     "AngularMiner": lambda _margin: AngularMiner(angle=20),
     "BatchHardMiner": lambda _margin: miners.BatchHardMiner(),
-    # The library's default: each photo's easiest positive, and its hardest negative beyond that.
+    # Library default: each photo's easiest positive and hardest negative farther than it.
     "BatchEasyHardMiner": lambda _margin: miners.BatchEasyHardMiner(),
     "TripletMarginMiner": lambda margin: miners.TripletMarginMiner(
         margin=margin, type_of_triplets="semihard"
@@ -77,12 +87,21 @@ MINERS: dict[str, Callable[[float], nn.Module]] = {
 
 
 def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
-    """The miner: (B, D) float32 rows, (B,) labels -> indices in the batch, of pairs (a1, p, a2, n)
-    or triplets (a, p, n). None for `none` or None: the loss takes all pairs.
+    """Create a miner by name.
 
-    `name`: a key of MINERS, in capitals or not, with or without `Miner`; `margin` (cosine for
-    MultiSimilarityMiner, distance for TripletMarginMiner) reaches those two alone, as it did in the
-    predecessor. Unprocessable: `unknown_miner`.
+    The miner is called with (B, D) float32 embeddings and (B,) labels, and returns indices into
+    the batch: pairs (a1, p, a2, n) or triplets (a, p, n).
+
+    Args:
+        name: a key of MINERS, in any case, with or without `Miner`; `none` or None for no miner.
+        margin: epsilon of MultiSimilarityMiner (cosine) or margin of TripletMarginMiner (distance);
+            ignored by the other miners, as in the GSV-Cities code.
+
+    Returns:
+        The miner, or None: the loss then uses all pairs.
+
+    Raises:
+        Unprocessable: `unknown_miner`.
     """
     if name is None or name.strip().lower() == NO_MINER:
         return None
@@ -93,11 +112,14 @@ def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
 def batch_accuracy(
     loss: nn.Module, miner: nn.Module | None, mined: Any, photos: int
 ) -> float | None:
-    """The predecessor's `b_acc`: the share of a batch's photos that are no anchor of what was
-    mined, because the network already tells their places apart.
+    """Return `b_acc` of the GSV-Cities code: the share of photos without a mined pair or triplet.
 
-    None where that says nothing: without a miner, with FastAP (for which mined pairs are weights,
-    every photo is an anchor) and with the histogram miner (which samples, whatever is learnt).
+    These are the photos whose places the network already distinguishes.
+
+    Returns:
+        A share from 0 to 1. None where it is not meaningful: without a miner, with FastAP (mined
+        pairs are weights there, so every photo is an anchor), and with the histogram miner (which
+        samples pairs independently of what was learned).
     """
     if miner is None or isinstance(loss, FastAPLoss):
         return None

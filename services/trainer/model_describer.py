@@ -1,4 +1,4 @@
-"""Photos described by a network of place descriptors, in training and from a checkpoint."""
+"""Describes photos with a place descriptor network, in validation and from a checkpoint."""
 
 from __future__ import annotations
 
@@ -18,17 +18,28 @@ from shared.evaluation.ranking import Rows, refused_photos_error
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
 
-# The means and deviations of ImageNet's channels, with which the backbones were trained.
+# Mean and std of ImageNet's channels, the normalisation with which the backbones were trained.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class ModelDescriber:
-    """Calls a network (B, 3, H, W) float32, ImageNet-normalised -> (B, D) on photos.
+    """Computes the descriptors of photo files with a network.
 
-    `image_size`: (height, width), to which photos are squeezed, bilinear and antialiased, as in
-    training; None keeps each photo's own size, and photos of one size go through together.
-    The network is left in the mode, training or not, in which it came.
+    The network's training mode is restored after each call.
+
+    Args:
+        model: (B, 3, H, W) float32, ImageNet-normalised -> (B, D).
+        device: device of the network.
+        image_size: (height, width) to which photos are resized without keeping the aspect ratio,
+            bilinear and antialiased, as in training. None keeps each photo's size; photos of equal
+            size form a batch.
+        batch_photos: number of photos read and described at a time.
+        max_pixels: larger photos are refused.
+
+    Attributes:
+        seconds: time spent in the network, in seconds; decoding runs concurrently.
+        photos: number of photos described in that time.
     """
 
     def __init__(
@@ -51,38 +62,42 @@ class ModelDescriber:
         )
         self._limit = BatchSizeLimit()
         self.seconds = 0.0
-        """spent in the network, of `photos`; they are read and decoded meanwhile"""
         self.photos = 0
         self._mean = torch.tensor(IMAGENET_MEAN, device=device)[:, None, None] * 255
-        self._deviation = torch.tensor(IMAGENET_STD, device=device)[:, None, None] * 255
+        self._std = torch.tensor(IMAGENET_STD, device=device)[:, None, None] * 255
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
+        """Yield (n, D) float32 descriptors, batch by batch, in the order of the photos.
+
+        Raises:
+            PlacewiseError: one error for all photos that cannot be read, decoded or processed.
+        """
         refused: list[tuple[Path, PlacewiseError]] = []
         was_training = self._model.training
         self._model.eval()
         threads = ThreadPoolExecutor(max(1, os.cpu_count() or 1))  # decoding releases the GIL
         try:
-            ahead = [threads.submit(self._read, p) for p in photos[: self._batch_photos]]
-            for begin in range(0, len(photos), self._batch_photos):
-                batch = [future.result() for future in ahead]
-                end = begin + self._batch_photos
-                following = photos[end : end + self._batch_photos]
-                ahead = [threads.submit(self._read, photo) for photo in following]
-                here = photos[begin:end]
+            prefetched = [threads.submit(self._decode, p) for p in photos[: self._batch_photos]]
+            for start in range(0, len(photos), self._batch_photos):
+                decoded = [future.result() for future in prefetched]
+                end = start + self._batch_photos
+                next_batch = photos[end : end + self._batch_photos]
+                prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
+                batch = photos[start:end]
                 refused += [
-                    (photo, outcome)
-                    for photo, outcome in zip(here, batch, strict=True)
-                    if isinstance(outcome, PlacewiseError)
+                    (photo, result)
+                    for photo, result in zip(batch, decoded, strict=True)
+                    if isinstance(result, PlacewiseError)
                 ]
-                if not refused:  # after a refusal, the rest is read for what else is unreadable
-                    pixels = [p for p in batch if not isinstance(p, PlacewiseError)]
-                    begun = time.perf_counter()
+                if not refused:  # after the first error, only look for more unreadable photos
+                    pixels = [p for p in decoded if not isinstance(p, PlacewiseError)]
+                    started_at = time.perf_counter()
                     try:
-                        rows = self._rows(pixels)
+                        rows = self._describe(pixels)
                     except PhotoTooLargeForGpu as error:
-                        refused.append((here[error.place], error))
+                        refused.append((batch[error.place], error))
                         continue
-                    self.seconds += time.perf_counter() - begun
+                    self.seconds += time.perf_counter() - started_at
                     self.photos += len(rows)
                     yield rows
         finally:
@@ -91,28 +106,28 @@ class ModelDescriber:
         if refused:
             raise refused_photos_error(refused, len(photos))
 
-    def _read(self, photo: Path) -> Pixels | PlacewiseError:
+    def _decode(self, photo: Path) -> Pixels | PlacewiseError:
         try:
             return decode_photo(photo.read_bytes(), self.preprocessing, self._max_pixels).pixels
         except OSError as error:
-            return InvalidRequest("photo_unreadable", f"It can't be read: {error.strerror}.")
+            return InvalidRequest("photo_unreadable", f"Can't read the file: {error.strerror}.")
         except Unprocessable as error:
             return error
 
-    def _rows(self, pixels: list[Pixels]) -> Rows:
+    def _describe(self, pixels: list[Pixels]) -> Rows:
         rows: Rows | None = None
-        for places, found in run_in_batches(pixels, self._run, self._limit, self._device):
+        for indices, outputs in run_in_batches(pixels, self._forward, self._limit, self._device):
             if rows is None:
-                rows = np.empty((len(pixels), found.shape[1]), np.float32)
-            rows[places] = found.numpy()
-        assert rows is not None, "a batch has a photo"
+                rows = np.empty((len(pixels), outputs.shape[1]), np.float32)
+            rows[indices] = outputs.numpy()
+        assert rows is not None, "a batch has at least one photo"
         return rows
 
-    def _run(self, pixels: Pixels) -> torch.Tensor:
+    def _forward(self, pixels: Pixels) -> torch.Tensor:
         with torch.inference_mode():
             stacked = torch.from_numpy(np.ascontiguousarray(pixels)).to(self._device)
             photos = stacked.permute(0, 3, 1, 2).float()
-            rows: torch.Tensor = self._model((photos - self._mean) / self._deviation)
+            rows: torch.Tensor = self._model((photos - self._mean) / self._std)
             return rows.float().cpu()
 
 

@@ -1,8 +1,8 @@
-"""The network, its loss and its steps, as Lightning drives them.
+"""Lightning module of metric-learning training; its optimizer, learning rate and model factory.
 
-The optimiser, and the learning rate as a function of how far the run is.
-
-The network that a run begins with.
+The learning rate is a function of step and epoch alone. It is set before each step instead of by a
+torch scheduler, so that a resumed run needs no scheduler state and milestones inside the warm-up
+count.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from shared.errors import Conflict, Unprocessable
 def make_optimizer(
     parameters: Iterable[torch.nn.Parameter], arguments: TrainingArguments
 ) -> torch.optim.Optimizer:
-    """Adam, AdamW or SGD over the parameters that learn."""
-    learning = [parameter for parameter in parameters if parameter.requires_grad]
+    """Create Adam, AdamW or SGD over the trainable parameters."""
+    trainable = [parameter for parameter in parameters if parameter.requires_grad]
     lr, decay = arguments.lr, arguments.weight_decay
     if arguments.optimizer == "sgd":
-        return torch.optim.SGD(learning, lr, arguments.momentum, weight_decay=decay)
+        return torch.optim.SGD(trainable, lr, arguments.momentum, weight_decay=decay)
     if arguments.optimizer == "adamw":
-        return torch.optim.AdamW(learning, lr, weight_decay=decay)
-    return torch.optim.Adam(learning, lr, weight_decay=decay)
+        return torch.optim.AdamW(trainable, lr, weight_decay=decay)
+    return torch.optim.Adam(trainable, lr, weight_decay=decay)
 
 
 def learning_rate(
@@ -47,17 +47,32 @@ def learning_rate(
     milestones: Sequence[int],
     lr_mult: float,
 ) -> float:
-    """The rate of a step, both counted from 0: a linear rise over `warmup_steps`, and a factor
-    `lr_mult` from each milestone's epoch on."""
-    rise = min(1.0, (step + 1) / warmup_steps) if warmup_steps else 1.0
-    passed = sum(epoch >= milestone for milestone in milestones)
-    return lr * rise * float(lr_mult**passed)
+    """Return the learning rate of a step: linear warm-up times step decay.
+
+    Args:
+        step: global step, from 0.
+        epoch: epoch, from 0.
+        lr: base learning rate.
+        warmup_steps: steps over which the rate rises linearly; 0: no warm-up.
+        milestones: epochs from which on the rate is multiplied by `lr_mult`.
+        lr_mult: factor of each milestone.
+    """
+    warmup = min(1.0, (step + 1) / warmup_steps) if warmup_steps else 1.0
+    milestones_passed = sum(epoch >= milestone for milestone in milestones)
+    return lr * warmup * float(lr_mult**milestones_passed)
 
 
 class MetricLearningModule(lightning.LightningModule):
-    """One step: photos -> descriptors -> the miner's pairs or triplets -> the loss.
+    """Lightning module: photos -> descriptors -> mined pairs or triplets -> loss.
 
-    `about` are plain values that its checkpoints carry beside the model's configuration.
+    Args:
+        model: the descriptor network.
+        arguments: loss, miner, optimizer and learning rate.
+        metadata: plain values that checkpoints store with the model's configuration.
+
+    Attributes:
+        last_loss: loss of the last step.
+        last_accuracy: `b_acc` of the last step; None where it is not meaningful.
     """
 
     def __init__(
@@ -70,7 +85,7 @@ class MetricLearningModule(lightning.LightningModule):
         self.last_loss = float("nan")
         self.last_accuracy: float | None = None
         self._arguments = arguments
-        self._about = metadata
+        self._metadata = metadata
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return make_optimizer(self.model.parameters(), self._arguments)
@@ -92,11 +107,11 @@ class MetricLearningModule(lightning.LightningModule):
         if not len(batch.photos):
             raise Unprocessable(
                 "no_photo_decodes",
-                "No photo of a whole batch decodes: "
+                "None of a batch's photos can be decoded: "
                 + "; ".join(p for p, _ in batch.undecodable[:3]),
             )
         rows = self.model(batch.photos)
-        # Exponents of similarities overflow in half precision.
+        # Losses exponentiate similarities, which overflows in half precision.
         with torch.autocast(rows.device.type, enabled=False):
             rows = rows.float()
             mined = self.miner(rows, batch.labels) if self.miner is not None else None
@@ -105,8 +120,8 @@ class MetricLearningModule(lightning.LightningModule):
         if not torch.isfinite(loss):
             raise Unprocessable(
                 "loss_not_finite",
-                f"The loss of step {self.global_step} is {self.last_loss}: the training has "
-                "diverged. Try a smaller --lr, more --warmpup_steps or --precision 32.",
+                f"The loss of step {self.global_step} is {self.last_loss}: training has diverged. "
+                "Try a smaller --lr, more --warmpup_steps or --precision 32.",
             )
         self.last_accuracy = batch_accuracy(self.loss, self.miner, mined, len(rows))
         self.log("loss", loss.detach(), batch_size=len(rows))
@@ -120,48 +135,53 @@ class MetricLearningModule(lightning.LightningModule):
         return batch.to(device, non_blocking=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        model = self.model.config.model_dump()
-        checkpoint["hyper_parameters"] = {**self._about, "model": model}
+        config = self.model.config.model_dump()
+        checkpoint["hyper_parameters"] = {**self._metadata, "model": config}
         checkpoint["last_loss"] = self.last_loss
         checkpoint["epoch_done"] = self.trainer.is_last_batch
 
 
 def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
-    """The model that the arguments describe; raises what `ModelConfig.read` does."""
+    """Build the model configuration from the arguments; raises what `VprModelConfig.parse` does."""
     return VprModelConfig.parse(
         {name: getattr(arguments, name) for name in VprModelConfig.model_fields}
     )
 
 
 def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool) -> VprModel:
-    """With pretrained weights, with those of `model_path`, or random by the seed.
+    """Create the network with pretrained weights, those of `model_path`, or random weights.
 
-    One that resumes gets its weights later. Raises what `build_vpr_model` and `load_checkpoint`
-    do, and
-    Conflict (`run_differs`) for a checkpoint of another network.
+    Args:
+        arguments: the run's arguments; random weights depend on the global seed.
+        display: receives a warning if frozen layers have random weights.
+        resuming: the weights are loaded later, from the run's checkpoint.
+
+    Raises:
+        Conflict: `run_differs`, if the checkpoint's network differs from the arguments'. Also
+            raises what `build_vpr_model` and `load_checkpoint` raise.
     """
     config = build_model_config(arguments)
-    elsewhere = resuming or arguments.model_path is not None
-    if elsewhere:
+    has_checkpoint = resuming or arguments.model_path is not None
+    if has_checkpoint:
         model = build_vpr_model(config.model_copy(update={"pretrained": False}))
         model.config = model.config.model_copy(update={"pretrained": config.pretrained})
     else:
         model = build_vpr_model(config, weights=arguments.weights)
     if arguments.model_path is not None and not resuming:
-        begun = load_checkpoint(arguments.model_path).model
-        if begun.config.model_dump(exclude=_TRAINING_ONLY_FIELDS) != model.config.model_dump(
+        initial = load_checkpoint(arguments.model_path).model
+        if initial.config.model_dump(exclude=_TRAINING_ONLY_FIELDS) != model.config.model_dump(
             exclude=_TRAINING_ONLY_FIELDS
         ):
             raise Conflict(
                 "run_differs",
-                f"--model_path {arguments.model_path} is another network than the arguments "
-                f"describe: {begun.config.model_dump_json()}",
+                f"The network of --model_path {arguments.model_path} differs from the one that the "
+                f"arguments describe: {initial.config.model_dump_json()}",
             )
-        model.load_state_dict(begun.state_dict())
-    if not config.pretrained and not elsewhere and config.layers_to_freeze >= 0:
+        model.load_state_dict(initial.state_dict())
+    if not config.pretrained and not has_checkpoint and config.layers_to_freeze >= 0:
         display.warn(
             f"--layers_to_freeze {config.layers_to_freeze} freezes layers whose weights are random "
-            "(--pretrained False): they never learn. Say --layers_to_freeze -1 to train them."
+            "(--pretrained False): they never learn. Use --layers_to_freeze -1 to train them."
         )
     return model
 

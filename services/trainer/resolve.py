@@ -1,8 +1,7 @@
-"""What a run's arguments mean on this machine and with this data, before its first step.
+"""Resolves a run's arguments against the machine and the data before the first step.
 
-What computes: the accelerator, its number and its precision, checked before anything is read.
-
-Where a run's figures go while it learns.
+Checks the accelerator, the device index, the precision and the loggers' packages before any data is
+read; creates the loggers and the checkpoint settings.
 """
 
 from __future__ import annotations
@@ -44,19 +43,23 @@ PRECISION_ALIASES = {
 
 @dataclass(frozen=True, slots=True)
 class Device:
+    """The device of a run, as Lightning and torch name it."""
+
     accelerator: str
     """gpu, mps or cpu"""
     devices: Any
-    """as Lightning wants it: [0] or 1"""
-    precision: str
+    """Lightning's `devices` argument: [0] or 1"""
+    precision: Any
+    """Lightning's `precision` argument, such as `16-mixed`"""
     torch_device: torch.device
 
 
 def resolve_device(arguments: TrainingArguments) -> Device:
-    """The one device that the arguments mean.
+    """Resolve the arguments to a single device.
 
-    Raises Misconfigured (`no_gpu`), InvalidRequest (`several_devices`, `unknown_precision`,
-    `precision_unfit`).
+    Raises:
+        Misconfigured: `no_gpu`.
+        InvalidRequest: `several_devices`, `unknown_precision`, `precision_unfit`.
     """
     accelerator = _resolve_accelerator(arguments.accelerator)
     index = _device_index(arguments.devices)
@@ -75,8 +78,8 @@ def resolve_device(arguments: TrainingArguments) -> Device:
     if index >= torch.cuda.device_count():
         raise Misconfigured(
             "no_gpu",
-            f"--devices [{index}]: this machine has {torch.cuda.device_count()} GPUs, "
-            "numbered from 0.",
+            f"--devices [{index}] does not exist: this machine has {torch.cuda.device_count()} "
+            "GPUs, numbered from 0.",
         )
     return Device("gpu", [index], precision, torch.device("cuda", index))
 
@@ -90,13 +93,13 @@ def _resolve_accelerator(requested: str) -> str:
         if not torch.cuda.is_available():
             raise Misconfigured(
                 "no_gpu",
-                "PyTorch finds no CUDA GPU here (--accelerator gpu is the default). Train on the "
-                "processor with --accelerator cpu --faiss_gpu False, or install the driver and a "
-                "CUDA build of PyTorch.",
+                "PyTorch finds no CUDA GPU (--accelerator gpu is the default). Train on the CPU "
+                "with --accelerator cpu --faiss_gpu False, or install the driver and a CUDA build "
+                "of PyTorch.",
             )
         return "gpu"
     if requested == "mps" and not torch.backends.mps.is_available():
-        raise Misconfigured("no_gpu", "PyTorch finds no MPS device here: say --accelerator cpu.")
+        raise Misconfigured("no_gpu", "PyTorch finds no MPS device. Use --accelerator cpu.")
     return requested
 
 
@@ -107,8 +110,8 @@ def _device_index(devices: int | str | tuple[int, ...]) -> int:
         return devices[0]
     raise InvalidRequest(
         "several_devices",
-        f"--devices {devices}: a run has one device: 1, or its number as [0]. Runs of a grid can "
-        "share a machine's GPUs, each with its own number.",
+        f"--devices {devices}: a run uses a single device. Give 1, or the device's index as [0]. "
+        "To use several GPUs, start several runs, each with its own index.",
     )
 
 
@@ -116,36 +119,42 @@ LOGGER_PACKAGES = {"tensorboard": ("tensorboard",), "wandb": ("wandb",), "mlflow
 
 
 def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
-    """One logger for each name. None needs an account but `wandb`, which can be offline
-    (`WANDB_MODE=offline`).
+    """Create Lightning loggers by name.
 
-    Raises Misconfigured (`logger_missing`) for one whose package is not installed.
+    Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`).
+
+    Raises:
+        Misconfigured: `logger_missing`, if a logger's package is not installed.
     """
     check_loggers(names)
-    made: list[Logger] = []
+    loggers: list[Logger] = []
     for name in names:
         if name == "csv":
-            made.append(CSVLogger(folder, name="csv"))
+            loggers.append(CSVLogger(folder, name="csv"))
         elif name == "tensorboard":
-            made.append(TensorBoardLogger(folder, name="", version="tensorboard"))
+            loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
         elif name == "wandb":
-            made.append(WandbLogger(name=folder.name, save_dir=folder, project="placewise"))
+            loggers.append(WandbLogger(name=folder.name, save_dir=folder, project="placewise"))
         else:
-            made.append(MLFlowLogger(run_name=folder.name, save_dir=str(folder / "mlflow")))
-    for logger in made:
+            loggers.append(MLFlowLogger(run_name=folder.name, save_dir=str(folder / "mlflow")))
+    for logger in loggers:
         logger.log_hyperparams(arguments)
-    return made
+    return loggers
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
-    """As `make_loggers` raises, before anything else is done."""
+    """Check that the loggers' packages are installed.
+
+    Raises:
+        Misconfigured: `logger_missing`.
+    """
     for name in names:
         for package in LOGGER_PACKAGES.get(name, ()):
             if importlib.util.find_spec(package) is None:
                 raise Misconfigured(
                     "logger_missing",
-                    f"--logger {name} needs the package {package}: install it, or name others "
-                    "(csv, tensorboard, none).",
+                    f"--logger {name} requires the package {package}. Install it, or choose other "
+                    "loggers (csv, tensorboard, none).",
                 )
 
 
@@ -153,27 +162,33 @@ Json = dict[str, Any]
 
 
 def check_environment(arguments: TrainingArguments) -> Device:
-    """The device, when all that the arguments need of this machine is there.
+    """Check device, loggers and faiss, and return the device.
 
-    Raises Misconfigured (`no_gpu`, `faiss_gpu_missing`, `logger_missing`), InvalidRequest.
+    Raises:
+        Misconfigured: `no_gpu`, `faiss_gpu_missing`, `logger_missing`.
+        InvalidRequest: as `resolve_device`.
     """
     device = resolve_device(arguments)
     check_loggers(arguments.logger)
     if arguments.faiss_gpu:
-        one = np.ones((1, 1), np.float32)
-        exact_knn(one, one, 1, faiss_gpu=True)
+        row = np.ones((1, 1), np.float32)
+        exact_knn(row, row, 1, faiss_gpu=True)
     return device
 
 
 def resolve_arguments(
     arguments: TrainingArguments, places: TrainingSet, sets: EvaluationSets
 ) -> TrainingArguments:
-    """The arguments with what was left to the data set filled in."""
+    """Fill in the arguments that depend on the data: sets, cities, absolute paths, monitor.
+
+    Raises:
+        InvalidRequest: `bad_argument`, if places may have fewer than `img_per_place` photos.
+    """
     if arguments.img_per_place > arguments.min_img_per_place:
         raise InvalidRequest(
             "bad_argument",
-            f"--img_per_place {arguments.img_per_place} is more than --min_img_per_place "
-            f"{arguments.min_img_per_place}: places without enough photos would be in the set.",
+            f"--img_per_place {arguments.img_per_place} exceeds --min_img_per_place "
+            f"{arguments.min_img_per_place}: places without enough photos would be sampled.",
         )
     assert arguments.data_root is not None
     changes: Json = {
@@ -190,14 +205,18 @@ def resolve_arguments(
 def make_checkpoints(
     arguments: TrainingArguments, folder: Path, sets: EvaluationSets, display: Display
 ) -> TopKCheckpoints:
-    """The run's checkpoints, none kept yet; InvalidRequest (`unknown_metric`, `bad_argument`)."""
+    """Create the checkpoint settings of a run.
+
+    Raises:
+        InvalidRequest: `unknown_metric`, `bad_argument`.
+    """
     metrics = [f"{each.name}/R{k}" for each in sets.validation for k in DEFAULT_KS]
     if not metrics:
-        display.warn("There is no set to validate on: only last.ckpt is kept.")
+        display.warn("There is no validation set: only last.ckpt is saved.")
     elif arguments.monitor not in metrics:
         raise InvalidRequest(
             "unknown_metric",
-            f"--monitor {arguments.monitor} is not measured in this run; known: "
+            f"--monitor {arguments.monitor} is not a metric of this run; known: "
             f"{', '.join(metrics)}.",
         )
     name = CheckpointNameTemplate(
@@ -208,7 +227,7 @@ def make_checkpoints(
         insert_names=arguments.auto_insert_metric_name,
     )
     for dropped in name.dropped_fields if metrics else ():
-        display.warn(f"--filename: no run on these sets logs {dropped}; it drops out of the names.")
+        display.warn(f"--filename: {dropped} is not a metric of this run; it is removed.")
     return TopKCheckpoints(
         folder / CHECKPOINTS_FOLDER,
         name,
@@ -220,7 +239,7 @@ def make_checkpoints(
 
 
 def portable_arguments(arguments: TrainingArguments) -> Json:
-    """What a checkpoint says of its training; no paths of this machine."""
+    """Return the arguments that a checkpoint stores: all except local paths."""
     plain = to_plain_dict(arguments)
     for name in ("data_root", "eval_roots", "weights", "model_path", "default_root_dir"):
         plain.pop(name)

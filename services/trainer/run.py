@@ -1,7 +1,4 @@
-"""One run of `placewise train`, from its arguments to its summary.
-
-Lightning's part of a run: its trainer, as quiet and as repeatable as a run wants it.
-"""
+"""Runs and resumes one training run, from its arguments to `metrics.json`."""
 
 from __future__ import annotations
 
@@ -70,19 +67,32 @@ def fit(
     loggers: Sequence[Logger],
     resume_from: Path | None,
 ) -> None:
-    """Learn until the arguments' end, from the beginning or from a checkpoint with the full state.
+    """Train with Lightning, from the start or from a checkpoint with the full state.
 
-    Validation and checkpoints are the watch's, not Lightning's. Raises RunStopped and what steps
-    raise.
+    The callback validates and saves checkpoints; Lightning's own validation, checkpointing and
+    progress bar are disabled.
+
+    Args:
+        module: the network with loss and miner.
+        batches: the training data.
+        callback: validates, saves checkpoints and stops the run.
+        arguments: number of epochs and logging interval; the callback ends at `max_steps`.
+        device: accelerator, device index and precision.
+        folder: the run's folder.
+        loggers: Lightning loggers; may be empty.
+        resume_from: `last.ckpt` of an interrupted run, or None.
+
+    Raises:
+        RunStopped: a stop was requested; also raises what training steps raise.
     """
-    # Its tips and its advice on numbers of workers are not what a run's user asked for.
+    # Hide Lightning's tips, such as its advice on the number of workers.
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\.")
         trainer = lightning.Trainer(
             accelerator=device.accelerator,
             devices=device.devices,
-            precision=_precision(device),
+            precision=device.precision,
             max_epochs=arguments.max_epochs,
             log_every_n_steps=arguments.log_every_n_steps,
             logger=list(loggers) or False,
@@ -104,98 +114,124 @@ def fit(
         )
 
 
-def _precision(device: Device) -> Any:
-    return device.precision
-
-
 Json = dict[str, Any]
 
 
 @dataclass
 class _PreparedRun:
-    """A run before its first step."""
+    """Everything that a run needs before its first step."""
 
     arguments: TrainingArguments
     device: Device
-    places: TrainingSet
+    training_set: TrainingSet
     sets: EvaluationSets
     model: VprModel
     folder: Path
     history: TrainingHistory
-    kept: TopKCheckpoints
+    checkpoints: TopKCheckpoints
     resume_from: Path | None
 
 
 def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
-    """Begin a run and do its phase; what `metrics.json` holds.
+    """Start a run and execute its phase: train, test, or all.
 
-    Raises RunStopped, and every error that a run's arguments or data can have.
+    Args:
+        arguments: the run's arguments.
+        display: receives messages and progress.
+        stop: requests a graceful stop.
+
+    Returns:
+        The content of `metrics.json`; `{"fast_dev_run": True}` for a fast development run.
+
+    Raises:
+        RunStopped: a stop was requested; the message says how to resume. Also raises every error
+            of arguments and data.
     """
     device = check_environment(arguments)
     if arguments.experiment_phase == "test":
         return _run_test_phase(arguments, device, display, stop)
-    places, sets = select_training_set(arguments), select_evaluation_sets(arguments)
-    arguments = resolve_arguments(arguments, places, sets)
+    training_set, sets = select_training_set(arguments), select_evaluation_sets(arguments)
+    arguments = resolve_arguments(arguments, training_set, sets)
     if arguments.show_data_stats:
-        print_data_sets(places, sets, display)
+        print_data_sets(training_set, sets, display)
     seed_everything(arguments.seed)
     model = make_model(arguments, display, resuming=False)
     folder = Path() if arguments.fast_dev_run else create_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
-    kept = make_checkpoints(arguments, folder, sets, display)
-    history = TrainingHistory(summarise_training_set(places))
+    checkpoints = make_checkpoints(arguments, folder, sets, display)
+    history = TrainingHistory(summarise_training_set(training_set))
     if not arguments.fast_dev_run:
         save_yaml(arguments, folder / CONFIG_FILE)
-    ready = _PreparedRun(arguments, device, places, sets, model, folder, history, kept, None)
-    return _run_until_stopped(ready, display, stop)
+    prepared = _PreparedRun(
+        arguments, device, training_set, sets, model, folder, history, checkpoints, None
+    )
+    return _run_until_stopped(prepared, display, stop)
 
 
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
-    """Go on with a run that was interrupted, or that is to learn longer; as `run`.
+    """Resume an interrupted run, or continue a finished one for more epochs.
 
-    Raises also NotFound (`run_not_found`), Conflict (`run_differs`).
+    Args:
+        path: the run's folder, or one of its checkpoints with the full state.
+        changes: arguments that override the stored ones.
+        display: receives messages and progress.
+        stop: requests a graceful stop.
+
+    Returns:
+        The content of `metrics.json`.
+
+    Raises:
+        NotFound: `run_not_found`.
+        Conflict: `run_differs`, for changed photos or a change that `--resume` does not allow. Also
+            raises what `run` raises.
     """
     folder, checkpoint = find_run(path)
     arguments = load_resumed_arguments(folder, changes)
     device = check_environment(arguments)
-    places, history = select_training_set(arguments), TrainingHistory.load(folder)
-    if history.training_set["fingerprint"] != places.fingerprint:
+    training_set, history = select_training_set(arguments), TrainingHistory.load(folder)
+    if history.training_set["fingerprint"] != training_set.fingerprint:
         raise Conflict(
             "run_differs",
-            f"The photos below {arguments.data_root} are not those that the run in {folder} began "
-            "with. Bring them back, or begin a new run (--model_path takes this one's weights).",
+            f"The photos in {arguments.data_root} are not those that the run in {folder} was "
+            "started with. Restore them, or start a new run (--model_path takes this run's "
+            "weights).",
         )
     sets = select_evaluation_sets(arguments)
-    kept = make_checkpoints(arguments, folder, sets, display)
-    kept.best = [each for each in history.best if (kept.folder / each[1]).is_file()]
+    checkpoints = make_checkpoints(arguments, folder, sets, display)
+    checkpoints.best = [
+        (score, name) for score, name in history.best if (checkpoints.folder / name).is_file()
+    ]
     model = make_model(arguments, display, resuming=True)
     save_yaml(arguments, folder / CONFIG_FILE)
-    ready = _PreparedRun(arguments, device, places, sets, model, folder, history, kept, checkpoint)
-    return _run_until_stopped(ready, display, stop)
+    prepared = _PreparedRun(
+        arguments, device, training_set, sets, model, folder, history, checkpoints, checkpoint
+    )
+    return _run_until_stopped(prepared, display, stop)
 
 
-def _run_until_stopped(ready: _PreparedRun, display: Display, stop: StopRequest) -> Json:
+def _run_until_stopped(prepared: _PreparedRun, display: Display, stop: StopRequest) -> Json:
     try:
-        return _train(ready, display, stop)
+        return _train(prepared, display, stop)
     except RunStopped:
-        if not ready.kept.last_path.is_file():
+        last_path = prepared.checkpoints.last_path
+        if not last_path.is_file():
             raise RunStopped(
-                "Stopped before the first step: there is nothing to go on from."
+                "Stopped before the first step: there is no checkpoint to resume from."
             ) from None
         raise RunStopped(
-            f"Stopped. {ready.kept.last_path} holds everything; go on with\n"
-            f"  placewise train --resume {shlex.quote(str(ready.folder))}"
+            f"Stopped. {last_path} holds the full training state; resume with\n"
+            f"  placewise train --resume {shlex.quote(str(prepared.folder))}"
         ) from None
 
 
-def _train(ready: _PreparedRun, display: Display, stop: StopRequest) -> Json:
-    arguments, device = ready.arguments, ready.device
-    learner = MetricLearningModule(
-        ready.model, arguments, metadata={"training": portable_arguments(arguments)}
+def _train(prepared: _PreparedRun, display: Display, stop: StopRequest) -> Json:
+    arguments, device = prepared.arguments, prepared.device
+    module = MetricLearningModule(
+        prepared.model, arguments, metadata={"training": portable_arguments(arguments)}
     )
-    validation = Validator(arguments, device.torch_device, display.progress, stop)
-    plan = PlaceBatchSampler(
-        ready.places.places,
+    validator = Validator(arguments, device.torch_device, display.progress, stop)
+    sampler = PlaceBatchSampler(
+        prepared.training_set.places,
         arguments.batch_size,
         arguments.img_per_place,
         arguments.shuffle_all,
@@ -203,88 +239,86 @@ def _train(ready: _PreparedRun, display: Display, stop: StopRequest) -> Json:
         arguments.reload_dataloaders_every_n_epochs,
         arguments.seed,
     )
-    photos = PlaceDataset(
-        plan,
+    dataset = PlaceDataset(
+        sampler,
         arguments.image_size,
         augment=arguments.augmentation == "randaugment",
         fail_on_undecodable=arguments.on_bad_image == "error",
     )
     batches = ResumableDataLoader(
-        plan,
-        photos,
+        sampler,
+        dataset,
         num_workers=arguments.num_workers,
         pin_memory=device.torch_device.type == "cuda",
     )
-    watch = TrainingCallback(
+    folder, sets, checkpoints = prepared.folder, prepared.sets, prepared.checkpoints
+    callback = TrainingCallback(
         arguments,
-        ready.folder,
+        folder,
         batches,
-        ready.sets.validation,
-        validation,
-        ready.kept,
-        ready.history,
+        sets.validation,
+        validator,
+        checkpoints,
+        prepared.history,
         stop,
         display,
     )
     loggers = [] if arguments.fast_dev_run else make_loggers(
-        arguments.logger, ready.folder, to_plain_dict(arguments)
+        arguments.logger, folder, to_plain_dict(arguments)
     )  # fmt: skip
-    if ready.resume_from is None:
-        validation.sanity_check(
-            learner.model.to(device.torch_device),
-            ready.sets.validation,
-            arguments.num_sanity_val_steps,
+    if prepared.resume_from is None:
+        validator.sanity_check(
+            module.model.to(device.torch_device), sets.validation, arguments.num_sanity_val_steps
         )
         seed_everything(arguments.seed)
-        is_over = False
+        is_complete = False
     else:
-        is_over = _finish_interrupted_validation(ready, learner, validation, display)
-    if not is_over:
-        fit(learner, batches, watch, arguments, device, ready.folder, loggers, ready.resume_from)
+        is_complete = _finish_interrupted_validation(prepared, module, validator, display)
+    if not is_complete:
+        fit(module, batches, callback, arguments, device, folder, loggers, prepared.resume_from)
     if arguments.fast_dev_run:
-        validation.sanity_check(learner.model.to(device.torch_device), ready.sets.validation, 1)
-        display.info("One batch of everything went through; nothing was kept.")
+        validator.sanity_check(module.model.to(device.torch_device), sets.validation, 1)
+        display.info("One batch of training and validation succeeded; no files were written.")
         return {"fast_dev_run": True}
-    ready.history.save(ready.folder)
-    tested = {}
+    prepared.history.save(folder)
+    test_recalls = {}
     if arguments.experiment_phase == "all":
-        chosen = ready.kept.best_path or ready.kept.last_path
-        best = load_checkpoint(chosen).model.to(device.torch_device)
-        tested = validation.measure(best, ready.sets.test, for_tests=True)
-    report = build_summary(arguments, ready.folder, ready.history, ready.kept, ready.sets, tested)
-    (ready.folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
+        best_path = checkpoints.best_path or checkpoints.last_path
+        best = load_checkpoint(best_path).model.to(device.torch_device)
+        test_recalls = validator.measure(best, sets.test, for_tests=True)
+    report = build_summary(arguments, folder, prepared.history, checkpoints, sets, test_recalls)
+    (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report
 
 
 def _finish_interrupted_validation(
-    ready: _PreparedRun, learner: MetricLearningModule, validation: Validator, display: Display
+    prepared: _PreparedRun, module: MetricLearningModule, validator: Validator, display: Display
 ) -> bool:
-    """Take the figures of an epoch that was interrupted while it was measured; whether the run
-    has all its steps."""
-    assert ready.resume_from is not None
-    arguments, history = ready.arguments, ready.history
-    stored = torch.load(ready.resume_from, map_location="cpu", weights_only=True)
+    """Repeat a validation that was interrupted; return whether the run has all its steps."""
+    assert prepared.resume_from is not None
+    arguments, history = prepared.arguments, prepared.history
+    stored = torch.load(prepared.resume_from, map_location="cpu", weights_only=True)
     epoch, step, epoch_done = stored["epoch"], stored["global_step"], stored["epoch_done"]
-    is_over: bool = (arguments.max_steps is not None and step >= arguments.max_steps) or (
+    is_complete: bool = (arguments.max_steps is not None and step >= arguments.max_steps) or (
         epoch_done and epoch + 1 >= arguments.max_epochs
     )
     history.epochs = [each for each in history.epochs if each.step <= step]
-    is_due = is_over or (epoch_done and is_validation_epoch(epoch, arguments))
+    is_due = is_complete or (epoch_done and is_validation_epoch(epoch, arguments))
     if not is_due or any(each.step == step for each in history.epochs):
-        return is_over
-    learner.load_state_dict(stored["state_dict"])
-    learner.model.to(ready.device.torch_device)
-    found = flatten_recalls(validation.measure(learner.model, ready.sets.validation))
-    source = ready.resume_from
+        return is_complete
+    module.load_state_dict(stored["state_dict"])
+    module.model.to(prepared.device.torch_device)
+    metrics = flatten_recalls(validator.measure(module.model, prepared.sets.validation))
+    source = prepared.resume_from
     record_epoch(
-        EpochRecord(epoch, step, stored["last_loss"], found),
+        EpochRecord(epoch, step, stored["last_loss"], metrics),
         history,
-        ready.kept,
+        prepared.checkpoints,
         lambda path, weights_only: copy_checkpoint(source, path, weights_only),
         display,
     )
-    history.save(ready.folder)
-    return is_over
+    history.save(prepared.folder)
+    return is_complete
 
 
 def _run_test_phase(
@@ -293,7 +327,7 @@ def _run_test_phase(
     if arguments.model_path is None:
         raise InvalidRequest(
             "model_path_missing",
-            "--experiment_phase test needs --model_path: the checkpoint that is tested.",
+            "--experiment_phase test requires --model_path, the checkpoint to test.",
         )
     checkpoint = load_checkpoint(arguments.model_path)
     if "image_size" not in arguments.model_fields_set:
@@ -301,11 +335,11 @@ def _run_test_phase(
     sets = select_evaluation_sets(arguments)
     if arguments.show_data_stats:
         print_data_sets(None, sets, display)
-    validation = Validator(arguments, device.torch_device, display.progress, stop)
+    validator = Validator(arguments, device.torch_device, display.progress, stop)
     model = checkpoint.model.to(device.torch_device)
-    tested = validation.measure(model, sets.test, for_tests=True)
+    test_recalls = validator.measure(model, sets.test, for_tests=True)
     folder = create_run_folder(arguments)
     save_yaml(arguments, folder / CONFIG_FILE)
-    report = build_summary(arguments, folder, None, None, sets, tested)
+    report = build_summary(arguments, folder, None, None, sets, test_recalls)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report

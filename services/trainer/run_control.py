@@ -1,6 +1,7 @@
-"""What a run tells whoever watches it; the command line shows it with bars.
+"""Run control: the display interface of a training run, and graceful stop on SIGINT and SIGTERM.
 
-Ctrl-C and SIGTERM: the run is kept after the step at work, then it ends.
+The first signal saves the run after the current step and stops it; the second one interrupts it
+at once.
 """
 
 from __future__ import annotations
@@ -13,29 +14,31 @@ from typing import Protocol
 
 
 class Display(Protocol):
+    """Interface through which a run reports messages and progress to the user."""
+
     def info(self, text: str) -> None:
-        """A line for the record."""
+        """Show a message."""
 
     def warn(self, text: str) -> None:
-        """A line that asks for attention."""
+        """Show a warning."""
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
-        """How far `what` is; it begins when first heard of and ends at `most`."""
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        """Report the progress of a task; its first call starts it, `done >= total` ends it."""
 
 
 class NullDisplay:
-    """Shows nothing; what was said stays, for whoever asks."""
+    """Display without output; it collects messages and warnings in `messages`."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.messages: list[str] = []
 
     def info(self, text: str) -> None:
-        self.said.append(text)
+        self.messages.append(text)
 
     def warn(self, text: str) -> None:
-        self.said.append(text)
+        self.messages.append(text)
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         return
 
 
@@ -43,19 +46,19 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class RunStopped(Exception):
-    """Somebody asked for the end, and the run is on disk as it was after the last step."""
+    """Raised after a requested stop; the run is saved as it was after its last step."""
 
 
 class StopRequest:
-    """Whether the end was asked for. The second time it is not waited for."""
+    """Flag that a signal sets to request a graceful stop; a second signal interrupts at once."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.is_requested = False
         self._is_listening = False
 
     @contextmanager
     def handle_signals(self) -> Iterator[StopRequest]:
-        """Take the signals for as long as the block lasts; only in the main thread."""
+        """Handle SIGINT and SIGTERM inside the block. Only for the main thread."""
         before = {number: signal.getsignal(number) for number in SIGNALS}
         self._is_listening = True
         self.install_handlers()
@@ -67,18 +70,21 @@ class StopRequest:
                 signal.signal(number, handler)
 
     def install_handlers(self) -> None:
-        """Take them back from Lightning, which puts a handler of its own before that of SIGTERM and
-        would end the run with nothing kept."""
+        """Install the handlers again, inside `handle_signals`; elsewhere do nothing.
+
+        Lightning replaces the handler of SIGTERM when training starts, and would end the run
+        without saving it.
+        """
         if self._is_listening:
             for number in SIGNALS:
-                signal.signal(number, self._take)
+                signal.signal(number, self._handle_signal)
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+    def _handle_signal(self, number: int, frame: FrameType | None) -> None:
+        if self.is_requested:
             raise KeyboardInterrupt
-        self.asked = True
+        self.is_requested = True
 
     def check(self) -> None:
-        """RunStopped when the end was asked for. Called where what is on disk is complete."""
-        if self.asked:
+        """Raise RunStopped if a stop was requested. Call it only when the saved run is complete."""
+        if self.is_requested:
             raise RunStopped

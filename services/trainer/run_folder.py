@@ -1,12 +1,10 @@
-"""The folder of one run: where it lies, what is in it.
+"""Layout of a run's folder, and the training history that is stored in it.
 
-config.yaml       every argument, as it was meant
-history.json      what was measured so far
-metrics.json      the summary at the end
-checkpoints/      the best ones, and last.ckpt
-csv/  tensorboard/
-
-What a run has come to so far, beside its checkpoints: `history.json`.
+config.yaml           every argument, resolved
+history.json          metrics of the epochs so far; `--resume` needs it
+metrics.json          summary, written at the end
+checkpoints/          the best checkpoints, and last.ckpt
+csv/  tensorboard/    output of the loggers
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ CHECKPOINTS_FOLDER = "checkpoints"
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
 
-# A run that went on with another of these would be another run.
+# Arguments that --resume must not change: they determine the training itself.
 IMMUTABLE_ARGUMENTS = (
     "batch_size", "img_per_place", "min_img_per_place", "shuffle_all",
     "random_sample_from_each_place", "image_size", "reload_dataloaders_every_n_epochs", "cities",
@@ -36,9 +34,11 @@ IMMUTABLE_ARGUMENTS = (
 
 
 def create_run_folder(arguments: TrainingArguments) -> Path:
-    """An empty folder for a run that begins.
+    """Create the folder of a new run: `run_name`, or a unique name with a timestamp.
 
-    Raises Conflict (`run_exists`) for a name that is taken, Misconfigured (`out_unwritable`).
+    Raises:
+        Conflict: `run_exists`, if the folder of `run_name` is not empty.
+        Misconfigured: `out_unwritable`.
     """
     root = Path(format_folder(arguments.default_root_dir, to_plain_dict(arguments)))
     if arguments.run_name is not None:
@@ -46,14 +46,14 @@ def create_run_folder(arguments: TrainingArguments) -> Path:
         if folder.is_dir() and any(folder.iterdir()):
             raise Conflict(
                 "run_exists",
-                f"{folder} holds a run already. Go on with it by --resume {folder}, or give "
+                f"{folder} already holds a run. Resume it with --resume {folder}, or choose "
                 "another --run_name.",
             )
         return _make_folder(folder, exist_ok=True)
-    # Local time: the name is for whoever looks into the folder.
-    began = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    # Local time, because the name is read by people.
+    timestamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     stem = safe_filename(
-        f"{began}-{arguments.backbone_arch}-{arguments.agg_arch}-{arguments.loss_name}"
+        f"{timestamp}-{arguments.backbone_arch}-{arguments.agg_arch}-{arguments.loss_name}"
     )
     number = 1
     while True:
@@ -65,29 +65,38 @@ def create_run_folder(arguments: TrainingArguments) -> Path:
 
 
 def find_run(resume: Path) -> tuple[Path, Path]:
-    """A run's folder, or one of its checkpoints with the full state -> folder and checkpoint.
+    """Find a run's folder and the checkpoint to resume from.
 
-    Raises NotFound (`run_not_found`).
+    Args:
+        resume: the run's folder, or one of its checkpoints with the full state.
+
+    Returns:
+        The folder and the checkpoint.
+
+    Raises:
+        NotFound: `run_not_found`.
     """
     if resume.is_dir():
         folder, checkpoint = resume, resume / CHECKPOINTS_FOLDER / "last.ckpt"
     else:
         folder, checkpoint = resume.parent.parent, resume
-    for needed in (folder / CONFIG_FILE, checkpoint):
-        if not needed.is_file():
+    for required in (folder / CONFIG_FILE, checkpoint):
+        if not required.is_file():
             raise NotFound(
                 "run_not_found",
-                f"--resume {resume}: there is no {needed}. Name the folder of a run, in which "
-                f"{CONFIG_FILE} and {CHECKPOINTS_FOLDER}/last.ckpt lie; a run that ended "
-                "before its first "
-                "step has none.",
+                f"--resume {resume}: there is no {required}. Give a run's folder, which contains "
+                f"{CONFIG_FILE} and {CHECKPOINTS_FOLDER}/last.ckpt. A run that ended before its "
+                "first step has no checkpoint.",
             )
     return folder, checkpoint
 
 
 def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
-    """What the run was told, with changes. Conflict (`run_differs`) for a change that would make
-    it another run."""
+    """Load a run's arguments and apply changes.
+
+    Raises:
+        Conflict: `run_differs`, for a change of one of `IMMUTABLE_ARGUMENTS`.
+    """
     stored = load_yaml(folder / CONFIG_FILE)
     before, after = build_arguments(stored), build_arguments(stored, changes)
     differing = [
@@ -96,8 +105,8 @@ def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArg
     if differing:
         raise Conflict(
             "run_differs",
-            f"--resume goes on with the run as it was: {', '.join(differing)} can't change. Begin "
-            "a new run (--model_path takes the weights of this one).",
+            f"--resume cannot change {', '.join(differing)}. Start a new run instead "
+            "(--model_path takes the weights of this one).",
         )
     return after
 
@@ -109,10 +118,10 @@ def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
         raise
     except OSError as error:
         raise Misconfigured(
-            "out_unwritable", f"Can't make the run's folder {folder}: {error.strerror}."
+            "out_unwritable", f"Can't create the run's folder {folder}: {error.strerror}."
         ) from error
     if not os.access(folder, os.W_OK):
-        raise Misconfigured("out_unwritable", f"The run's folder {folder} can't be written.")
+        raise Misconfigured("out_unwritable", f"The run's folder {folder} is not writable.")
     return folder.resolve()
 
 
@@ -121,35 +130,39 @@ HISTORY_FILE = "history.json"
 
 @dataclass
 class EpochRecord:
+    """Metrics of one validated epoch."""
+
     number: int
-    """from 0"""
+    """epoch, from 0"""
     step: int
-    """after it"""
+    """global step at the end of the epoch"""
     loss: float
-    """of the last step"""
+    """loss of the last step"""
     figures: dict[str, float]
-    """SET/R1 ...: shares from 0 to 1"""
+    """metric (SET/R1 ...) -> value from 0 to 1"""
 
 
 @dataclass
 class TrainingHistory:
-    """Grows with the run; saved when a checkpoint is."""
+    """Metrics and counters of a run, saved as `history.json` with each checkpoint."""
 
     training_set: dict[str, Any]
+    """as `summarise_training_set` returns it"""
     epochs: list[EpochRecord] = field(default_factory=list)
-    """those that were measured"""
+    """the validated epochs"""
     best: list[tuple[float, str]] = field(default_factory=list)
-    """score and file name of the best checkpoints, the best first"""
+    """score and file name of the best checkpoints, best first"""
     bad_photos: dict[str, str] = field(default_factory=dict)
-    """path -> why it does not decode"""
+    """path -> why the photo cannot be decoded"""
     images: int = 0
-    """that were learned from"""
+    """number of photos trained on"""
     seconds: float = 0.0
-    """spent on steps, validation left out"""
+    """training time without validation"""
     seconds_waited: float = 0.0
-    """of them, for photos to be read"""
+    """part of `seconds` spent waiting for the data loader"""
 
     def save(self, folder: Path) -> None:
+        """Write `history.json` atomically."""
         path = folder / HISTORY_FILE
         partial = path.with_name(f"{HISTORY_FILE}.partial")
         partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
@@ -157,7 +170,11 @@ class TrainingHistory:
 
     @classmethod
     def load(cls, folder: Path) -> TrainingHistory:
-        """Unprocessable (`run_unreadable`) where the folder's file can't be read."""
+        """Load `history.json` of a run's folder.
+
+        Raises:
+            Unprocessable: `run_unreadable`.
+        """
         try:
             stored = json.loads((folder / HISTORY_FILE).read_text())
             stored["epochs"] = [EpochRecord(**epoch) for epoch in stored["epochs"]]
@@ -166,5 +183,5 @@ class TrainingHistory:
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise Unprocessable(
                 "run_unreadable",
-                f"{folder / HISTORY_FILE} can't be read: {error}. Begin a new run.",
+                f"Can't read {folder / HISTORY_FILE}: {error}. Start a new run.",
             ) from error

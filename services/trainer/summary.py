@@ -1,4 +1,4 @@
-"""What a run was and came to: the lines before it and `metrics.json` after it."""
+"""Summary of a run: data set statistics before training, `metrics.json` after it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,16 @@ from shared.evaluation.ranking import Recalls
 Json = dict[str, Any]
 
 
-def print_data_sets(places: TrainingSet | None, sets: EvaluationSets, display: Display) -> None:
-    """What there is to learn from and to be measured on."""
-    if places is not None:
+def print_data_sets(
+    training_set: TrainingSet | None, sets: EvaluationSets, display: Display
+) -> None:
+    """Show the size of the training set and of each evaluation set."""
+    if training_set is not None:
         display.info(
-            f"To learn from: {len(places.places)} places, {places.photo_count} photos, "
-            f"{len(places.cities)} cities ({places.layout} in {places.root})"
+            f"Training set: {len(training_set.places)} places, {training_set.photo_count} photos, "
+            f"{len(training_set.cities)} cities ({training_set.layout} in {training_set.root})"
         )
-    for each in {one.name: one for one in (*sets.validation, *sets.test)}.values():
+    for each in {each.name: each for each in (*sets.validation, *sets.test)}.values():
         display.info(
             f"{each.name}: {len(each.database)} database photos, {len(each.queries)} queries, "
             f"{len(each.without_positives)} of them without a positive ({each.rule}, "
@@ -43,11 +45,14 @@ def build_summary(
     arguments: TrainingArguments,
     folder: Path,
     history: TrainingHistory | None,
-    kept: TopKCheckpoints | None,
+    checkpoints: TopKCheckpoints | None,
     sets: EvaluationSets,
-    tested: dict[str, Recalls],
+    test_recalls: dict[str, Recalls],
 ) -> Json:
-    """The content of `metrics.json`; shares are from 0 to 1."""
+    """Build the content of `metrics.json`; recalls are from 0 to 1.
+
+    `history` and `checkpoints` are None in the phase test.
+    """
     report: Json = {
         "run": str(folder),
         "config": str(folder / CONFIG_FILE),
@@ -55,7 +60,7 @@ def build_summary(
         "sets": {
             each.name: summarise_evaluation_set(each) for each in (*sets.validation, *sets.test)
         },
-        "test": {name: one.as_json() for name, one in tested.items()},
+        "test": {name: recalls.as_json() for name, recalls in test_recalls.items()},
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__,
@@ -63,8 +68,8 @@ def build_summary(
             "pytorch_metric_learning": pytorch_metric_learning.__version__,
         },
     }
-    if history is not None and kept is not None:
-        report |= _training_summary(arguments, history, kept)
+    if history is not None and checkpoints is not None:
+        report |= _training_summary(arguments, history, checkpoints)
     else:
         report["best"] = _checkpoint_details(Path(str(arguments.model_path)), None)
     report["next"] = _next_commands(arguments, report)
@@ -72,19 +77,22 @@ def build_summary(
 
 
 def _training_summary(
-    arguments: TrainingArguments, history: TrainingHistory, kept: TopKCheckpoints
+    arguments: TrainingArguments, history: TrainingHistory, checkpoints: TopKCheckpoints
 ) -> Json:
     best = (
-        _checkpoint_details(kept.best_path, kept.best[0][0]) if kept.best_path is not None
-        else _checkpoint_details(kept.last_path, None)
-    )  # fmt: skip
+        _checkpoint_details(checkpoints.best_path, checkpoints.best[0][0])
+        if checkpoints.best_path is not None
+        else _checkpoint_details(checkpoints.last_path, None)
+    )
     return {
         "training_set": history.training_set,
         "epochs": [asdict(epoch) for epoch in history.epochs],
         "monitor": arguments.monitor,
         "best": best,
-        "checkpoints": [_checkpoint_entry(kept.folder / name, score) for score, name in kept.best],
-        "last": str(kept.last_path),
+        "checkpoints": [
+            _checkpoint_entry(checkpoints.folder / name, score) for score, name in checkpoints.best
+        ],
+        "last": str(checkpoints.last_path),
         "bad_photos": history.bad_photos,
         "images": history.images,
         "images_per_second": history.images / history.seconds if history.seconds else None,
@@ -109,7 +117,7 @@ def _checkpoint_details(path: Path, score: float | None) -> Json:
 
 
 def _next_commands(arguments: TrainingArguments, report: Json) -> list[str]:
-    """Commands that one would type now."""
+    """Return commands that evaluate the best checkpoint and register it as a model."""
     best = shlex.quote(report["best"]["path"])
     root = shlex.quote(str((arguments.eval_roots or (arguments.data_root,))[0]))
     return [

@@ -1,13 +1,14 @@
-"""From ranked photos to a place: where it is, whether it is in the map at all, how sure that is.
+"""Evaluation of place recognition: location estimates, calibration, retrieval metrics, reports.
 
-`places` says when two photos show one place, `evidence` what a ranking tells, `calibration` what
-a generation's evaluations have learnt of such evidence, `figures` how good the confidence is.
+Estimates of a query's place: `place_evidence` decides when two photos show the same place and how
+strongly a ranking supports a place; `calibration` turns this evidence into an accept threshold and
+a confidence, and measures how good the confidence is.
 
-Evaluation: photos of a data set to rows, rows to rankings, rankings to figures and reports.
+Evaluation on data sets:
 
-    describe -> rows -> nearest -> recalls        what training validates with
-                                -> figures -> report, differences between runs
+    describe -> descriptors -> exact_knn -> ranking (recall@k; training validates with it)
+                                         -> retrieval_metrics -> results, report
 
-Photos come through a `Describe`: a checkpoint's network here, any extractor where the command line
-wires it, so that the same figures are taken of everything.
+Descriptors come from a `DescribeFunction`: a checkpoint's network in the trainer, any extractor in
+the command line. All are therefore measured by the same code.
 """

@@ -1,11 +1,11 @@
-"""Confidence intervals by a bootstrap over clusters of queries.
+"""Confidence intervals by the cluster bootstrap, and paired comparison of two runs.
 
-Queries of one street or one drive succeed and fail together: as if they were independent, an
-interval would come out too narrow. So whole clusters are drawn, with replacement, as many as there
-are, and the mean is taken over the queries in them (cluster bootstrap, Davison and Hinkley 1997,
-3.8; percentile intervals). Two runs are compared on the same draws, query by query.
+Queries of one street or one drive are correlated; treating them as independent would make intervals
+too narrow. The bootstrap therefore resamples whole clusters with replacement, as many as there are,
+and averages over their queries (cluster bootstrap, Davison and Hinkley 1997, 3.8; percentile
+intervals). Two runs are compared by the differences of their queries, on the same resamples.
 
-Which queries stand and fall together: those of one sequence, of one place, or of one block.
+A cluster is the queries of one sequence, of one place, or of one square of 50 m.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from shared.geodesy import EARTH_RADIUS_M
 
 RESAMPLES = 2000
 CONFIDENCE_LEVEL = 0.95
-MIN_CLUSTERS = 5  # of fewer, the draws say nothing about clusters that were never seen
-MAX_DRAWN_COUNTS = 4_000_000  # counts
+MIN_CLUSTERS = 5  # resampling fewer clusters says too little about unseen ones
+MAX_COUNTS_PER_BLOCK = 4_000_000  # bounds the memory of the resampled counts
 
 Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class ConfidenceInterval:
+    """Percentile interval at `CONFIDENCE_LEVEL`."""
+
     low: float
     high: float
 
@@ -39,18 +41,20 @@ class ConfidenceInterval:
 
 @dataclass(frozen=True, slots=True)
 class PairedDifference:
-    """Of the means of two runs on the same queries: the first less the second."""
+    """Difference of a metric's mean between two runs on the same queries: first minus second."""
 
     mean: float
     low: float | None
+    """bounds of the interval; None with too few clusters"""
     high: float | None
     won: int
-    """queries on which the first run is better"""
+    """number of queries on which the first run is better"""
     lost: int
+    """number of queries on which the second run is better"""
 
     @property
     def is_significant(self) -> bool:
-        """Whether 0 lies outside of the interval."""
+        """Whether the interval excludes 0."""
         return self.low is not None and self.high is not None and not self.low <= 0 <= self.high
 
     def as_json(self) -> dict[str, float | int | bool | None]:
@@ -60,9 +64,16 @@ class PairedDifference:
 def bootstrap_intervals(
     values: Values, clusters: NDArray[np.int64], *, resamples: int = RESAMPLES, seed: int = 0
 ) -> list[ConfidenceInterval] | None:
-    """(queries, figures), (queries,) numbers of clusters -> LEVEL interval of each figure's mean.
+    """Compute the bootstrap interval of each metric's mean.
 
-    None with fewer than LEAST_CLUSTERS clusters.
+    Args:
+        values: (queries, metrics) float64.
+        clusters: (queries,) int64, the cluster label of each query.
+        resamples: number of bootstrap resamples.
+        seed: random seed.
+
+    Returns:
+        One interval per metric at `CONFIDENCE_LEVEL`; None with fewer than `MIN_CLUSTERS` clusters.
     """
     _, cluster = np.unique(clusters, return_inverse=True)
     count = int(cluster.max()) + 1 if len(cluster) else 0
@@ -71,14 +82,14 @@ def bootstrap_intervals(
     sums = np.zeros((count, values.shape[1]))
     np.add.at(sums, cluster, values)
     sizes = np.bincount(cluster, minlength=count).astype(np.float64)
-    random = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     means = []
-    at_once = max(1, MAX_DRAWN_COUNTS // count)
-    for begin in range(0, resamples, at_once):
-        drawn = random.multinomial(
-            count, np.full(count, 1 / count), size=min(at_once, resamples - begin)
+    block = max(1, MAX_COUNTS_PER_BLOCK // count)
+    for start in range(0, resamples, block):
+        counts = rng.multinomial(
+            count, np.full(count, 1 / count), size=min(block, resamples - start)
         ).astype(np.float64)
-        means.append((drawn @ sums) / (drawn @ sizes)[:, None])
+        means.append((counts @ sums) / (counts @ sizes)[:, None])
     tail = (1 - CONFIDENCE_LEVEL) / 2
     low, high = np.quantile(np.concatenate(means), [tail, 1 - tail], axis=0)
     return [ConfidenceInterval(float(a), float(b)) for a, b in zip(low, high, strict=True)]
@@ -87,45 +98,60 @@ def bootstrap_intervals(
 def paired_differences(
     first: Values, second: Values, clusters: NDArray[np.int64], *, seed: int = 0
 ) -> list[PairedDifference]:
-    """(queries, figures) of two runs -> the difference of each figure's mean, with its interval."""
+    """Compute the paired difference of each metric between two runs on the same queries.
+
+    Args:
+        first: (queries, metrics) float64.
+        second: the same shape, in the same order.
+        clusters: (queries,) int64, the cluster label of each query.
+        seed: random seed of the bootstrap.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
     if first.shape != second.shape:
         raise ValueError(f"runs of different shape: {first.shape} and {second.shape}")
     difference = first - second
-    found = bootstrap_intervals(difference, clusters, seed=seed)
+    intervals = bootstrap_intervals(difference, clusters, seed=seed)
     return [
         PairedDifference(
             mean=float(column.mean()),
-            low=found[place].low if found else None,
-            high=found[place].high if found else None,
+            low=intervals[index].low if intervals else None,
+            high=intervals[index].high if intervals else None,
             won=int((column > 0).sum()),
             lost=int((column < 0).sum()),
         )
-        for place, column in enumerate(difference.T)
+        for index, column in enumerate(difference.T)
     ]
 
 
-GRID_CELL_M = 50.0  # two radii of the usual rule: neighbours share most of their positives
+GRID_CELL_M = 50.0  # twice the usual positive radius: queries in a cell share most positives
 
 
 @dataclass(frozen=True, slots=True)
 class QueryClusters:
-    of: NDArray[np.int64]
-    """(queries,) number of each query's cluster"""
+    """Assignment of queries to bootstrap clusters."""
+
+    labels: NDArray[np.int64]
+    """(queries,) cluster label of each query"""
     kind: str
     """`sequences`, `places`, `squares of 50 m` or `queries`"""
 
     @property
     def count(self) -> int:
-        return len(np.unique(self.of))
+        return len(np.unique(self.labels))
 
 
 def cluster_queries(queries: Sequence[DatasetPhoto]) -> QueryClusters:
-    """By sequence where each query has one and they are enough for an interval; else by place;
-    else by where it was taken; else each query is alone."""
+    """Cluster queries by sequence, by place or by position.
+
+    Uses the first of these that is known for every query and gives `MIN_CLUSTERS` clusters or
+    more. If there is none, each query is a cluster.
+    """
     for kind, keys in (
-        ("sequences", [shot.sequence for shot in queries]),
-        ("places", [shot.place for shot in queries]),
-        (f"squares of {GRID_CELL_M:g} m", [_grid_cell_of(shot) for shot in queries]),
+        ("sequences", [photo.sequence for photo in queries]),
+        ("places", [photo.place for photo in queries]),
+        (f"squares of {GRID_CELL_M:g} m", [_grid_cell(photo) for photo in queries]),
     ):
         if None not in keys and len(set(keys)) >= MIN_CLUSTERS:
             return QueryClusters(_number_labels(keys), kind)
@@ -133,19 +159,20 @@ def cluster_queries(queries: Sequence[DatasetPhoto]) -> QueryClusters:
 
 
 def singleton_clusters(queries: int) -> QueryClusters:
-    """Each query a cluster of its own: of queries of which nothing is known."""
+    """Make each query a cluster of its own, for queries without metadata."""
     return QueryClusters(np.arange(queries), "queries")
 
 
-def _grid_cell_of(shot: DatasetPhoto) -> tuple[str | None, int, int] | None:
-    if shot.easting is not None and shot.northing is not None:
-        return shot.zone, int(shot.easting // GRID_CELL_M), int(shot.northing // GRID_CELL_M)
-    if shot.latitude is None or shot.longitude is None:
+def _grid_cell(photo: DatasetPhoto) -> tuple[str | None, int, int] | None:
+    if photo.easting is not None and photo.northing is not None:
+        return photo.zone, int(photo.easting // GRID_CELL_M), int(photo.northing // GRID_CELL_M)
+    if photo.latitude is None or photo.longitude is None:
         return None
-    metres_a_degree = math.radians(EARTH_RADIUS_M)
-    row = int(shot.latitude * metres_a_degree // GRID_CELL_M)
-    shrunk = math.cos(math.radians(row * GRID_CELL_M / metres_a_degree))  # the same along a row
-    return "degrees", row, int(shot.longitude * metres_a_degree * shrunk // GRID_CELL_M)
+    metres_per_degree = math.radians(EARTH_RADIUS_M)
+    row = int(photo.latitude * metres_per_degree // GRID_CELL_M)
+    # One factor for the whole row, so that its cells line up.
+    scale = math.cos(math.radians(row * GRID_CELL_M / metres_per_degree))
+    return "degrees", row, int(photo.longitude * metres_per_degree * scale // GRID_CELL_M)
 
 
 def _number_labels(keys: Sequence[Hashable]) -> NDArray[np.int64]:

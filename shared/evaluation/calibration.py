@@ -1,15 +1,16 @@
-"""What a generation's scores mean: a threshold learnt from impostors, a confidence from labels.
+"""Calibration of a generation's scores: open-set threshold, confidence, and their metrics.
 
-*Impostors* are the map's own photos asked without their place: whatever comes first then is wrong.
-Their evidence is what a photo from outside the map would show, so a threshold that 95 % of them
-stay under accepts about one outsider in twenty. It needs no labels.
+The *threshold* decides whether a query shows a place of the map. It is fitted on *impostors*: the
+map's own photos, searched with all photos of their place excluded, so that every match is wrong.
+Their evidence is that of photos from outside the map, so a threshold that 95 % of them do not
+exceed accepts about one outside photo in twenty. It needs no labelled queries.
 
-A *confidence*, P(the estimate is right), needs queries whose place is known and that were taken on
-another day than the photos they match: within one session the right photo always scores high, and
-a confidence learnt there would be overconfident ever after. It is a logistic regression on the
-evidence (Platt 1999), fitted by Newton's method with a small ridge.
+The *confidence*, P(the estimate is correct), needs queries whose place is known and that were taken
+on another day than the photos they match. Within one session the correct photo always scores high,
+and a confidence fitted on such queries would be overconfident. It is a logistic regression on the
+evidence (Platt 1999), fitted by Newton's method with a small L2 penalty.
 
-How good a confidence is: calibration error, AUROC, recall at a precision.
+Metrics of a confidence: expected calibration error (ECE), AUROC, recall at a given precision.
 """
 
 from __future__ import annotations
@@ -23,16 +24,19 @@ from pydantic import BaseModel, ConfigDict
 from shared.evaluation.place_evidence import PlaceEvidence
 
 FALSE_ACCEPT_RATE = 0.05  # of impostors
-MIN_IMPOSTORS = 20  # fewer, and one in twenty can't be told
+MIN_IMPOSTORS = 20  # with fewer, a rate of one in twenty cannot be estimated
 MIN_LABELLED_QUERIES = 40
-MIN_QUERIES_PER_CLASS = 8  # right ones and wrong ones: with fewer the slope is a guess
-L2_PENALTY = 0.1  # in units of standardised evidence: keeps separable data finite
+MIN_QUERIES_PER_CLASS = 8  # correct and wrong queries each; with fewer the slope is unreliable
+L2_PENALTY = 0.1  # on standardised evidence; keeps weights finite on separable data
 NEWTON_STEPS = 50
 FOLDS = 5
 
 
 class LogisticRegression(BaseModel):
-    """P = 1 / (1 + exp(-(intercept + sum of weight * (evidence - mean) / scale)))."""
+    """Logistic regression on standardised evidence.
+
+    P = 1 / (1 + exp(-(intercept + sum of weight * (evidence - mean) / scale))).
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -42,43 +46,48 @@ class LogisticRegression(BaseModel):
     scales: tuple[float, ...]
 
     def probability(self, evidence: PlaceEvidence) -> float:
-        """P(right) of one piece of evidence, in (0, 1)."""
+        """Return P(correct) for one query's evidence, in (0, 1)."""
         return float(self.probabilities(_matrix([evidence]))[0])
 
     def probabilities(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 2) evidence -> (n,) probabilities."""
-        standard = (rows - np.array(self.means)) / np.array(self.scales)
-        return _sigmoid(self.intercept + standard @ np.array(self.weights))
+        """Return P(correct) for (n, 2) rows of support and agreement, (n,) float64."""
+        standardised = (rows - np.array(self.means)) / np.array(self.scales)
+        return _sigmoid(self.intercept + standardised @ np.array(self.weights))
 
 
 class Calibration(BaseModel):
-    """Stored with the generation that it was learnt on; says nothing about any other."""
+    """Calibration of one generation's scores, stored with it. It is not valid for another one."""
 
     model_config = ConfigDict(frozen=True)
 
     radius_m: float
     support_threshold: float | None
-    """Evidence with less support is "not in this map"; None with too few impostors."""
+    """Queries whose support does not exceed it are "not in this map"; None: too few impostors."""
     impostors: int
+    """number of impostors that the threshold was fitted on"""
     labelled_queries: int
+    """number of labelled queries that the confidence was fitted on"""
     confidence: LogisticRegression | None
-    """None: uncalibrated."""
+    """None: uncalibrated"""
 
     @property
     def state(self) -> str:
-        """`calibrated` or `uncalibrated`: whether answers carry a confidence."""
+        """`calibrated` if estimates have a confidence, else `uncalibrated`."""
         return "uncalibrated" if self.confidence is None else "calibrated"
 
     def accepts(self, evidence: PlaceEvidence) -> bool | None:
-        """Whether the ranking shows a place of the map; None where that can't be told yet."""
+        """Return whether the query shows a place of the map; None without a threshold."""
         return None if self.support_threshold is None else evidence.support > self.support_threshold
 
 
 def fit_threshold(impostors: Sequence[PlaceEvidence]) -> float | None:
-    """The support that FALSE_ACCEPTS of the impostors exceed; None for fewer than LEAST_IMPOSTORS.
+    """Fit the support threshold that at most `FALSE_ACCEPT_RATE` of new impostors exceed.
 
-    The smallest order statistic whose rank is high enough: on average at most that share of new
-    impostors exceeds it, whatever their distribution (conformal bound, Vovk et al. 2005).
+    It is the smallest order statistic of sufficient rank. The bound holds on average for any
+    distribution of the impostors (conformal prediction, Vovk et al. 2005).
+
+    Returns:
+        The threshold; None for fewer than `MIN_IMPOSTORS`.
     """
     if len(impostors) < MIN_IMPOSTORS:
         return None
@@ -88,25 +97,30 @@ def fit_threshold(impostors: Sequence[PlaceEvidence]) -> float | None:
 
 
 def fit_confidence(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> LogisticRegression | None:
-    """P(right) from (evidence, was it right); None with too few of them, or of one kind."""
-    right = sum(ok for _, ok in labelled)
+    """Fit P(correct) on pairs of evidence and whether the estimate was correct.
+
+    Returns:
+        The regression; None with fewer than `MIN_LABELLED_QUERIES` queries, or fewer than
+        `MIN_QUERIES_PER_CLASS` correct or wrong ones.
+    """
+    correct = sum(is_correct for _, is_correct in labelled)
     if (
         len(labelled) < MIN_LABELLED_QUERIES
-        or min(right, len(labelled) - right) < MIN_QUERIES_PER_CLASS
+        or min(correct, len(labelled) - correct) < MIN_QUERIES_PER_CLASS
     ):
         return None
     rows = _matrix([evidence for evidence, _ in labelled])
-    truth = np.array([ok for _, ok in labelled], dtype=np.float64)
+    target = np.array([is_correct for _, is_correct in labelled], dtype=np.float64)
     means, scales = rows.mean(axis=0), rows.std(axis=0)
     scales = np.where(scales > 1e-9, scales, 1.0)
     design = np.column_stack([np.ones(len(rows)), (rows - means) / scales])
-    ridge = np.diag([0.0, *[L2_PENALTY] * rows.shape[1]])
+    penalty = np.diag([0.0, *[L2_PENALTY] * rows.shape[1]])
     beta = np.zeros(design.shape[1])
     for _ in range(NEWTON_STEPS):
         probability = _sigmoid(design @ beta)
-        gradient = design.T @ (truth - probability) - ridge @ beta
-        spread = np.maximum(probability * (1 - probability), 1e-6)
-        step = np.linalg.solve((design.T * spread) @ design + ridge, gradient)
+        gradient = design.T @ (target - probability) - penalty @ beta
+        variance = np.maximum(probability * (1 - probability), 1e-6)
+        step = np.linalg.solve((design.T * variance) @ design + penalty, gradient)
         beta += step
         if float(np.abs(step).max()) < 1e-8:
             break
@@ -119,18 +133,19 @@ def fit_confidence(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> LogisticRe
 
 
 def cross_validate(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> list[float] | None:
-    """P(right) of each, learnt from the other folds: what the confidence is worth on new queries.
+    """Predict P(correct) of each query by k-fold cross-validation, with `FOLDS` folds.
 
-    None where there are too few to learn from.
+    Returns:
+        The predictions in the order of the queries; None if a fold has too few queries to fit on.
     """
-    predicted = [0.0] * len(labelled)
+    predictions = [0.0] * len(labelled)
     for fold in range(FOLDS):
-        learnt = fit_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
-        if learnt is None:
+        model = fit_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
+        if model is None:
             return None
         for index in range(fold, len(labelled), FOLDS):
-            predicted[index] = learnt.probability(labelled[index][0])
-    return predicted
+            predictions[index] = model.probability(labelled[index][0])
+    return predictions
 
 
 def _matrix(evidence: Sequence[PlaceEvidence]) -> NDArray[np.float64]:
@@ -138,48 +153,60 @@ def _matrix(evidence: Sequence[PlaceEvidence]) -> NDArray[np.float64]:
 
 
 def _sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    bounded: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(x, -30, 30)))
-    return bounded
+    probabilities: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(x, -30, 30)))
+    return probabilities
 
 
 CALIBRATION_BINS = 10
 
 
 def expected_calibration_error(confidence: Sequence[float], correct: Sequence[bool]) -> float:
-    """Expected calibration error (Naeini et al. 2015) over bins of equally many queries.
+    """Compute the expected calibration error (Naeini et al. 2015), with equal-mass bins.
 
-    The mean, weighed by size, of |mean confidence - share that is right| over the bins.
+    The mean of |mean confidence - accuracy| over the bins, weighted by their size.
     """
     order = np.argsort(confidence, kind="stable")
-    said = np.asarray(confidence, dtype=np.float64)[order]
-    truth = np.asarray(correct, dtype=np.float64)[order]
+    predicted = np.asarray(confidence, dtype=np.float64)[order]
+    target = np.asarray(correct, dtype=np.float64)[order]
     bins = np.array_split(
-        np.arange(len(said)), min(CALIBRATION_BINS, max(1, len(said) // CALIBRATION_BINS))
+        np.arange(len(predicted)), min(CALIBRATION_BINS, max(1, len(predicted) // CALIBRATION_BINS))
     )
-    gaps = [len(b) * abs(float(said[b].mean() - truth[b].mean())) for b in bins]
-    return sum(gaps) / len(said)
+    gaps = [len(b) * abs(float(predicted[b].mean() - target[b].mean())) for b in bins]
+    return sum(gaps) / len(predicted)
 
 
 def auroc(confidence: Sequence[float], correct: Sequence[bool]) -> float | None:
-    """P(a right one has a higher confidence than a wrong one), ties half; None without both."""
-    said, truth = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
-    wrong = np.sort(said[~truth])
-    if truth.all() or not truth.any():
+    """Compute the AUROC: P(a correct query has a higher confidence than a wrong one).
+
+    Ties count half. None unless there are both correct and wrong queries.
+    """
+    predicted, target = np.asarray(confidence, dtype=np.float64), np.asarray(correct, dtype=bool)
+    wrong = np.sort(predicted[~target])
+    if target.all() or not target.any():
         return None
-    below = np.searchsorted(wrong, said[truth], side="left")
-    not_above = np.searchsorted(wrong, said[truth], side="right")
+    below = np.searchsorted(wrong, predicted[target], side="left")
+    not_above = np.searchsorted(wrong, predicted[target], side="right")
     return float((below + not_above).mean() / 2 / len(wrong))
 
 
 def recall_at_precision(
     confidence: Sequence[float], correct: Sequence[bool], answerable: int, precision: float = 0.99
 ) -> float:
-    """The largest share of `answerable` queries that are answered, and rightly, by accepting all
-    above some confidence of which at least `precision` are right. 0 when no such one exists."""
+    """Compute the highest recall of any confidence threshold that has the required precision.
+
+    Args:
+        confidence: confidence of each query.
+        correct: whether each query's estimate is correct.
+        answerable: number of queries that can be answered correctly, the denominator of recall.
+        precision: minimum share of correct answers among those above the threshold.
+
+    Returns:
+        The recall, from 0 to 1; 0 if no threshold has the precision.
+    """
     order = np.argsort(-np.asarray(confidence, dtype=np.float64), kind="stable")
-    said = np.asarray(confidence, dtype=np.float64)[order]
+    predicted = np.asarray(confidence, dtype=np.float64)[order]
     hits = np.cumsum(np.asarray(correct, dtype=np.int64)[order])
-    share = hits / np.arange(1, len(said) + 1)
-    # Equal confidences are accepted together: only the last of them can be a cut.
-    cut = np.append(said[1:] != said[:-1], True) & (share >= precision)
-    return float(hits[cut].max() / answerable) if cut.any() and answerable else 0.0
+    precisions = hits / np.arange(1, len(predicted) + 1)
+    # Equal confidences are accepted together, so a threshold follows the last of them.
+    is_cut = np.append(predicted[1:] != predicted[:-1], True) & (precisions >= precision)
+    return float(hits[is_cut].max() / answerable) if is_cut.any() and answerable else 0.0

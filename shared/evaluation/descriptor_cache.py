@@ -1,7 +1,7 @@
-"""Descriptors kept from run to run, by the photo's bytes and by all that decides their value.
+"""On-disk cache of descriptors between evaluation runs, keyed by photo content and extractor spec.
 
-One SQLite file for each specification: killed at any moment, it holds whole rows or none. What was
-used longest ago goes first when all of them outgrow their limit.
+Each spec has one SQLite file, whose transactions keep rows complete if the process is killed. When
+the files exceed the size limit, the least recently used file is deleted first.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from shared.config.private_files import FILE_MODE, make_private_folder
 from shared.errors import InvalidRequest
 from shared.evaluation.ranking import DescribeFunction, Rows
 
-BATCH = 32  # rows that are read from the cache together
-ROW_OVERHEAD_BYTES = 100  # of SQLite, for a row: key, page slack
+BATCH = 32  # rows read from the cache at a time
+ROW_OVERHEAD_BYTES = 100  # SQLite's overhead per row: key and unused page space
 BUSY_TIMEOUT_SECONDS = 60.0
 
 SCHEMA = """
@@ -30,61 +30,76 @@ CREATE TABLE IF NOT EXISTS times (seconds REAL NOT NULL, photos INT NOT NULL);
 
 
 class TimedDescriber(DescribeFunction, Protocol):
-    """A Describe that says what its network took."""
+    """A DescribeFunction that measures the time spent in its network."""
 
     seconds: float
     photos: int
 
 
 class CachedDescriber:
-    """A Describe that asks `inner` only for photos whose row is not there yet."""
+    """DescribeFunction that calls `inner` only for photos whose descriptor is not cached.
+
+    Args:
+        inner: computes missing descriptors.
+        folder: folder of the cache files, shared by all specs.
+        spec: everything that determines a descriptor's value.
+        max_bytes: size limit of the folder. When it is reached, new descriptors are computed but
+            not stored.
+
+    Attributes:
+        on_lookup: called with the numbers of photos looked up so far and in total, before the
+            first descriptor is yielded.
+    """
 
     def __init__(
-        self, inner: TimedDescriber, folder: Path, spec: Mapping[str, Any], *, most_bytes: int
+        self, inner: TimedDescriber, folder: Path, spec: Mapping[str, Any], *, max_bytes: int
     ) -> None:
-        """`spec` is everything that decides a row's value; `most_bytes` is for all specs in
-        `folder`. Beyond them, rows are made and not kept."""
         self._inner = inner
         self._folder = folder
-        named = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
-        self._file = folder / f"{named[:32]}.sqlite"
-        self._most_bytes = most_bytes
-        self.on_lookup: Callable[[int, int], None] = lambda done, most: None
-        """hears how many photos have been looked for, before the first row comes"""
+        spec_hash = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
+        self._file = folder / f"{spec_hash[:32]}.sqlite"
+        self._max_bytes = max_bytes
+        self.on_lookup: Callable[[int, int], None] = lambda done, total: None
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
-        kept = self._open()
+        """Yield (n, D) float32 descriptors, batch by batch, in the order of the photos."""
+        connection = self._open()
         try:
             keys, missing = [], []
             for photo in photos:
                 keys.append(_photo_sha256(photo))
-                missing.append(not _has_row(kept, keys[-1]))
+                missing.append(not _has_row(connection, keys[-1]))
                 self.on_lookup(len(keys), len(photos))
-            made = self._made([p for p, m in zip(photos, missing, strict=True) if m])
-            for begin in range(0, len(photos), BATCH):
-                rows, new = [], []
-                for place in range(begin, min(begin + BATCH, len(photos))):
-                    if missing[place]:
-                        rows.append(next(made))
-                        new.append((keys[place], rows[-1].tobytes()))
+            computed = self._compute([p for p, m in zip(photos, missing, strict=True) if m])
+            for start in range(0, len(photos), BATCH):
+                rows, new_rows = [], []
+                for index in range(start, min(start + BATCH, len(photos))):
+                    if missing[index]:
+                        rows.append(next(computed))
+                        new_rows.append((keys[index], rows[-1].tobytes()))
                     else:
-                        rows.append(_load_row(kept, keys[place]))
+                        rows.append(_load_row(connection, keys[index]))
                 yield np.stack(rows)
-                self._keep(kept, new)  # not before: whoever takes them may find that they are bad
+                # Stored after the yield: the consumer raises on invalid rows, such as NaN.
+                self._store(connection, new_rows)
         finally:
-            kept.close()
+            connection.close()
 
     def milliseconds_a_photo(self) -> float | None:
-        """What the network took, over all photos that were ever described for this cache; None
-        where nothing was."""
-        kept = self._open()
+        """Return the mean network time per photo over all photos described for this cache.
+
+        None if no time has been recorded.
+        """
+        connection = self._open()
         try:
-            seconds, photos = kept.execute("SELECT sum(seconds), sum(photos) FROM times").fetchone()
+            seconds, photos = connection.execute(
+                "SELECT sum(seconds), sum(photos) FROM times"
+            ).fetchone()
         finally:
-            kept.close()
+            connection.close()
         return 1000 * seconds / photos if photos else None
 
-    def _made(self, photos: Sequence[Path]) -> Iterator[Any]:
+    def _compute(self, photos: Sequence[Path]) -> Iterator[Any]:
         if not photos:
             return
         for batch in self._inner(photos):
@@ -93,38 +108,40 @@ class CachedDescriber:
     def _open(self) -> sqlite3.Connection:
         make_private_folder(self._folder)
         self._file.touch(FILE_MODE)
-        kept = sqlite3.connect(self._file, timeout=BUSY_TIMEOUT_SECONDS, isolation_level=None)
-        kept.execute("PRAGMA journal_mode = WAL")
-        kept.execute("PRAGMA synchronous = NORMAL")
-        kept.executescript(SCHEMA)
-        self._file.touch()  # it is the last one to go
-        return kept
+        connection = sqlite3.connect(self._file, timeout=BUSY_TIMEOUT_SECONDS, isolation_level=None)
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.executescript(SCHEMA)
+        self._file.touch()  # the modification time is the time of last use
+        return connection
 
-    def _keep(self, kept: sqlite3.Connection, new: Sequence[tuple[bytes, bytes]]) -> None:
-        """Rows and the time they took, in one transaction."""
-        if not new:
+    def _store(
+        self, connection: sqlite3.Connection, new_rows: Sequence[tuple[bytes, bytes]]
+    ) -> None:
+        """Store rows and the time of their computation in one transaction."""
+        if not new_rows:
             return
-        has_room = self._make_room(sum(len(row) + ROW_OVERHEAD_BYTES for _, row in new))
-        kept.execute("BEGIN IMMEDIATE")
-        if has_room:
-            kept.executemany("INSERT OR REPLACE INTO rows VALUES (?, ?)", new)
+        has_space = self._evict_for(sum(len(row) + ROW_OVERHEAD_BYTES for _, row in new_rows))
+        connection.execute("BEGIN IMMEDIATE")
+        if has_space:
+            connection.executemany("INSERT OR REPLACE INTO rows VALUES (?, ?)", new_rows)
         if self._inner.photos:
-            took = (self._inner.seconds, self._inner.photos)
-            kept.execute("INSERT INTO times VALUES (?, ?)", took)
-        kept.execute("COMMIT")
+            timing = (self._inner.seconds, self._inner.photos)
+            connection.execute("INSERT INTO times VALUES (?, ?)", timing)
+        connection.execute("COMMIT")
         self._inner.seconds, self._inner.photos = 0.0, 0
 
-    def _make_room(self, more: int) -> bool:
-        """Whether so many bytes more may be kept, after the oldest other specs have gone."""
+    def _evict_for(self, new_bytes: int) -> bool:
+        """Evict other specs, least recently used first; return whether `new_bytes` fit."""
         others = [file for file in self._folder.glob("*.sqlite") if file != self._file]
         for file in sorted(others, key=lambda file: file.stat().st_mtime):
-            if self._size() + more <= self._most_bytes:
+            if self._total_bytes() + new_bytes <= self._max_bytes:
                 break
             for part in self._folder.glob(f"{file.name}*"):
                 part.unlink(missing_ok=True)
-        return self._size() + more <= self._most_bytes
+        return self._total_bytes() + new_bytes <= self._max_bytes
 
-    def _size(self) -> int:
+    def _total_bytes(self) -> int:
         return sum(file.stat().st_size for file in self._folder.glob("*.sqlite*"))
 
 
@@ -134,15 +151,15 @@ def _photo_sha256(photo: Path) -> bytes:
             digest = hashlib.file_digest(file, "sha256")
     except OSError as error:
         raise InvalidRequest(
-            "photo_unreadable", f"{photo} can't be read: {error.strerror}."
+            "photo_unreadable", f"Can't read {photo}: {error.strerror}."
         ) from error
     return digest.digest()
 
 
-def _has_row(kept: sqlite3.Connection, key: bytes) -> bool:
-    return kept.execute("SELECT 1 FROM rows WHERE photo = ?", (key,)).fetchone() is not None
+def _has_row(connection: sqlite3.Connection, key: bytes) -> bool:
+    return connection.execute("SELECT 1 FROM rows WHERE photo = ?", (key,)).fetchone() is not None
 
 
-def _load_row(kept: sqlite3.Connection, key: bytes) -> Any:
-    (row,) = kept.execute("SELECT row FROM rows WHERE photo = ?", (key,)).fetchone()
+def _load_row(connection: sqlite3.Connection, key: bytes) -> Any:
+    (row,) = connection.execute("SELECT row FROM rows WHERE photo = ?", (key,)).fetchone()
     return np.frombuffer(row, np.float32)

@@ -1,9 +1,9 @@
-"""Exact nearest rows by cosine, in bounded memory: blocks of the database, a running merge.
+"""Exact k-nearest-neighbour search by cosine similarity, in bounded memory.
 
-Each block is searched by faiss (inner products of IndexFlatIP's kind). Products in float32 differ
-in their last digits with where a row lies in a block. So candidates that are nearly equal are
-compared again in float64, and what is equal then goes by index: a ranking is the same for any
-block size, and copies of a photo are nobody's luck.
+The database is searched in blocks with faiss (brute-force inner product, as IndexFlatIP), and the
+top k of the blocks are merged. Float32 products depend in their last digits on a row's position in
+the block. Near ties are therefore recomputed in float64, and exact ties are ordered by index. The
+ranking is the same for any block size, also if the database holds copies of a photo.
 """
 
 from __future__ import annotations
@@ -17,13 +17,9 @@ from numpy.typing import NDArray
 
 from shared.errors import Misconfigured
 
-BLOCK_BYTES = 256_000_000  # of database rows, and as much of queries, that are in memory at once
-EXTRA_CANDIDATES = (
-    12  # candidates beyond the first k, so that most near ties are settled among them
-)
-TIE_TOLERANCE = (
-    1e-5  # of a cosine; some ten times what float32 loses in products of 100,000 numbers
-)
+BLOCK_BYTES = 256_000_000  # size of a block of database rows, and of a block of queries
+EXTRA_CANDIDATES = 12  # beyond the first k; most near ties can be resolved among them
+TIE_TOLERANCE = 1e-5  # cosine; about ten times the float32 error of 100,000-dimensional products
 
 Rows = NDArray[np.float32]
 Scores = NDArray[np.float32]
@@ -33,12 +29,12 @@ BlockProgress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Rankings:
-    """Of each query, the best first."""
+    """Top k of each query, best first."""
 
     indices: Indices
-    """(queries, k) of database rows"""
+    """(queries, k) int64 indices of database rows"""
     scores: Scores
-    """(queries, k) cosines"""
+    """(queries, k) float32 cosines"""
 
 
 def exact_knn(
@@ -48,36 +44,48 @@ def exact_knn(
     *,
     faiss_gpu: bool = False,
     block_bytes: int = BLOCK_BYTES,
-    on_progress: BlockProgress = lambda done, most: None,
+    on_progress: BlockProgress = lambda done, total: None,
 ) -> Rankings:
-    """(n, D) and (m, D) unit rows, which may be memory-mapped -> the first min(k, m) of each query.
+    """Search the k nearest database rows of each query by cosine similarity.
 
-    Of equally similar rows the lower index comes first. `on_progress` hears how many products
-    of rows are
-    done, and of how many. Raises Misconfigured (`faiss_gpu_missing`).
+    Args:
+        queries: (n, D) float32, L2-normalised; may be memory-mapped.
+        database: (m, D) float32, L2-normalised; may be memory-mapped.
+        k: number of neighbours; at most m are returned.
+        faiss_gpu: search on the GPU.
+        block_bytes: size of the blocks of queries and of database rows.
+        on_progress: called with the numbers of finished and of all query-row comparisons.
+
+    Returns:
+        (n, min(k, m)) rankings; equally similar rows are ordered by index.
+
+    Raises:
+        Misconfigured: `faiss_gpu_missing`.
     """
     search = _make_gpu_search() if faiss_gpu else _search_cpu
     k = min(k, len(database))
-    at_once = max(1, block_bytes // (4 * max(1, database.shape[1])))
-    found = Rankings(np.empty((len(queries), k), np.int64), np.empty((len(queries), k), np.float32))
-    most, done = len(queries) * len(database), 0
-    for start in range(0, len(queries), at_once):
-        asked = np.ascontiguousarray(queries[start : start + at_once], np.float32)
+    block_rows = max(1, block_bytes // (4 * max(1, database.shape[1])))
+    result = Rankings(
+        np.empty((len(queries), k), np.int64), np.empty((len(queries), k), np.float32)
+    )
+    total, done = len(queries) * len(database), 0
+    for query_start in range(0, len(queries), block_rows):
+        batch = np.ascontiguousarray(queries[query_start : query_start + block_rows], np.float32)
         merged: Rankings | None = None
-        for begin in range(0, len(database), at_once):
-            block = np.ascontiguousarray(database[begin : begin + at_once], np.float32)
-            kept = min(k + EXTRA_CANDIDATES, len(block))
-            scores, indices = search(asked, block, kept)
-            here = Rankings(indices.astype(np.int64) + begin, scores)
-            merged = here if merged is None else _merge_top_k(merged, here, k + EXTRA_CANDIDATES)
-            done += len(asked) * len(block)
-            on_progress(done, most)
+        for start in range(0, len(database), block_rows):
+            block = np.ascontiguousarray(database[start : start + block_rows], np.float32)
+            candidates = min(k + EXTRA_CANDIDATES, len(block))
+            scores, indices = search(batch, block, candidates)
+            top = Rankings(indices.astype(np.int64) + start, scores)
+            merged = top if merged is None else _merge_top_k(merged, top, k + EXTRA_CANDIDATES)
+            done += len(batch) * len(block)
+            on_progress(done, total)
         if merged is None:  # an empty database
             continue
-        settled = _resolve_ties(merged, asked, database, k, at_once)
-        found.indices[start : start + len(asked)] = settled.indices
-        found.scores[start : start + len(asked)] = settled.scores
-    return found
+        resolved = _resolve_ties(merged, batch, database, k, block_rows)
+        result.indices[query_start : query_start + len(batch)] = resolved.indices
+        result.scores[query_start : query_start + len(batch)] = resolved.scores
+    return result
 
 
 def _search_cpu(queries: Rows, block: Rows, k: int) -> tuple[Scores, Indices]:
@@ -89,9 +97,9 @@ def _make_gpu_search() -> Callable[[Rows, Rows, int], tuple[Scores, Indices]]:
     if not hasattr(faiss, "StandardGpuResources") or faiss.get_num_gpus() == 0:
         raise Misconfigured(
             "faiss_gpu_missing",
-            "This faiss has no GPU: the package faiss-cpu is installed, or no GPU is there. Search "
-            "on the processor (training: --faiss_gpu False; else without --faiss-gpu), or install "
-            "a faiss for GPUs.",
+            "faiss cannot use a GPU: either the package faiss-cpu is installed, or there is no "
+            "GPU. Search on the CPU (training: --faiss_gpu False; otherwise omit --faiss-gpu), or "
+            "install faiss with GPU support.",
         )
     resources = faiss.StandardGpuResources()
 
@@ -104,48 +112,51 @@ def _make_gpu_search() -> Callable[[Rows, Rows, int], tuple[Scores, Indices]]:
     return search
 
 
-def _merge_top_k(one: Rankings, other: Rankings, kept: int) -> Rankings:
-    """The `kept` best of both, per query."""
-    indices = np.concatenate([one.indices, other.indices], axis=1)
-    scores = np.concatenate([one.scores, other.scores], axis=1)
-    order = np.lexsort((indices, -scores), axis=1)[:, :kept]
+def _merge_top_k(first: Rankings, second: Rankings, k: int) -> Rankings:
+    indices = np.concatenate([first.indices, second.indices], axis=1)
+    scores = np.concatenate([first.scores, second.scores], axis=1)
+    order = np.lexsort((indices, -scores), axis=1)[:, :k]
     return Rankings(np.take_along_axis(indices, order, 1), np.take_along_axis(scores, order, 1))
 
 
-def _resolve_ties(found: Rankings, queries: Rows, database: Rows, k: int, at_once: int) -> Rankings:
-    """The first k of each query, near ties decided in float64."""
-    kept = found.indices.shape[1]
-    gaps = -np.diff(found.scores, axis=1)
-    near = (gaps[:, : min(k, kept - 1)] < TIE_TOLERANCE).any(axis=1)
-    # From the kth to the last candidate all nearly equal: there may be more of them.
-    crowded = kept < len(database)
-    open_ended = near & crowded & (found.scores[:, k - 1] - found.scores[:, -1] < TIE_TOLERANCE)
-    indices, scores = found.indices[:, :k].copy(), found.scores[:, :k].copy()
-    for place in np.flatnonzero(near & ~open_ended):
-        among = np.sort(found.indices[place])
-        exact = _cosines_float64(queries[place : place + 1], database[among])[0]
+def _resolve_ties(
+    ranked: Rankings, queries: Rows, database: Rows, k: int, block_rows: int
+) -> Rankings:
+    """Return the top k of each query, with near ties recomputed in float64."""
+    candidates = ranked.indices.shape[1]
+    gaps = -np.diff(ranked.scores, axis=1)
+    has_tie = (gaps[:, : min(k, candidates - 1)] < TIE_TOLERANCE).any(axis=1)
+    # If the kth to the last candidate are nearly equal, rows beyond the candidates may be as well.
+    is_truncated = candidates < len(database)
+    is_open = (
+        has_tie & is_truncated & (ranked.scores[:, k - 1] - ranked.scores[:, -1] < TIE_TOLERANCE)
+    )
+    indices, scores = ranked.indices[:, :k].copy(), ranked.scores[:, :k].copy()
+    for query in np.flatnonzero(has_tie & ~is_open):
+        rows = np.sort(ranked.indices[query])
+        exact = _cosines_float64(queries[query : query + 1], database[rows])[0]
         order = np.argsort(-exact, kind="stable")[:k]
-        indices[place], scores[place] = among[order], exact[order]
-    doubtful = np.flatnonzero(open_ended)
-    if len(doubtful):
-        best = _search_float64(queries[doubtful], database, k, at_once)
-        indices[doubtful], scores[doubtful] = best.indices, best.scores
+        indices[query], scores[query] = rows[order], exact[order]
+    unresolved = np.flatnonzero(is_open)
+    if len(unresolved):
+        best = _search_float64(queries[unresolved], database, k, block_rows)
+        indices[unresolved], scores[unresolved] = best.indices, best.scores
     return Rankings(indices, scores)
 
 
-def _search_float64(queries: Rows, database: Rows, k: int, at_once: int) -> Rankings:
-    """As `nearest`, but every product in float64."""
+def _search_float64(queries: Rows, database: Rows, k: int, block_rows: int) -> Rankings:
+    """Search as `exact_knn`, with all products in float64."""
     merged: Rankings | None = None
-    step = max(1, at_once // 2)  # float64 takes twice the room
-    for begin in range(0, len(database), step):
-        exact = _cosines_float64(queries, database[begin : begin + step])
+    step = max(1, block_rows // 2)  # float64 takes twice the memory
+    for start in range(0, len(database), step):
+        exact = _cosines_float64(queries, database[start : start + step])
         order = np.argsort(-exact, axis=1, kind="stable")[:, :k]
-        here = Rankings(order + begin, np.take_along_axis(exact, order, 1))
-        merged = here if merged is None else _merge_top_k(merged, here, k)
-    assert merged is not None, "asked of a database with rows"
+        top = Rankings(order + start, np.take_along_axis(exact, order, 1))
+        merged = top if merged is None else _merge_top_k(merged, top, k)
+    assert merged is not None, "the database has rows"
     return merged
 
 
 def _cosines_float64(queries: Rows, rows: Rows) -> Scores:
-    """Cosines computed in float64: equal rows get the same float32."""
+    """Compute cosines in float64, so that equal rows get the same float32 value."""
     return (queries.astype(np.float64) @ rows.astype(np.float64).T).astype(np.float32)

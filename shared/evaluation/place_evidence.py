@@ -1,6 +1,6 @@
-"""When two photos show the same place: near each other, or under one label.
+"""Evidence for a place: same-place predicates, support and agreement of a ranking, location.
 
-What a ranking tells of the place: by how much it leads, and how many photos agree.
+Two photos show the same place if they are close to each other or have the same place label.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 
 from shared.geodesy import distance_m, weighted_centroid
 
-# Farther away than this, or under another label, is certainly another place. Between the radius
-# that counts as right and this lies what is neither.
+# Farther away than this, or with another label, is a different place. Photos between the positive
+# radius and this distance are neither the same place nor a different one.
 DIFFERENT_PLACE_M = 100.0
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoLocation:
-    """Where a photo was taken, as far as it is known; coordinates come in pairs, in degrees."""
+    """Where a photo was taken: coordinates in degrees (both or neither) and a place label."""
 
     latitude: float | None
     longitude: float | None
@@ -30,55 +30,57 @@ class PhotoLocation:
         return self.latitude is not None or self.place is not None
 
 
-def distance_between_m(one: PhotoLocation, other: PhotoLocation) -> float | None:
-    """None where one of them has no coordinates."""
-    if one.latitude is None or one.longitude is None:
+def distance_between_m(a: PhotoLocation, b: PhotoLocation) -> float | None:
+    """Return the distance in metres; None if a location has no coordinates."""
+    if a.latitude is None or a.longitude is None:
         return None
-    if other.latitude is None or other.longitude is None:
+    if b.latitude is None or b.longitude is None:
         return None
-    return distance_m(one.latitude, one.longitude, other.latitude, other.longitude)
+    return distance_m(a.latitude, a.longitude, b.latitude, b.longitude)
 
 
-def is_same_place(one: PhotoLocation, other: PhotoLocation, radius_m: float) -> bool:
-    """Within `radius_m` of each other, or under one label."""
-    if one.place is not None and one.place == other.place:
+def is_same_place(a: PhotoLocation, b: PhotoLocation, radius_m: float) -> bool:
+    """Return whether two locations are within `radius_m` or have the same label."""
+    if a.place is not None and a.place == b.place:
         return True
-    away = distance_between_m(one, other)
-    return away is not None and away <= radius_m
+    distance = distance_between_m(a, b)
+    return distance is not None and distance <= radius_m
 
 
-def is_different_place(one: PhotoLocation, other: PhotoLocation) -> bool:
-    """Certainly another place: another label or more than 100 m away, and nothing against it."""
-    away = distance_between_m(one, other)
-    labels_differ = one.place is not None and other.place is not None and one.place != other.place
-    if one.place is not None and one.place == other.place:
+def is_different_place(a: PhotoLocation, b: PhotoLocation) -> bool:
+    """Return whether two locations are certainly different places.
+
+    They are if they are more than 100 m apart and do not have the same label, or, without
+    coordinates, if their labels differ.
+    """
+    distance = distance_between_m(a, b)
+    labels_differ = a.place is not None and b.place is not None and a.place != b.place
+    if a.place is not None and a.place == b.place:
         return False
-    return labels_differ if away is None else away > DIFFERENT_PLACE_M
+    return labels_differ if distance is None else distance > DIFFERENT_PLACE_M
 
 
-EVIDENCE_DEPTH = (
-    50  # ranks looked at; a rival that is not among them scores at most what the last does
-)
-VOTING_PHOTOS = 10  # of them, those that may agree with the first
+EVIDENCE_DEPTH = 50  # ranks needed; a rival place below them scores at most what the last rank does
+VOTING_PHOTOS = 10  # first ranks that count towards support and agreement
 
 
 @dataclass(frozen=True, slots=True)
 class RankedPhoto:
-    """One photo of a ranking: the score that ranks it (a cosine) and where it was taken."""
+    """A photo of a ranking: its cosine score and where it was taken."""
 
     score: float
-    spot: PhotoLocation
+    location: PhotoLocation
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceEvidence:
-    """How the first ten photos speak for the place of the best one.
+    """Evidence of the first ten photos of a ranking for the place of the best one.
 
-    `support`: the sum, over those of them that show that place, of how much higher their cosine is
-    than the best one of any other place. `agreement`: their share. Of the statistics that were
-    tried on generated places (best score, lead, z-score of the lead, softmax share of the place)
-    these two told right from wrong best, and carry over to photos of other days, which lower all
-    scores alike.
+    `support` is the sum, over those of them that show this place, of the margin of their cosine
+    over the best cosine of any other place. `agreement` is their share of the ten. On generated
+    places, these two separated correct from wrong estimates best among the statistics that were
+    tried (best score, margin, z-score of the margin, softmax share of the place). They carry over
+    to photos of other days, which lower all scores alike.
     """
 
     support: float
@@ -88,46 +90,60 @@ class PlaceEvidence:
 def compute_evidence(
     ranking: Sequence[RankedPhoto], radius_m: float, place: PhotoLocation | None = None
 ) -> PlaceEvidence | None:
-    """How a ranking, best first, speaks for `place`; left out: for the place of its best photo.
+    """Compute the evidence of a ranking for a place.
 
-    A filter takes rivals away, and what is left would look sure of itself: weigh the ranking of the
-    whole map for the place that the filter let through. None when the ranking is empty or the
-    place is not known.
+    A search filter removes competing places, which makes the remaining ranking look too certain.
+    For a filtered search, pass the unfiltered ranking of the map, and the place that the filtered
+    search found.
+
+    Args:
+        ranking: photos of the map, best first, `EVIDENCE_DEPTH` ranks if there are as many.
+        radius_m: radius of a place, in metres.
+        place: the place in question; by default that of the best photo.
+
+    Returns:
+        The evidence; None if the ranking is empty or the place is unknown.
     """
     if not ranking:
         return None
-    first = place or ranking[0].spot
-    if not first.is_known:
+    target = place or ranking[0].location
+    if not target.is_known:
         return None
-    rival = next((r.score for r in ranking if is_different_place(first, r.spot)), ranking[-1].score)
+    rival_score = next(
+        (r.score for r in ranking if is_different_place(target, r.location)), ranking[-1].score
+    )
     voters = ranking[:VOTING_PHOTOS]
-    agreeing = [r.score for r in voters if is_same_place(first, r.spot, radius_m)]
-    support = sum(max(0.0, score - rival) for score in agreeing)
+    agreeing = [r.score for r in voters if is_same_place(target, r.location, radius_m)]
+    support = sum(max(0.0, score - rival_score) for score in agreeing)
     return PlaceEvidence(support, len(agreeing) / len(voters))
 
 
 def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoLocation:
-    """Where the ranking points to: the first photo's label, and the centre of the first ten that
-    lie within `radius_m` of it, each weighed by its score's lead over the last of the ranking."""
-    first = ranking[0].spot
+    """Estimate the location of a query from its ranking, which must not be empty.
+
+    The label is the best photo's. The coordinates are the weighted centroid of those of the first
+    ten photos that are within `radius_m` of the best one. The weight of a photo is the margin of
+    its score over the last score of the ranking.
+    """
+    first = ranking[0].location
     if first.latitude is None:
         return first
-    floor = ranking[-1].score
-    near = [
+    last_score = ranking[-1].score
+    nearby = [
         r
         for r in ranking[:VOTING_PHOTOS]
-        if r.spot.latitude is not None
+        if r.location.latitude is not None
         and is_same_place(
             PhotoLocation(first.latitude, first.longitude, None),
-            PhotoLocation(r.spot.latitude, r.spot.longitude, None),
+            PhotoLocation(r.location.latitude, r.location.longitude, None),
             radius_m,
         )
     ]
-    weights = np.array([r.score - floor for r in near]) + 1e-9
+    weights = np.array([r.score - last_score for r in nearby]) + 1e-9
     latitude, longitude = weighted_centroid(
-        np.array([r.spot.latitude for r in near], dtype=np.float64),
-        np.array([r.spot.longitude for r in near], dtype=np.float64),
+        np.array([r.location.latitude for r in nearby], dtype=np.float64),
+        np.array([r.location.longitude for r in nearby], dtype=np.float64),
         weights,
     )
-    # Seven digits are a centimetre; more would be rounding errors.
+    # Seven decimal places are about a centimetre; more would be rounding error.
     return PhotoLocation(round(latitude, 7), round(longitude, 7), first.place)

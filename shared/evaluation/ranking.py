@@ -1,6 +1,6 @@
-"""An evaluation set asked of something that describes photos: rankings and recall@k.
+"""Evaluates a descriptor on an evaluation set: describe, rank exactly, compute recall@k.
 
-What describes photos, as evaluation sees it, and its rows in memory or in a mapped file.
+Descriptors are held in memory or, if they are large, in a memory-mapped temporary file.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from shared.errors import PlacewiseError, Unprocessable
 from shared.evaluation.exact_knn import BLOCK_BYTES, Indices, Rankings, exact_knn
 from shared.evaluation.recall import recall_at_k
 
-MAX_ROWS_IN_MEMORY_BYTES = 1_000_000_000  # rows beyond it lie in a mapped file meanwhile
-MAX_PHOTOS_LISTED = 20  # photos that an error lists; the others are counted
+MAX_ROWS_IN_MEMORY_BYTES = 1_000_000_000  # larger matrices are memory-mapped
+MAX_PHOTOS_LISTED = 20  # photos listed in an error message; the others are counted
 
 Rows = NDArray[np.float32]
 
 
 class DescribeFunction(Protocol):
-    """Photos to their rows, batch by batch, in the photos' order: (b, D) float32, unit length.
+    """Interface of descriptor extraction: yields (b, D) float32 L2-normalised rows, in order.
 
-    A photo that can't be described is an Unprocessable error (`refused_photos_error`) that
-    names it: a
-    figure over the others would be one of another data set.
+    If a photo cannot be described, implementations raise the Unprocessable error that
+    `refused_photos_error` builds. Metrics over the remaining photos would be those of a different
+    data set.
     """
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]: ...
@@ -44,11 +44,21 @@ def describe_to_matrix(
     photos: Sequence[Path],
     *,
     memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
-    on_progress: Callable[[int], None] = lambda more: None,
+    on_progress: Callable[[int], None] = lambda count: None,
 ) -> Iterator[Rows]:
-    """(photos, D) rows for as long as the block lasts; `on_progress` hears how many more are there.
+    """Describe photos into a matrix that is valid inside the `with` block.
 
-    Raises Unprocessable (`features_not_finite`, and what `describe` raises).
+    Args:
+        describe: descriptor extraction.
+        photos: the photos.
+        memory_bytes: larger matrices are memory-mapped.
+        on_progress: called with the number of new rows after each batch.
+
+    Yields:
+        (photos, D) float32 descriptors.
+
+    Raises:
+        Unprocessable: `features_not_finite`; also raises what `describe` raises.
     """
     with contextlib.ExitStack() as stack:
         rows: Rows = np.empty((0, 0), np.float32)
@@ -83,22 +93,23 @@ def _check_finite(batch: Rows, photos: Sequence[Path]) -> None:
         first = photos[int(np.flatnonzero(~finite)[0])]
         raise Unprocessable(
             "features_not_finite",
-            f"The network's descriptor of {first} is not finite, and {int((~finite).sum())} of its "
-            "batch are not: check the weights; a training that has diverged makes such networks.",
+            f"The network's descriptor of {first} has NaN or infinite values "
+            f"({int((~finite).sum())} photos of its batch do). Check the weights; a diverged "
+            "training produces such networks.",
         )
 
 
 def refused_photos_error(
     refused: Sequence[tuple[Path, PlacewiseError]], photos: int
 ) -> Unprocessable:
-    """The error that names the photos that can't be described, and why."""
+    """Build the error that lists the photos that cannot be described, with reasons."""
     lines = [f"{photo}: {error.detail}" for photo, error in refused[:MAX_PHOTOS_LISTED]]
     if len(refused) > MAX_PHOTOS_LISTED:
         lines.append(f"and {len(refused) - MAX_PHOTOS_LISTED} more")
     return Unprocessable(
         "photos_refused",
-        f"{len(refused)} of {photos} photos of the data set can't be described, and without them "
-        "it would be another data set. Mend or fetch them again.\n" + "\n".join(lines),
+        f"{len(refused)} of {photos} photos of the data set cannot be described. Repair or "
+        "download them again; metrics without them would not be comparable.\n" + "\n".join(lines),
     )
 
 
@@ -109,12 +120,12 @@ ProgressCallback = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Recalls:
-    """The shares are from 0 to 1; NaN where there is no query to take them of."""
+    """Recall@k of one evaluation set, from 0 to 1; NaN without queries."""
 
     recall_all: dict[int, float]
-    """By k; a query without a positive counts as missed. What papers print."""
+    """k -> recall over all queries, as papers report it; a query without a positive is a miss"""
     recall_findable: dict[int, float]
-    """By k, over the queries that have a positive."""
+    """k -> recall over the queries that have a positive"""
     queries: int
     without_positive: int
 
@@ -122,19 +133,19 @@ class Recalls:
         return {
             "queries": self.queries,
             "without_positive": self.without_positive,
-            "recall": _shares_by_k(self.recall_all),
-            "recall_findable": _shares_by_k(self.recall_findable),
+            "recall": _recalls_as_json(self.recall_all),
+            "recall_findable": _recalls_as_json(self.recall_findable),
         }
 
 
 @dataclass(frozen=True, slots=True)
 class RecallEvaluation:
-    """What came of one evaluation set."""
+    """Rankings and recalls of one evaluation set."""
 
     ranked: Rankings
     recalls: Recalls
     dimension: int
-    """of a row; 4 bytes a number"""
+    """dimension of a descriptor"""
 
 
 def evaluate_recall(
@@ -145,13 +156,21 @@ def evaluate_recall(
     faiss_gpu: bool = False,
     memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
     block_bytes: int = BLOCK_BYTES,
-    on_progress: ProgressCallback = lambda what, done, most: None,
+    on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> RecallEvaluation:
-    """Describe the database and the queries, rank, count.
+    """Describe the database and the queries, rank them exactly, and compute recall@k.
 
-    `on_progress` hears what is being done (`database`, `queries`, `search`), how far it is and
-    where it
-    ends. Raises what `describe` does, and Misconfigured (`faiss_gpu_missing`).
+    Args:
+        describe: descriptor extraction.
+        evaluation_set: database, queries and positives.
+        ks: the values of k.
+        faiss_gpu: search on the GPU.
+        memory_bytes: larger descriptor matrices are memory-mapped.
+        block_bytes: block size of the search.
+        on_progress: called with the stage (`database`, `queries`, `search`), done and total.
+
+    Raises:
+        Misconfigured: `faiss_gpu_missing`; also raises what `describe` raises.
     """
     with describe_evaluation_set(
         describe, evaluation_set, memory_bytes=memory_bytes, on_progress=on_progress
@@ -162,7 +181,7 @@ def evaluate_recall(
             max(ks),
             faiss_gpu=faiss_gpu,
             block_bytes=block_bytes,
-            on_progress=lambda done, most: on_progress("search", done, most),
+            on_progress=lambda done, total: on_progress("search", done, total),
         )
         dimension = database.shape[1]
     return RecallEvaluation(
@@ -176,50 +195,65 @@ def describe_evaluation_set(
     evaluation_set: EvaluationSet,
     *,
     memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
-    on_progress: ProgressCallback = lambda what, done, most: None,
+    on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> Iterator[tuple[Rows, Rows]]:
-    """(m, D) rows of the database and (n, D) of the queries, for as long as the block lasts."""
+    """Describe an evaluation set into matrices that are valid inside the `with` block.
+
+    Yields:
+        (m, D) float32 descriptors of the database and (n, D) of the queries.
+    """
     with contextlib.ExitStack() as stack:
-        found = []
-        for what, shots in (
+        matrices = []
+        for stage, photos in (
             ("database", evaluation_set.database),
             ("queries", evaluation_set.queries),
         ):
-            more = _count_progress(what, len(shots), on_progress)
-            paths = [shot.path for shot in shots]
-            found.append(
+            matrices.append(
                 stack.enter_context(
-                    describe_to_matrix(describe, paths, memory_bytes=memory_bytes, on_progress=more)
+                    describe_to_matrix(
+                        describe,
+                        [photo.path for photo in photos],
+                        memory_bytes=memory_bytes,
+                        on_progress=_accumulate_progress(stage, len(photos), on_progress),
+                    )
                 )
             )
-        database, queries = found
+        database, queries = matrices
         yield database, queries
 
 
-def _count_progress(stage: str, total: int, on_progress: ProgressCallback) -> Callable[[int], None]:
+def _accumulate_progress(
+    stage: str, total: int, on_progress: ProgressCallback
+) -> Callable[[int], None]:
     done = 0
 
-    def more(count: int) -> None:
+    def advance(count: int) -> None:
         nonlocal done
         done += count
         on_progress(stage, done, total)
 
-    return more
+    return advance
 
 
 def compute_recalls(
     ranked: Indices, positives: Sequence[Indices], ks: Sequence[int] = DEFAULT_KS
 ) -> Recalls:
-    """(queries, k) rankings and each query's positives -> both recalls."""
-    findable = [place for place, found in enumerate(positives) if len(found)]
+    """Compute both kinds of recall.
+
+    Args:
+        ranked: (queries, depth) database indices, best first.
+        positives: database indices of each query's positives.
+        ks: the values of k.
+    """
+    findable = [query for query, rows in enumerate(positives) if len(rows)]
     return Recalls(
         recall_all=recall_at_k(ranked, positives, ks),
-        recall_findable=recall_at_k(ranked[findable], [positives[p] for p in findable], ks),
+        recall_findable=recall_at_k(ranked[findable], [positives[q] for q in findable], ks),
         queries=len(positives),
         without_positive=len(positives) - len(findable),
     )
 
 
-def _shares_by_k(shares: dict[int, float]) -> dict[str, float | None]:
-    """JSON has no NaN."""
-    return {str(k): None if math.isnan(share) else share for k, share in shares.items()}
+def _recalls_as_json(recalls: dict[int, float]) -> dict[str, float | None]:
+    # JSON has no NaN.
+    return {str(k): None if math.isnan(recall) else recall for k, recall in recalls.items()}

@@ -1,10 +1,8 @@
-"""One answered evaluation set, with all that its files and its report say.
+"""Results of an evaluation run: predictions, comparison with another run, and output files.
 
-Two runs on the same queries: who won which, and whether that is more than chance.
-
-Predictions as the predecessor wrote them: (queries, k) database indices, the best first.
-
-The files of a run: predictions, their table, figures, pairs.
+Predictions are an `.npy` file with (queries, k) database indices, best first, the format of the
+predecessor's evaluation scripts (docs/how-to/evaluate.md). The output files of a run are the
+predictions (`.npy` and `.csv`), `metrics.json`, and the pairs for hloc.
 """
 
 from __future__ import annotations
@@ -29,88 +27,104 @@ from shared.evaluation.bootstrap import PairedDifference, paired_differences
 from shared.evaluation.exact_knn import Indices, Rankings, Scores
 from shared.evaluation.retrieval_metrics import RetrievalMetrics, compute_hits, hits_at_k
 
-MAX_ENTRIES_SHOWN = 5  # wrong entries that an error names
+MAX_ENTRIES_SHOWN = 5  # invalid entries listed in an error message
 
 
 def read_predictions(path: Path) -> Indices:
-    """(queries, k) int64 from an `.npy` file.
+    """Read predictions from an `.npy` file.
 
-    Raises InvalidRequest: `predictions_unreadable`, `predictions_empty`, `bad_predictions` (no
-    two-dimensional array of whole numbers, or a number below 0).
+    Returns:
+        (queries, k) int64 database indices, best first.
+
+    Raises:
+        InvalidRequest: `predictions_unreadable`, `predictions_empty`, or `bad_predictions` (not a
+            two-dimensional integer array, or a negative index).
     """
     try:
-        found = np.load(path, allow_pickle=False)
+        stored = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InvalidRequest(
-            "predictions_unreadable", f"{path} can't be read as predictions in .npy: {error}."
+            "predictions_unreadable", f"Can't read {path} as predictions in .npy format: {error}."
         ) from error
-    if not isinstance(found, np.ndarray) or found.ndim != 2 or found.dtype.kind not in "iu":
-        what = f"{found.dtype} {found.shape}" if isinstance(found, np.ndarray) else "an archive"
+    if not isinstance(stored, np.ndarray) or stored.ndim != 2 or stored.dtype.kind not in "iu":
+        what = f"{stored.dtype} {stored.shape}" if isinstance(stored, np.ndarray) else "an archive"
         raise InvalidRequest(
             "bad_predictions",
-            f"{path} holds {what}; predictions are whole numbers (queries, k): of each query, the "
-            "indices of the database photos found, the best first.",
+            f"{path} holds {what}. Predictions must be an integer array (queries, k): for each "
+            "query, the indices of the database photos, best first.",
         )
-    if 0 in found.shape:
+    if 0 in stored.shape:
         raise InvalidRequest(
             "predictions_empty",
-            f"{path} has the shape {found.shape}: it says nothing about any query. The run that "
-            "wrote it had failed; make it again.",
+            f"{path} is empty: its shape is {stored.shape}. The run that wrote it failed; repeat "
+            "it.",
         )
-    ranked = found.astype(np.int64)
+    ranked = stored.astype(np.int64)
     if ranked.min() < 0:
-        raise _out_of_range(path, ranked, ranked < 0, "indices are counted from 0")
+        raise _out_of_range(path, ranked, ranked < 0, "indices begin at 0")
     return ranked
 
 
 def check_predictions(
     path: Path, ranked: Indices, positives: Sequence[Indices], database_size: int | None
 ) -> None:
-    """Whether they can be about these queries, and about a database of that many photos; None
-    where nobody has said how many.
+    """Check that predictions match the queries and the database.
 
-    Raises InvalidRequest: `predictions_of_other_queries`, `bad_predictions`.
+    Args:
+        path: the file, for error messages.
+        ranked: (queries, k) database indices.
+        positives: the ground truth, one entry per query.
+        database_size: number of database photos; None if unknown.
+
+    Raises:
+        InvalidRequest: `predictions_of_other_queries`, `bad_predictions`.
     """
     if len(ranked) != len(positives):
         raise InvalidRequest(
             "predictions_of_other_queries",
-            f"{path} holds predictions for {len(ranked)} queries, the ground truth is of "
-            f"{len(positives)}. Both have to be of the same list, in the same order.",
+            f"{path} has predictions for {len(ranked)} queries, the ground truth has "
+            f"{len(positives)} queries. Both must list the same queries in the same order.",
         )
     if database_size is not None and ranked.max() >= database_size:
         raise _out_of_range(
             path,
             ranked,
             ranked >= database_size,
-            f"the database has {database_size} photos, 0 the first",
+            f"the database has {database_size} photos, and indices begin at 0",
         )
 
 
 def _out_of_range(
-    path: Path, ranked: Indices, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], why: str
+    path: Path, ranked: Indices, invalid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], why: str
 ) -> InvalidRequest:
-    where = np.argwhere(wrong)
-    named = ", ".join(f"{ranked[q, k]} of query {q}" for q, k in where[:MAX_ENTRIES_SHOWN].tolist())
-    more = f" and {len(where) - MAX_ENTRIES_SHOWN} more" if len(where) > MAX_ENTRIES_SHOWN else ""
-    return InvalidRequest("bad_predictions", f"{path} is out of range: {named}{more}; {why}.")
+    positions = np.argwhere(invalid)
+    shown = ", ".join(
+        f"{ranked[q, k]} of query {q}" for q, k in positions[:MAX_ENTRIES_SHOWN].tolist()
+    )
+    hidden = len(positions) - MAX_ENTRIES_SHOWN
+    more = f" and {hidden} more" if hidden > 0 else ""
+    return InvalidRequest(
+        "bad_predictions", f"{path} has indices out of range: {shown}{more}; {why}."
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class RunComparison:
-    """This run against another one, on one evaluation set."""
+    """Paired comparison of this run with another one on one evaluation set."""
 
     other: str
-    """what the other run calls itself"""
+    """name of the other run"""
     differences: dict[int, PairedDifference]
-    """by k: this run's recall less the other's"""
+    """k -> recall of this run minus recall of the other"""
     won: list[int]
-    """queries that are right at rank 1 here and wrong there"""
+    """queries that are correct at rank 1 in this run only"""
     lost: list[int]
+    """queries that are correct at rank 1 in the other run only"""
 
     def as_json(self) -> dict[str, Any]:
         return {
             "other": self.other,
-            "difference": {str(k): found.as_json() for k, found in self.differences.items()},
+            "difference": {str(k): each.as_json() for k, each in self.differences.items()},
             "won": self.won,
             "lost": self.lost,
         }
@@ -123,40 +137,50 @@ def compare_with_run(
     measured: RetrievalMetrics,
     positives: Sequence[Indices],
 ) -> RunComparison:
-    """This run's figures against those of an earlier `--out` folder.
+    """Compare this run with an earlier `--out` folder, query by query.
 
-    Raises NotFound (`no_run`), InvalidRequest (`bad_run`), Conflict (`runs_not_comparable`): the
-    other run asked another set, other queries, or under other rules.
+    Args:
+        folder: the earlier run's output folder.
+        set_name: the evaluation set.
+        fingerprint: the set's fingerprint in this run.
+        measured: this run's metrics.
+        positives: database indices of each query's positives.
+
+    Raises:
+        NotFound: `no_run`.
+        InvalidRequest: `bad_run`.
+        Conflict: `runs_not_comparable`, if the set, its queries or the protocol differ.
     """
-    about = _load_metrics(folder)
-    theirs = about.get("sets", {}).get(set_name)
-    if theirs is None:
+    stored = _load_metrics(folder)
+    other_set = stored.get("sets", {}).get(set_name)
+    if other_set is None:
         raise NotFound(
-            "no_run", f"{folder} has no result of {set_name}; it has {', '.join(about['sets'])}."
+            "no_run",
+            f"{folder} has no result for {set_name}. It has {', '.join(stored['sets'])}.",
         )
-    if theirs.get("fingerprint") != fingerprint:
+    if other_set.get("fingerprint") != fingerprint:
         raise Conflict(
             "runs_not_comparable",
-            f"{set_name} in {folder} has the fingerprint {str(theirs.get('fingerprint'))[:12]}, "
-            f"here it is {fingerprint[:12]}: other photos, positives or another protocol. Evaluate "
-            "both on the same set.",
+            f"{set_name} in {folder} has the fingerprint {str(other_set.get('fingerprint'))[:12]}, "
+            f"in this run it is {fingerprint[:12]}: the photos, the positives or the protocol "
+            "differ. Evaluate both runs on the same set.",
         )
     ranked = read_predictions(folder / f"predictions_{set_name}.npy")
     if len(ranked) != len(positives):
         raise InvalidRequest(
-            "bad_run", f"{folder} holds predictions for {len(ranked)} of {len(positives)} queries."
+            "bad_run", f"{folder} has predictions for {len(ranked)} of {len(positives)} queries."
         )
     ks = [k for k in measured.recalls.recall_all if k <= ranked.shape[1]]
     hits = compute_hits(ranked, positives)
-    found = paired_differences(
-        measured.within[:, : len(ks)], hits_at_k(hits, ks), measured.clusters.of
+    differences = paired_differences(
+        measured.within[:, : len(ks)], hits_at_k(hits, ks), measured.clusters.labels
     )
-    gained = measured.hits[:, 0].astype(int) - hits[:, 0].astype(int)
+    change = measured.hits[:, 0].astype(int) - hits[:, 0].astype(int)
     return RunComparison(
-        other=str(about.get("run", {}).get("name") or folder.name),
-        differences=dict(zip(ks, found, strict=True)),
-        won=np.flatnonzero(gained > 0).tolist(),
-        lost=np.flatnonzero(gained < 0).tolist(),
+        other=str(stored.get("run", {}).get("name") or folder.name),
+        differences=dict(zip(ks, differences, strict=True)),
+        won=np.flatnonzero(change > 0).tolist(),
+        lost=np.flatnonzero(change < 0).tolist(),
     )
 
 
@@ -164,72 +188,80 @@ def _load_metrics(folder: Path) -> dict[str, Any]:
     file = folder / "metrics.json"
     if not file.is_file():
         raise NotFound(
-            "no_run", f"{folder} is no folder of `placewise evaluate --out`: no {file.name} there."
+            "no_run",
+            f"{folder} is not an output folder of `placewise evaluate --out`: it has no "
+            f"{file.name}.",
         )
     try:
-        about = json.loads(file.read_text())
+        metrics = json.loads(file.read_text())
     except ValueError as error:
-        raise InvalidRequest("bad_run", f"{file} is no JSON: {error}.") from error
-    if not isinstance(about, dict) or not isinstance(about.get("sets"), dict):
+        raise InvalidRequest("bad_run", f"{file} is not valid JSON: {error}.") from error
+    if not isinstance(metrics, dict) or not isinstance(metrics.get("sets"), dict):
         raise InvalidRequest("bad_run", f"{file} was not written by `placewise evaluate`.")
-    return about
+    return metrics
 
 
 @dataclass(frozen=True)
 class EvaluationRun:
-    """What answered, the same for all sets of a run."""
+    """Metadata of a run, common to all of its evaluation sets."""
 
     name: str
-    """a checkpoint's file, an extractor, a server's map, a predictions file"""
+    """checkpoint file, extractor, map of a server, or predictions file"""
     fingerprint: str | None
-    """of what decides a descriptor's value; None where nothing says it"""
+    """identifies everything that determines a descriptor's value; None if unknown"""
     about: dict[str, Any] = field(default_factory=dict)
+    """more facts for the report and `metrics.json`"""
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    asked: EvaluationSet
-    """Of a predictions file without lists, the database is empty."""
+    """Rankings and metrics of one evaluation set."""
+
+    evaluation_set: EvaluationSet
+    """the database is empty for a predictions file without photo lists"""
     ranked: Rankings
     has_scores: bool
+    """false for a predictions file, whose `ranked.scores` are meaningless"""
     measured: RetrievalMetrics
     about: dict[str, Any]
-    """`dimension`, `describe_ms_per_photo`, ... as far as they are known"""
+    """`dimension`, `describe_ms_per_photo`, ... as far as known"""
     against: RunComparison | None = None
+    """comparison with an earlier run"""
     published: tuple[PublishedResult, ...] = ()
+    """published results on the same set and protocol"""
     suspects: tuple[SuspectLabel, ...] = ()
-    """confident first matches that the rule calls wrong and that lie just outside of it"""
+    """confident first matches that count as wrong but are just outside the positive criterion"""
 
     @property
     def file_name(self) -> str:
-        """The set's name as a part of file names."""
-        return re.sub(r"[^A-Za-z0-9._-]+", "_", self.asked.name)
+        """The set's name, safe for file names."""
+        return re.sub(r"[^A-Za-z0-9._-]+", "_", self.evaluation_set.name)
 
     @property
     def scores(self) -> Scores | None:
         return self.ranked.scores if self.has_scores else None
 
     def match(self, query: int, rank: int) -> DatasetPhoto | None:
-        """The database photo at that rank, from 0; None where no list names it."""
-        if not self.asked.database:
+        """Return the database photo at a rank, from 0; None if the database is not listed."""
+        if not self.evaluation_set.database:
             return None
-        return self.asked.database[int(self.ranked.indices[query, rank])]
+        return self.evaluation_set.database[int(self.ranked.indices[query, rank])]
 
     def match_name(self, query: int, rank: int) -> str:
-        """Its name, or else its number."""
-        shot = self.match(query, rank)
-        return shot.name if shot else str(self.ranked.indices[query, rank])
+        """Return the name of the database photo at a rank, or its index if it is not listed."""
+        photo = self.match(query, rank)
+        return photo.name if photo else str(self.ranked.indices[query, rank])
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "fingerprint": self.asked.fingerprint,
-            "protocol": self.asked.protocol,
-            "rule": self.asked.rule,
-            "database": len(self.asked.database) or None,
+            "fingerprint": self.evaluation_set.fingerprint,
+            "protocol": self.evaluation_set.protocol,
+            "rule": self.evaluation_set.rule,
+            "database": len(self.evaluation_set.database) or None,
             **self.about,
             **self.measured.as_json(),
             "against": self.against.as_json() if self.against else None,
-            "published": [found.as_json() for found in self.published],
+            "published": [each.as_json() for each in self.published],
             "suspects": [asdict(suspect) for suspect in self.suspects],
         }
 
@@ -238,17 +270,19 @@ REPORTED_PACKAGES = ("numpy", "pillow", "torch", "torchvision", "timm", "faiss-c
 
 
 def build_metrics(run: EvaluationRun, results: Sequence[EvaluationResult]) -> dict[str, Any]:
-    """Everything that was measured, and with what."""
+    """Build the content of `metrics.json`: run, package versions, metrics by set."""
     return {
         "run": {"name": run.name, "fingerprint": run.fingerprint, **run.about},
         "versions": package_versions(),
-        "sets": {result.asked.name: result.as_json() for result in results},
+        "sets": {result.evaluation_set.name: result.as_json() for result in results},
     }
 
 
 def write_run_files(out: Path, run: EvaluationRun, results: Sequence[EvaluationResult]) -> None:
-    """`predictions_SET.npy` and `.csv` of each set, and last `metrics.json`: where that is, all
-    of them are."""
+    """Write `predictions_SET.npy` and `.csv` of each set, then `metrics.json`.
+
+    `metrics.json` is written last and atomically: if it exists, all files are complete.
+    """
     out.mkdir(parents=True, exist_ok=True)
     for result in results:
         np.save(out / f"predictions_{result.file_name}.npy", result.ranked.indices)
@@ -260,27 +294,30 @@ def write_run_files(out: Path, run: EvaluationRun, results: Sequence[EvaluationR
 
 
 def write_pairs(file: Path, results: Sequence[EvaluationResult]) -> int:
-    """The pairs that a localisation goes on with (hloc): `query database` by name, a line each, in
-    the order of the ranking; returns how many."""
+    """Write the retrieved pairs in hloc's format: a line `query database` per pair, by rank.
+
+    Returns:
+        The number of pairs.
+    """
     count = 0
     with file.open("w", encoding="utf-8") as lines:
         for result in results:
-            for query, shot in enumerate(result.asked.queries):
+            for query, photo in enumerate(result.evaluation_set.queries):
                 for rank in range(result.measured.depth):
-                    lines.write(f"{shot.name} {result.match_name(query, rank)}\n")
+                    lines.write(f"{photo.name} {result.match_name(query, rank)}\n")
                     count += 1
     return count
 
 
 def package_versions() -> dict[str, str]:
-    """Of what a figure may depend on, as far as it is installed."""
-    found = {"python": platform.python_version(), "placewise": version("placewise")}
+    """Return the versions of the installed packages that can influence metrics."""
+    versions = {"python": platform.python_version(), "placewise": version("placewise")}
     for package in REPORTED_PACKAGES:
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def _write_predictions_csv(file: Path, result: EvaluationResult) -> None:
@@ -288,16 +325,16 @@ def _write_predictions_csv(file: Path, result: EvaluationResult) -> None:
     with file.open("w", encoding="utf-8", newline="") as opened:
         table = csv.writer(opened, lineterminator="\n")
         table.writerow(["query", "rank", "match", "score", "metres", "correct"])
-        for query, shot in enumerate(result.asked.queries):
+        for query, photo in enumerate(result.evaluation_set.queries):
             for rank in range(result.measured.depth):
-                away = None if metres is None else float(metres[query, rank])
+                distance = None if metres is None else float(metres[query, rank])
                 table.writerow(
                     [
-                        shot.name,
+                        photo.name,
                         rank + 1,
                         result.match_name(query, rank),
                         "" if scores is None else f"{scores[query, rank]:.6f}",
-                        "" if away is None or np.isnan(away) else f"{away:.2f}",
+                        "" if distance is None or np.isnan(distance) else f"{distance:.2f}",
                         "true" if result.measured.hits[query, rank] else "false",
                     ]
                 )

@@ -1,16 +1,7 @@
-"""Every figure of one answered evaluation set.
+"""Retrieval metrics of one evaluation set: recall@k, mAP@k, precision-recall, distance error.
 
-Which of the ranked database photos are right.
-
-Mean average precision of rankings that end at k.
-
-Precision and recall of the first match, by the score above which it is believed.
-
-How far each ranked photo was taken from its query.
-
-How far from the query its first match was taken.
-
-What the score of the first match says about its being right.
+Also measures how well the score of the first match predicts whether it is correct: AUROC, recall
+at 99 % precision, and expected calibration error (ECE). Means have cluster-bootstrap intervals.
 """
 
 from __future__ import annotations
@@ -46,31 +37,37 @@ Hits = NDArray[np.bool_]
 
 
 def compute_hits(ranked: Indices, positives: Sequence[Indices]) -> Hits:
-    """(queries, k) database indices, each query's positives -> (queries, k), True where right."""
-    rows = [np.isin(row, found) for row, found in zip(ranked, positives, strict=True)]
-    return np.array(rows, bool).reshape(ranked.shape)
+    """Return a (queries, k) bool array: whether each ranked database index is a positive."""
+    hits = [np.isin(row, rows) for row, rows in zip(ranked, positives, strict=True)]
+    return np.array(hits, bool).reshape(ranked.shape)
 
 
 def hits_at_k(hits: Hits, ks: Sequence[int]) -> NDArray[np.float64]:
-    """(queries, k) -> (queries, len(ks)): 1.0 where one of the first k is right, else 0.0."""
+    """Return (queries, len(ks)) float64: 1.0 if one of the first k is a positive, else 0.0."""
     columns = [hits[:, :k].any(axis=1) for k in ks]
     return np.stack(columns, axis=1).astype(np.float64)
 
 
 def average_precisions(hits: Hits, positive_counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(queries, k) hits, (queries,) how many positives each has -> (queries,) AP@k.
+    """Compute the average precision at k of each query.
 
-    AP@k is the sum, over the right ones among the first k, of the precision at their rank, divided
-    by min(positives, k): 1 where nothing wrong stands before what could be found (Manning et al.,
-    Introduction to Information Retrieval, 8.4, cut at k). NaN for a query without positives: leave
-    those out of the mean.
+    AP@k is the sum of the precisions at the ranks of the positives among the first k, divided by
+    min(positives, k). It is 1 if no wrong photo is ranked above a positive (Manning et al.,
+    Introduction to Information Retrieval, 8.4, truncated at k).
+
+    Args:
+        hits: (queries, k) bool.
+        positive_counts: (queries,) number of positives of each query.
+
+    Returns:
+        (queries,) float64; NaN for a query without positives, to be excluded from the mean.
     """
     ranks = np.arange(1, hits.shape[1] + 1)
     precision = np.cumsum(hits, axis=1) / ranks
     sums = (precision * hits).sum(axis=1)
     findable = np.minimum(positive_counts, hits.shape[1]).astype(np.float64)
-    unknown = np.full(len(sums), np.nan)
-    precisions: NDArray[np.float64] = np.divide(sums, findable, out=unknown, where=findable > 0)
+    result = np.full(len(sums), np.nan)
+    precisions: NDArray[np.float64] = np.divide(sums, findable, out=result, where=findable > 0)
     return precisions
 
 
@@ -79,34 +76,43 @@ Curve = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PrecisionRecall:
-    """A point for each distinct score, the highest first."""
+    """Precision-recall curve of the first match, with a point per distinct score, highest first."""
 
     thresholds: Curve
+    """minimum score at which a first match is accepted"""
     precision: Curve
-    """Of the answers with at least that score, the share that is right."""
+    """share of the accepted first matches that are correct"""
     recall: Curve
-    """Of the queries that have a positive, the share that is answered so, and rightly."""
+    """share of the queries with a positive whose first match is accepted and correct"""
     area: float
-    """Under the curve in steps: the sum of (R_i - R_(i-1)) P_i."""
+    """average precision: the sum of (R_i - R_(i-1)) P_i"""
 
 
 def precision_recall(
     scores: NDArray[np.floating], correct: NDArray[np.bool_], queries_with_positive: int
 ) -> PrecisionRecall | None:
-    """(queries,) scores of the first match and whether it is right; None without a findable query.
+    """Compute the precision-recall curve of the first match over score thresholds.
 
-    Queries without a positive are asked, too: what is answered there counts against precision.
+    Queries without a positive are included: accepting their first match lowers precision.
+
+    Args:
+        scores: (queries,) score of the first match.
+        correct: (queries,) whether the first match is a positive.
+        queries_with_positive: number of queries with a positive.
+
+    Returns:
+        The curve; None without a query that has a positive.
     """
     if not queries_with_positive or not len(scores):
         return None
     order = np.argsort(-scores, kind="stable")
-    said, hits = scores[order], np.cumsum(correct[order])
-    # Equal scores are believed together.
-    cut = np.flatnonzero(np.append(said[1:] != said[:-1], True))
-    precision, recall = hits[cut] / (cut + 1), hits[cut] / queries_with_positive
+    ordered, hits = scores[order], np.cumsum(correct[order])
+    # Equal scores are accepted together, so a threshold follows the last of them.
+    cuts = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
+    precision, recall = hits[cuts] / (cuts + 1), hits[cuts] / queries_with_positive
     steps = np.diff(recall, prepend=0.0)
     return PrecisionRecall(
-        said[cut].astype(np.float64), precision, recall, float((steps * precision).sum())
+        ordered[cuts].astype(np.float64), precision, recall, float((steps * precision).sum())
     )
 
 
@@ -116,19 +122,32 @@ Distances = NDArray[np.float64]
 def match_distances(
     queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto], ranked: Indices
 ) -> Distances:
-    """(queries, k) database indices -> (queries, k) metres, NaN where one has no position."""
-    asked = [query for query, row in zip(queries, ranked, strict=True) for _ in row]
-    found = [database[number] for number in ranked.ravel().tolist()]
-    return pairwise_distances_m(asked, found).reshape(ranked.shape)
+    """Compute the distance of each ranked photo from its query.
+
+    Args:
+        queries: the queries.
+        database: the database photos.
+        ranked: (queries, k) database indices.
+
+    Returns:
+        (queries, k) metres; NaN where a photo has no position.
+    """
+    repeated = [query for query, row in zip(queries, ranked, strict=True) for _ in row]
+    matches = [database[index] for index in ranked.ravel().tolist()]
+    return pairwise_distances_m(repeated, matches).reshape(ranked.shape)
 
 
 DISTANCE_THRESHOLDS_M = (1, 2, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 200, 500, 1000)
 
 
 def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
-    """(queries,) metres, NaN where not known -> the shares of known ones that lie within x.
+    """Summarise the distances of first matches: median, and shares within given distances.
 
-    None where none is known.
+    Args:
+        metres: (queries,) distance of the first match; NaN if unknown.
+
+    Returns:
+        `queries`, `without_position`, `median_m` and `within`; None if no distance is known.
     """
     known = metres[np.isfinite(metres)]
     if not len(known):
@@ -148,14 +167,15 @@ TARGET_PRECISION = 0.99
 
 @dataclass(frozen=True, slots=True)
 class ScoreCalibration:
+    """How well the score of the first match predicts that it is correct."""
+
     auroc: float | None
-    """P(a right first match scores higher than a wrong one); None where all are of one kind."""
+    """P(a correct first match scores higher than a wrong one); None without both kinds"""
     recall_at_99_precision: float
-    """Of the queries that have a positive, the share answered rightly above a score at which 99 %
-    of the answers are right."""
+    """recall at the score threshold above which 99 % of first matches are correct"""
     calibration_error: float | None
-    """Of a logistic regression on the score, learnt from other clusters than it is tested on. None
-    where there are too few queries, right ones or wrong ones to learn from."""
+    """ECE of a logistic regression on the score, cross-validated by cluster; None with too few
+    queries, or too few correct or wrong ones, to fit it"""
 
 
 def calibrate_scores(
@@ -164,64 +184,72 @@ def calibrate_scores(
     queries_with_positive: int,
     clusters: QueryClusters,
 ) -> ScoreCalibration:
-    """(queries,) cosines of the first match and whether it is right; `queries_with_positive`
-    queries have a
-    positive."""
-    said, truth = scores.astype(np.float64).tolist(), correct.tolist()
-    confidence = _cross_validated_confidence(said, truth, clusters)
+    """Measure how well the score of the first match predicts that it is correct.
+
+    Args:
+        scores: (queries,) cosine of the first match.
+        correct: (queries,) whether the first match is a positive.
+        queries_with_positive: number of queries with a positive.
+        clusters: clusters of correlated queries; a cluster is never split between folds.
+    """
+    values, target = scores.astype(np.float64).tolist(), correct.tolist()
+    confidence = _cross_validated_confidence(values, target, clusters)
     return ScoreCalibration(
-        auroc=auroc(said, truth),
+        auroc=auroc(values, target),
         recall_at_99_precision=recall_at_precision(
-            said, truth, queries_with_positive, TARGET_PRECISION
+            values, target, queries_with_positive, TARGET_PRECISION
         ),
         calibration_error=None
         if confidence is None
-        else expected_calibration_error(confidence, truth),
+        else expected_calibration_error(confidence, target),
     )
 
 
 def _cross_validated_confidence(
     scores: list[float], correct: list[bool], clusters: QueryClusters
 ) -> list[float] | None:
-    """P(right) of each query, learnt from the queries of other folds; a cluster is of one fold."""
-    fold = np.random.default_rng(0).permutation(int(clusters.of.max(initial=-1)) + 1) % FOLDS
-    folds = fold[clusters.of] if len(scores) else np.empty(0, np.int64)
-    evidence = [PlaceEvidence(score, 0.0) for score in scores]  # the score alone
-    predicted = [0.0] * len(scores)
+    """Predict P(correct) of each query by cross-validation, without splitting clusters."""
+    fold = np.random.default_rng(0).permutation(int(clusters.labels.max(initial=-1)) + 1) % FOLDS
+    folds = fold[clusters.labels] if len(scores) else np.empty(0, np.int64)
+    evidence = [PlaceEvidence(score, 0.0) for score in scores]  # the score is the only feature
+    predictions = [0.0] * len(scores)
     for held_out in range(FOLDS):
-        learnt = fit_confidence(
-            [(e, r) for e, r, f in zip(evidence, correct, folds, strict=True) if f != held_out]
+        model = fit_confidence(
+            [(e, c) for e, c, f in zip(evidence, correct, folds, strict=True) if f != held_out]
         )
-        if learnt is None:
+        if model is None:
             return None
-        for place in np.flatnonzero(folds == held_out):
-            predicted[place] = learnt.probability(evidence[place])
-    return predicted
+        for query in np.flatnonzero(folds == held_out):
+            predictions[query] = model.probability(evidence[query])
+    return predictions
 
 
-MAX_CURVE_POINTS = 400  # of a curve that is written down
+MAX_CURVE_POINTS = 400  # points of a curve in metrics.json
 
 
 @dataclass(frozen=True, slots=True)
 class RetrievalMetrics:
-    """All shares are from 0 to 1."""
+    """Metrics of one evaluation set. Shares are from 0 to 1."""
 
     recalls: Recalls
     hits: Hits
-    """(queries, depth)"""
+    """(queries, depth) whether each ranked photo is a positive"""
     within: NDArray[np.float64]
-    """(queries, ks) whether one of the first k is right: what runs are compared by"""
+    """(queries, ks) whether one of the first k is a positive; runs are compared by it"""
     recall_intervals: list[ConfidenceInterval] | None
-    """in the order of the ks"""
+    """intervals of `recalls.recall_all`, in the order of the ks; None with too few clusters"""
     findable_intervals: list[ConfidenceInterval] | None
+    """intervals of `recalls.recall_findable`"""
     mean_average_precision: float
-    """at the rankings' depth, over the queries that have a positive"""
+    """mAP at the rankings' depth, over the queries that have a positive"""
     map_interval: ConfidenceInterval | None
     clusters: QueryClusters
     curve: PrecisionRecall | None
+    """None without scores"""
     calibration: ScoreCalibration | None
+    """None without scores"""
     metres: Distances | None
-    """(queries, depth)"""
+    """(queries, depth) distance of each ranked photo from its query; None if unknown"""
 
     @property
     def depth(self) -> int:
@@ -229,9 +257,9 @@ class RetrievalMetrics:
 
     @property
     def recall_curve(self) -> list[float]:
-        """Recall at 1, 2, ... to the rankings' depth."""
-        first_right = np.logical_or.accumulate(self.hits, axis=1)
-        return [float(share) for share in first_right.mean(axis=0)]
+        """Recall@1, recall@2, ... up to the rankings' depth."""
+        hit_so_far = np.logical_or.accumulate(self.hits, axis=1)
+        return [float(recall) for recall in hit_so_far.mean(axis=0)]
 
     def as_json(self) -> dict[str, Any]:
         ks = list(self.recalls.recall_all)
@@ -266,28 +294,34 @@ def compute_metrics(
     metres: Distances | None = None,
     ks: Sequence[int] = DEFAULT_KS,
 ) -> RetrievalMetrics:
-    """(queries, depth) rankings -> their figures; `ks` beyond the depth are left out.
+    """Compute all metrics of an evaluation set.
 
-    Without scores (a predictions file has none) there is no precision-recall curve and no
-    calibration; without metres no distance error.
+    Args:
+        ranked: (queries, depth) database indices, best first.
+        positives: database indices of each query's positives.
+        clusters: clusters of correlated queries, for the intervals.
+        scores: (queries, depth) cosines; None (a predictions file) omits the precision-recall
+            curve and the calibration.
+        metres: (queries, depth) distances from the query; None omits the distance error.
+        ks: the values of k; those beyond the depth are ignored.
     """
     depth = ranked.shape[1]
     ks = [k for k in ks if k <= depth]
     hits = compute_hits(ranked, positives)
     within = hits_at_k(hits, ks)
-    counts = np.array([len(found) for found in positives], np.int64)
-    findable = counts > 0
-    precisions = average_precisions(hits, counts)[findable]
-    of_findable = np.column_stack([within[findable], precisions])
-    found = bootstrap_intervals(of_findable, clusters.of[findable])
+    positive_counts = np.array([len(rows) for rows in positives], np.int64)
+    findable = positive_counts > 0
+    precisions = average_precisions(hits, positive_counts)[findable]
+    findable_values = np.column_stack([within[findable], precisions])
+    intervals = bootstrap_intervals(findable_values, clusters.labels[findable])
     return RetrievalMetrics(
         recalls=compute_recalls(ranked, positives, ks),
         hits=hits,
         within=within,
-        recall_intervals=bootstrap_intervals(within, clusters.of),
-        findable_intervals=found[:-1] if found else None,
+        recall_intervals=bootstrap_intervals(within, clusters.labels),
+        findable_intervals=intervals[:-1] if intervals else None,
         mean_average_precision=float(precisions.mean()) if len(precisions) else float("nan"),
-        map_interval=found[-1] if found else None,
+        map_interval=intervals[-1] if intervals else None,
         clusters=clusters,
         curve=(
             None
@@ -304,31 +338,31 @@ def compute_metrics(
 
 
 def _intervals_by_k(
-    ks: Sequence[int], found: list[ConfidenceInterval] | None
+    ks: Sequence[int], intervals: list[ConfidenceInterval] | None
 ) -> dict[str, list[float]] | None:
-    if found is None:
+    if intervals is None:
         return None
-    return {str(k): interval.as_json() for k, interval in zip(ks, found, strict=True)}
+    return {str(k): interval.as_json() for k, interval in zip(ks, intervals, strict=True)}
 
 
 def _curve_json(curve: PrecisionRecall | None) -> dict[str, Any] | None:
     if curve is None:
         return None
     count = len(curve.thresholds)
-    kept = np.unique(np.linspace(0, count - 1, min(count, MAX_CURVE_POINTS)).round().astype(int))
+    shown = np.unique(np.linspace(0, count - 1, min(count, MAX_CURVE_POINTS)).round().astype(int))
     return {
         "area": curve.area,
         "points": [
             {
-                "score": float(curve.thresholds[place]),
-                "precision": float(curve.precision[place]),
-                "recall": float(curve.recall[place]),
+                "score": float(curve.thresholds[index]),
+                "precision": float(curve.precision[index]),
+                "recall": float(curve.recall[index]),
             }
-            for place in kept
+            for index in shown
         ],
     }
 
 
-def _nan_to_none(share: float) -> float | None:
-    """JSON has no NaN."""
-    return None if np.isnan(share) else share
+def _nan_to_none(value: float) -> float | None:
+    # JSON has no NaN.
+    return None if np.isnan(value) else value

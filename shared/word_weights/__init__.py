@@ -1,10 +1,10 @@
-"""Word weights: which words of a vocabulary tell the map's own places apart.
+"""Word weights: weights of a VLAD vocabulary's words, fitted on the map's own places.
 
-VLAD's score is a sum over the words, its clusters: cos(q, d) = sum over k of <q_k, d_k>. Photos of
-the map whose places are known show which of these products are larger for one place than for two;
-a weight for each word makes those count. Weights multiply the query alone, so that stored rows stay
-what they are, and any exact search ranks by them.
+VLAD's score is a sum over the words (cluster centres): cos(q, d) = sum over k of <q_k, d_k>. Photos
+of the map with known places show which of these products are larger for photos of the same place
+than for photos of different places. A weight per word emphasises these words. Only the query is
+multiplied by the weights, so stored descriptors stay valid and any exact search can use them.
 
-`pairs` says which photos teach, `learn` what follows from their rows, `compare` whether it helps,
-`record` what is kept with a generation.
+`training_pairs` samples pairs of photos, `weights` computes weights and tests whether they improve
+recall, `record` is what a generation stores.
 """

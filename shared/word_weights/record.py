@@ -1,4 +1,4 @@
-"""What is kept of a map's word weights, with the generation whose words they weigh."""
+"""Record of a map's word weights, stored with the generation of their vocabulary."""
 
 from __future__ import annotations
 
@@ -12,54 +12,60 @@ from shared.word_weights.training_pairs import PairSource
 
 
 class Outcome(StrEnum):
-    KEPT = "kept"  # searches rank by them
-    NOT_KEPT = "not kept"  # they did not raise recall by more than chance would
-    NOT_ENOUGH_PAIRS = "not enough pairs"  # nothing was learnt
+    """Result of fitting word weights."""
+
+    KEPT = "kept"  # searches use the weights
+    NOT_KEPT = "not kept"  # recall did not improve significantly
+    NOT_ENOUGH_PAIRS = "not enough pairs"  # no weights were fitted
 
 
 class HeldOut(BaseModel):
-    """Photos of the map, each left out and asked with what the half it is not in has taught."""
+    """Two-fold cross-validation: leave-one-out queries with the weights of the other half."""
 
     model_config = ConfigDict(frozen=True)
 
     without: dict[str, Any]
-    """`queries`, `R@1`, `R@5`, `R@10` by the plain cosine."""
+    """`queries`, `R@1`, `R@5`, `R@10` of the unweighted cosine"""
     weighted: dict[str, Any]
-    """The same of the same queries, with the weights of the other half."""
+    """the same metrics of the same queries with weights"""
     better: int
-    """Queries whose first photo is right with weights alone."""
+    """number of queries that are correct at rank 1 only with weights"""
     worse: int
-    """Without them alone."""
+    """number of queries that are correct at rank 1 only without weights"""
     chance: float
-    """Probability of so many better ones where weights are worth nothing."""
+    """p-value of the one-sided sign test"""
 
 
 class WordWeights(BaseModel):
-    """Stored with the generation. `pairs` are those of both halves together."""
+    """Word weights of a generation. Numbers of pairs are those of both halves together."""
 
     model_config = ConfigDict(frozen=True)
 
     outcome: Outcome
     reason: str
-    """Why, in a sentence with the numbers."""
+    """explanation of the outcome, with its numbers"""
     taught_by: PairSource
+    """what same-place pairs were determined by"""
     near_pairs: int
+    """number of same-place pairs"""
     far_pairs: int
+    """number of different-place pairs"""
     seed: int
     searchable: int
-    """Photos that could be found then."""
+    """number of searchable photos at the time of fitting"""
     weights: tuple[float, ...] = ()
-    """One for each word, from 0 up; of any scale. Empty where nothing was learnt."""
+    """one per word, 0 or more, of any scale; empty if none were fitted"""
     held_out: HeldOut | None = None
+    """cross-validation; None if no weights were fitted"""
     calibration: Calibration | None = None
-    """What the scores mean that rankings with these weights have; None unless kept."""
+    """calibration of weighted scores; None unless the outcome is `kept`"""
 
     @property
     def applied(self) -> tuple[float, ...]:
-        """The weights that searches rank by; empty unless kept."""
+        """The weights that searches use; empty unless the outcome is `kept`."""
         return self.weights if self.outcome == Outcome.KEPT else ()
 
 
 def parse_word_weights(record: dict[str, Any] | None) -> WordWeights | None:
-    """What the column `Generation.word_weights` holds."""
+    """Parse the value of the column `Generation.word_weights`."""
     return None if record is None else WordWeights.model_validate(record)

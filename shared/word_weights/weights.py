@@ -1,11 +1,10 @@
-"""From pairs of descriptors to one weight for each word, and from there to a weighted query.
+"""Computes word weights from pairs of descriptors, applies them to queries, and tests their effect.
 
     w_k = max(0, (mean of <a_k, b_k> over near pairs - mean over far pairs) / deviation over far)
 
-The distance of two means in units of the noise between them, as signal detection's d' (Green and
-Swets 1966): a word that is alike wherever one looks (sky, asphalt) gets 0.
-
-Do weights help: the same queries, asked without and with them.
+A weight is the difference of two means in units of the noise, as the sensitivity index d' of signal
+detection theory (Green and Swets 1966). A word that looks alike everywhere (sky, asphalt) gets 0.
+The effect is tested with a sign test on the same queries with and without weights.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-# Deviations below are rounding: products of words that occur in no far pair are all 0.
+# Smaller deviations are rounding errors: a word that is in no far pair has only zero products.
 MIN_DEVIATION = 1e-9
 
 Rows = NDArray[np.float32]
@@ -26,32 +25,42 @@ Float64Array = NDArray[np.float64]
 
 
 def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Float64Array:
-    """(n, words) products <a_k, b_k> of the (n, 2) pairs of (m, words * width) rows.
+    """Compute the inner products of the words of pairs of descriptors.
 
-    Those of a pair add up to its cosine. Takes no more memory than two rows beside the result.
+    The products of a pair add up to its cosine. Needs no more memory than two rows in addition to
+    the result.
+
+    Args:
+        rows: (m, words * width) float32 L2-normalised descriptors.
+        pairs: (n, 2) indices into `rows`.
+        words: number of words.
+
+    Returns:
+        (n, words) float64.
     """
     if not len(pairs):
         return np.empty((0, words))
     blocks = rows.reshape(len(rows), words, -1)
-    found = np.empty((len(pairs), words))
-    for number, (one, other) in enumerate(pairs.tolist()):
-        np.einsum("kw,kw->k", blocks[one], blocks[other], out=found[number], dtype=np.float64)
-    return found
+    products = np.empty((len(pairs), words))
+    for index, (a, b) in enumerate(pairs.tolist()):
+        np.einsum("kw,kw->k", blocks[a], blocks[b], out=products[index], dtype=np.float64)
+    return products
 
 
 @dataclass(frozen=True, slots=True)
 class ProductMoments:
-    """Sums over the products of so many pairs, word by word; those of two sets of pairs add up."""
+    """Sums of word products over pairs; the sums of two sets of pairs can be added."""
 
     pairs: int
+    """number of pairs"""
     total: Float64Array
-    """(words,)"""
+    """(words,) sums"""
     squares: Float64Array
-    """(words,) sums of squares."""
+    """(words,) sums of squares"""
 
     @classmethod
     def from_products(cls, products: Float64Array) -> ProductMoments:
-        """(n, words) products."""
+        """Sum (n, words) products."""
         return cls(len(products), products.sum(axis=0), (products**2).sum(axis=0))
 
     def __add__(self, other: ProductMoments) -> ProductMoments:
@@ -61,19 +70,20 @@ class ProductMoments:
 
     @property
     def mean(self) -> Float64Array:
-        found: Float64Array = self.total / self.pairs
-        return found
+        """(words,) means over the pairs."""
+        mean: Float64Array = self.total / self.pairs
+        return mean
 
     @property
     def deviation(self) -> Float64Array:
-        """Standard deviation over the pairs."""
-        found: Float64Array = np.sqrt(np.maximum(0.0, self.squares / self.pairs - self.mean**2))
-        return found
+        """(words,) standard deviations over the pairs."""
+        deviation: Float64Array = np.sqrt(np.maximum(0.0, self.squares / self.pairs - self.mean**2))
+        return deviation
 
 
 @dataclass(frozen=True, slots=True)
 class PairStatistics:
-    """What pairs of one place (`near`) and of two places (`far`) come to."""
+    """Moments of same-place (`near`) and different-place (`far`) pairs."""
 
     near: ProductMoments
     far: ProductMoments
@@ -82,7 +92,7 @@ class PairStatistics:
     def from_rows(
         cls, rows: Rows, near: NDArray[np.int64], far: NDArray[np.int64], words: int
     ) -> PairStatistics:
-        """Pairs of both kinds, (n, 2) and (m, 2), of (r, words * width) rows."""
+        """Compute the moments of (n, 2) near and (m, 2) far pairs of (r, words * width) rows."""
         return cls(
             ProductMoments.from_products(word_products(rows, near, words)),
             ProductMoments.from_products(word_products(rows, far, words)),
@@ -92,24 +102,43 @@ class PairStatistics:
         return PairStatistics(self.near + other.near, self.far + other.far)
 
     def weights(self) -> Float64Array:
-        """(words,) weights from 0 up. ValueError without pairs of both kinds."""
+        """Compute the weights, (words,) float64, 0 or more.
+
+        Raises:
+            ValueError: there are no near pairs or no far pairs.
+        """
         if not (self.near.pairs and self.far.pairs):
-            raise ValueError(f"{self.near.pairs} near and {self.far.pairs} far pairs teach nothing")
+            raise ValueError(
+                f"Word weights need near and far pairs; there are {self.near.pairs} near and "
+                f"{self.far.pairs} far pairs."
+            )
         noise = self.far.deviation
-        told = noise > MIN_DEVIATION
+        is_informative = noise > MIN_DEVIATION
         gap = self.near.mean - self.far.mean
-        return np.where(told, np.maximum(0.0, gap / np.where(told, noise, 1.0)), 0.0)
+        return np.where(
+            is_informative, np.maximum(0.0, gap / np.where(is_informative, noise, 1.0)), 0.0
+        )
 
 
 def empty_pair_statistics(words: int) -> PairStatistics:
-    """What no pairs come to: the sum's beginning."""
-    none = ProductMoments(0, np.zeros(words), np.zeros(words))
-    return PairStatistics(none, none)
+    """Return the statistics of no pairs, the start value of a sum."""
+    zero = ProductMoments(0, np.zeros(words), np.zeros(words))
+    return PairStatistics(zero, zero)
 
 
 def apply_word_weights(query: NDArray[np.float32], weights: Sequence[float]) -> Float64Array | None:
-    """(words * width,) query with its words multiplied, and normalised again; None where no word
-    of the query has any weight. ValueError when the query's length is no multiple of the words."""
+    """Multiply the words of a query by their weights and L2-normalise it.
+
+    Args:
+        query: (words * width,) descriptor.
+        weights: one weight per word.
+
+    Returns:
+        (words * width,) float64; None if all words of the query have weight 0.
+
+    Raises:
+        ValueError: the dimension is not a multiple of the number of weights.
+    """
     if len(query) % len(weights):
         raise ValueError(f"{len(weights)} weights don't fit {len(query)} dimensions")
     blocks = query.astype(np.float64).reshape(len(weights), -1)
@@ -122,16 +151,20 @@ SIGNIFICANCE_LEVEL = 0.05
 
 
 def sign_test_p_value(better: int, worse: int) -> float:
-    """How probable so many improvements or more are where weights change nothing for the better.
+    """Compute the p-value of the exact one-sided sign test (McNemar 1947).
 
-    `better` queries were right with weights alone, `worse` without them alone. Of those that differ
-    each is then a coin's throw: the exact one-sided sign test (McNemar 1947).
+    Under the null hypothesis that weights do not improve recall, each query whose result differs
+    is equally likely to be better or worse.
+
+    Args:
+        better: number of queries that are correct only with weights.
+        worse: number of queries that are correct only without weights.
     """
-    differ = better + worse
-    as_good: int = sum(math.comb(differ, n) for n in range(better, differ + 1))
-    return float(Fraction(as_good, 2**differ))
+    total = better + worse
+    at_least_as_good: int = sum(math.comb(total, n) for n in range(better, total + 1))
+    return float(Fraction(at_least_as_good, 2**total))
 
 
 def is_significant_improvement(better: int, worse: int) -> bool:
-    """More right than without weights, and by more than chance brings in one of twenty cases."""
+    """Return whether weights improve recall at `SIGNIFICANCE_LEVEL`."""
     return better > worse and sign_test_p_value(better, worse) < SIGNIFICANCE_LEVEL

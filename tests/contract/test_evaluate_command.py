@@ -162,7 +162,7 @@ def test_report_is_one_file_that_fetches_nothing(
     for drawing in drawings:
         ET.fromstring(drawing)
     assert town.fingerprint in text
-    assert "No published figure is shown beside these" in text
+    assert "No published results are shown" in text
 
 
 def test_only_wrong_leaves_right_queries_out_of_the_report(city: Path, tmp_path: Path) -> None:

@@ -44,11 +44,11 @@ class StopAfter(NullDisplay):
         super().__init__()
         self._stop, self._what, self._left = stop, what, times
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         if what.startswith(self._what):
             self._left -= 1
             if self._left == 0:
-                self._stop.asked = True
+                self._stop.is_requested = True
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def test_a_resumed_run_can_not_become_another(
     with pytest.raises(Conflict, match="batch_size"):
         run.resume(copy, {"batch_size": 3}, NullDisplay(), StopRequest())
     more = write_tiny_places(tmp_path / "more", places=7)
-    with pytest.raises(Conflict, match="are not those"):
+    with pytest.raises(Conflict, match="are not those that the run"):
         run.resume(copy, {"data_root": str(more)}, NullDisplay(), StopRequest())
     with pytest.raises(NotFound, match="there is no"):
         run.resume(tmp_path, {}, NullDisplay(), StopRequest())
@@ -173,7 +173,7 @@ def test_frozen_layers_keep_their_weights_and_the_others_learn(
     assert changed
     assert not [name for name in changed if "stem" in name]
     assert any("stem" in name for name in before)
-    assert any("never learn" in line for line in display.said)
+    assert any("never learn" in line for line in display.messages)
 
 
 def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_pat
     report = train(said, display)
     assert list(report["bad_photos"]) == [str(broken)]
     assert report["images"] == 17
-    assert any(broken.name in line for line in display.said)
+    assert any(broken.name in line for line in display.messages)
     with pytest.raises(Unprocessable, match=broken.name[:20]) as caught:
         train({**said, "on_bad_image": "error", "run_name": "strict"})
     assert caught.value.code == "undecodable_photo"

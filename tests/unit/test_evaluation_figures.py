@@ -106,13 +106,13 @@ def test_queries_cluster_by_sequence_then_place_then_square() -> None:
     many = range(MIN_CLUSTERS)
     named = [shot(0.0, sequence=f"drive {n}", place="one") for n in many for _ in range(2)]
     assert cluster_queries(named).kind == "sequences"
-    assert cluster_queries(named).of.tolist() == [n for n in many for _ in range(2)]
+    assert cluster_queries(named).labels.tolist() == [n for n in many for _ in range(2)]
     placed = [shot(0.0, place=f"place {n}") for n in many]
     assert cluster_queries(placed).kind == "places"
     apart = [shot(100.0 * n) for n in many]
     near = [shot(100.0 * n + 49.0) for n in many]
     assert cluster_queries([*apart, *near]).kind == "squares of 50 m"
-    assert cluster_queries([*apart, *near]).of.tolist() == [*many, *many]
+    assert cluster_queries([*apart, *near]).labels.tolist() == [*many, *many]
     lost = [shot(None) for _ in many]
     assert cluster_queries(lost).kind == "queries"
 

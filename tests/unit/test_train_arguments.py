@@ -218,7 +218,7 @@ def test_an_unknown_key_of_a_file_names_the_nearest_and_the_file(tmp_path: Path)
 def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "run.yaml"
     file.write_text("- lr\n")
-    with pytest.raises(InvalidRequest, match="names with values"):
+    with pytest.raises(InvalidRequest, match="mapping of names to values"):
         load_yaml(file)
     with pytest.raises(NotFound, match="Can't read"):
         load_yaml(tmp_path / "none.yaml")

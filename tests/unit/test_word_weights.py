@@ -119,7 +119,7 @@ def all_pairs(chosen: PairSplit, half: int, kind: str) -> list[tuple[int, int]]:
 
 def test_near_pairs_are_5_to_25_m_apart_far_ones_over_50_and_each_lies_in_one_half() -> None:
     spots = [*street(60), *(north(12_000 + 2 * n) for n in range(30))]  # a burst of 2 m steps
-    chosen = sample_pairs(spots, seed=0, rows_at_once=10_000)
+    chosen = sample_pairs(spots, seed=0, batch_photos=10_000)
     assert chosen.by == PairSource.COORDINATES
     assert chosen.is_enough
     for half in (0, 1):
@@ -135,7 +135,7 @@ def test_near_pairs_are_5_to_25_m_apart_far_ones_over_50_and_each_lies_in_one_ha
 
 def test_photos_of_one_place_are_in_one_half_and_the_halves_are_alike_in_size() -> None:
     spots = street(61)
-    halves = sample_pairs(spots, seed=5, rows_at_once=100).halves
+    halves = sample_pairs(spots, seed=5, batch_photos=100).halves
     for place in range(61):
         assert len(set(halves[4 * place : 4 * place + 4])) == 1
     assert abs(2 * sum(halves) - len(halves)) <= 4
@@ -143,16 +143,16 @@ def test_photos_of_one_place_are_in_one_half_and_the_halves_are_alike_in_size() 
 
 def test_pairs_are_bounded_however_many_photos_there_are() -> None:
     spots = street(1500)
-    chosen = sample_pairs(spots, seed=0, rows_at_once=10_000)
+    chosen = sample_pairs(spots, seed=0, batch_photos=10_000)
     assert chosen.counts() == [(MAX_PAIRS, MAX_PAIRS)] * 2
 
 
 def test_lessons_are_no_larger_than_memory_allows() -> None:
-    chosen = sample_pairs(street(60), seed=0, rows_at_once=16)
+    chosen = sample_pairs(street(60), seed=0, batch_photos=16)
     lessons = [*chosen.batches[0], *chosen.batches[1]]
     assert all(len(set(lesson.photos)) == len(lesson.photos) <= 16 for lesson in lessons)
     assert all(len(lesson.far) <= len(lesson.near) for lesson in lessons)
-    assert chosen.counts() != sample_pairs(street(60), seed=0, rows_at_once=2).counts()
+    assert chosen.counts() != sample_pairs(street(60), seed=0, batch_photos=2).counts()
 
 
 def test_same_seed_gives_the_same_pairs_and_another_seed_others() -> None:
@@ -165,7 +165,7 @@ def test_same_seed_gives_the_same_pairs_and_another_seed_others() -> None:
 def test_rooms_teach_by_their_labels() -> None:
     """Also those that bear the coordinates of their building, all the same."""
     spots = [PhotoLocation(45.0, 7.0, f"room {n // 6}") for n in range(240)]
-    chosen = sample_pairs(spots, seed=0, rows_at_once=100)
+    chosen = sample_pairs(spots, seed=0, batch_photos=100)
     assert (chosen.by, chosen.is_enough) == (PairSource.PLACES, True)
     for half in (0, 1):
         assert all(spots[a].place == spots[b].place for a, b in all_pairs(chosen, half, "near"))
@@ -183,7 +183,7 @@ def test_rooms_teach_by_their_labels() -> None:
     ],
 )
 def test_too_few_pairs_are_counted_and_not_enough(spots: list[PhotoLocation]) -> None:
-    chosen = sample_pairs(spots, seed=0, rows_at_once=100)
+    chosen = sample_pairs(spots, seed=0, batch_photos=100)
     assert not chosen.is_enough
     assert min(min(counts) for counts in chosen.counts()) < MIN_PAIRS
 

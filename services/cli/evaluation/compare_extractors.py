@@ -161,7 +161,7 @@ def compare_extractors(
             difference: PairedDifference | None = None
             if first is not None:
                 (difference,) = paired_differences(
-                    measured.within[:, :1], first.within[:, :1], clusters.of
+                    measured.within[:, :1], first.within[:, :1], clusters.labels
                 )
             found.append(
                 (ComparedExtractor(entry.spec_text, measured, difference, **about), measured)

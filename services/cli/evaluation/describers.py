@@ -176,5 +176,5 @@ def _with_cache(
         describe,
         settings.placewise_home / CACHE_FOLDER,
         spec,
-        most_bytes=settings.descriptor_cache_bytes,
+        max_bytes=settings.descriptor_cache_bytes,
     )

@@ -119,7 +119,7 @@ def output_results(
     if options.as_json:
         found = build_metrics(run, results)
         if len(results) == 1:  # a program that asks about one set need not know its name
-            found |= found["sets"][results[0].asked.name]
+            found |= found["sets"][results[0].evaluation_set.name]
         print_json(found)
         return
     for result in results:
@@ -131,10 +131,10 @@ def output_results(
 
 
 def _print_result(result: EvaluationResult) -> None:
-    asked, measured = result.asked, result.measured
+    evaluation_set, measured = result.evaluation_set, result.measured
     recalls = measured.recalls
     table = Table(
-        asked.name,
+        evaluation_set.name,
         Column(f"all {recalls.queries} queries", justify="right"),
         Column(f"{recalls.queries - recalls.without_positive} with a positive", justify="right"),
     )
@@ -148,7 +148,8 @@ def _print_result(result: EvaluationResult) -> None:
     table.add_row(f"mAP@{measured.depth}", "", _format_share(mean, [within] if within else None, 0))
     console.print(table)
     console.print(
-        f"Right: {asked.rule}; protocol {asked.protocol}; fingerprint {asked.fingerprint[:16]}; "
+        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
+        f"fingerprint {evaluation_set.fingerprint[:16]}; "
         + (
             f"95 % intervals over {measured.clusters.count} {measured.clusters.kind}."
             if measured.recall_intervals

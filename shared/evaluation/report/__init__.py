@@ -1,1 +1,1 @@
-"""One HTML file for a run: nothing in it is fetched from anywhere."""
+"""Self-contained HTML reports of evaluation runs, without external resources."""
