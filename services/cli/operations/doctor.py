@@ -103,7 +103,8 @@ def check_memory(settings: Settings) -> str:
     needed = PROCESS_OVERHEAD_BYTES + weights + batch
     estimate = (
         f"{recipe.name} requires about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, "
-        f"a batch of {settings.batch_photos} photos {batch / 1e9:.1f}), {owner} has {available / 1e9:.1f} GB"
+        f"a batch of {settings.batch_photos} photos {batch / 1e9:.1f}), "
+        f"{owner} has {available / 1e9:.1f} GB"
     )
     if needed <= available:
         return estimate
