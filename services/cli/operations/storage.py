@@ -256,8 +256,8 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
 def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     """Count orphaned objects by prefix; with --confirm, move them to the trash.
 
-    Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also overrides a hold on
-    garbage collection. Services can keep running.
+    Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
+    overrides a hold on garbage collection. Services can keep running.
     """
     with report_errors(as_json):
         from services.steward.tasks.garbage_collection import (
