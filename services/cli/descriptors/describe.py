@@ -85,7 +85,7 @@ def describe(
             "--root",
             exists=True,
             file_okay=False,
-            help="With FILE.h5: use paths relative to this folder as names. Default: paths as given.",
+            help="With FILE.h5: name photos by paths relative to this folder. Default: as given.",
         ),
     ] = None,
     as_json: JsonOption = False,
