@@ -171,7 +171,8 @@ def _print_result(result: EvaluationResult) -> None:
         + (
             f"95 % confidence intervals over {measured.clusters.count} {measured.clusters.kind}."
             if measured.recall_intervals
-            else f"{measured.clusters.count} {measured.clusters.kind} are too few for confidence intervals."
+            else f"{measured.clusters.count} {measured.clusters.kind} are too few for confidence "
+            "intervals."
         ),
         soft_wrap=True,
         markup=False,
