@@ -91,12 +91,12 @@ class NetworkBaselines:
         rows: dict[str, list[Rows]] = {name: [] for name in self.names}
         for pixels in self._batches(paths):
             features = self.extractor.features(pixels)
-            described = (
+            batches = (
                 self._untrained_rows(pixels),
                 vlad(features, self._shipped),
                 vlad(features, self._fitted),
             )
-            for name, batch in zip(self.names, described, strict=True):
+            for name, batch in zip(self.names, batches, strict=True):
                 rows[name].append(batch.cpu().numpy())
             advance(len(pixels))
         described = {name: np.concatenate(parts) for name, parts in rows.items()}
