@@ -118,7 +118,7 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
         (unit_rows()[0], [], "bad_rows", "rows"),
         (unit_rows(), ["--extractor", "test-tiny-avg"], "options_contradict", "--extractor"),
         (unit_rows(), ["--map", "town"], "options_contradict", "--map"),
-        (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "no folder"),
+        (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "does not exist"),
         (unit_rows(), ["--out", "a.npz"], "bad_out", ".safetensors"),
     ],
 )
