@@ -230,7 +230,7 @@ def test_folder_that_is_not_there_is_named(photos: list[Path], tmp_path: Path) -
 
 def test_torch_is_imported_only_when_the_command_runs() -> None:
     code = (
-        "from services.cli.main import tree; import sys; tree(['describe']);"
+        "from services.cli.main import build_app; import sys; build_app(['describe']);"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
