@@ -1,4 +1,4 @@
-"""The Python client of Placewise: photo in, place out.
+"""Python client of Placewise, a self-hosted visual place recognition service.
 
     import placewise
 
@@ -11,8 +11,8 @@
         async for photo in places.photos(place="atrium"):
             ...
 
-Answers are the frozen objects of `placewise.answers`. Whatever the server refuses is raised as the
-error that it means, a PlacewiseError with its `status`, `code` and `detail`.
+Responses are frozen objects of `placewise.answers`. Error responses are raised as subclasses of
+PlacewiseError with the attributes `status`, `code` and `detail`.
 """
 
 from placewise.answers import Answer, Job, Photo, Similar
@@ -74,14 +74,21 @@ def connect(
     patience_seconds: float = PATIENCE_SECONDS,
     timeout_seconds: float = TIMEOUT_SECONDS,
 ) -> Client:
-    """A client of the server at `url` and of one of its maps (left out: `default`).
+    """Create a client of a server and one of its maps. No request is sent yet.
 
-    A call that meets a server which is away (503, 507, no connection) is repeated for
-    `patience_seconds`, after waits that double; one that says when to come again is obeyed. Every
-    POST has an Idempotency-Key, so that what is repeated is done once. 0 repeats nothing. A call
-    ends after `timeout_seconds` without a byte. Nothing is asked of the server yet.
+    Calls are retried with exponential backoff while the server is unavailable (503, 507, no
+    connection), and as its Retry-After says while it is busy (429). Every POST carries an
+    Idempotency-Key, so that a retried call takes effect once.
 
-    Raises InvalidRequest (`bad_address`, `bad_key`).
+    Args:
+        url: URL of the server, such as `http://127.0.0.1:8000`.
+        key: API key; a server on a loopback address may not require one.
+        map: Name of the map; None for `default`.
+        patience_seconds: How long calls are retried; 0 disables retries.
+        timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
+
+    Raises:
+        InvalidRequest: `bad_address`, `bad_key`.
     """
     return Client(
         _Raw(url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds)
@@ -96,7 +103,10 @@ def connect_async(
     patience_seconds: float = PATIENCE_SECONDS,
     timeout_seconds: float = TIMEOUT_SECONDS,
 ) -> AsyncClient:
-    """`connect`, for asyncio. Photos are read from disk between two sends, in the loop's thread."""
+    """Create an asynchronous client; the parameters are those of `connect`.
+
+    Files to upload are read in the thread of the event loop.
+    """
     return AsyncClient(
         _AsyncRaw(url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds)
     )

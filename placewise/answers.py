@@ -1,7 +1,7 @@
-"""What a server answers, as frozen objects. Times carry an offset, sizes are bytes.
+"""Responses of the HTTP API as frozen Pydantic models. Times have a UTC offset, sizes are bytes.
 
-Field for field the schemas of the API's description (`/openapi.json`; a test compares them). What a
-newer server says beyond that is kept as an attribute, too.
+The fields match the schemas of the OpenAPI description (`/openapi.json`), which a test verifies.
+Fields that a newer server adds are available as attributes, too.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from shared.client import FINISHED
 
 
 class Answer(BaseModel):
+    """Base class of all responses."""
+
     model_config = ConfigDict(frozen=True, extra="allow")
 
 
 class Photo(Answer):
-    """A stored photo. Degrees are WGS 84; `heading` is clockwise from north."""
+    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from north."""
 
     image_id: UUID
     image_path: str
@@ -42,7 +44,7 @@ class Photo(Answer):
 
 
 class OnePhoto(Photo):
-    """A stored photo, with what becomes of it."""
+    """A stored photo with its processing state."""
 
     job_id: UUID | None
     media_type: str
@@ -51,7 +53,7 @@ class OnePhoto(Photo):
 
 
 class Uploaded(Answer):
-    """A photo that is stored; its job, if any, describes it."""
+    """Response to an upload. The job, if any, describes the photo."""
 
     file_id: UUID
     job_id: UUID | None
@@ -65,18 +67,25 @@ class Uploaded(Answer):
 
 
 class Deleted(Answer):
+    """Response to the deletion of a photo."""
+
     success: bool
     message: str
     deleted_file_id: UUID
 
 
 class ClusterShare(Answer):
+    """Contribution of a vocabulary cluster to a similarity score."""
+
     cluster: int
     share: float
 
 
 class Explanation(Answer):
-    """Where a similarity comes from: shares that add up to it. `overlay` is a data URI."""
+    """Decomposition of a similarity score into shares that add up to it.
+
+    `overlay` is an image as a data URI.
+    """
 
     clusters: list[ClusterShare] | None
     rows: int
@@ -86,7 +95,7 @@ class Explanation(Answer):
 
 
 class SimilarPhoto(Photo):
-    """A photo of an answer; scores are cosines in [-1, 1]."""
+    """A search result; scores are cosine similarities in [-1, 1]."""
 
     similarity_score: float
     weighted_score: float | None = None
@@ -95,7 +104,7 @@ class SimilarPhoto(Photo):
 
 
 class Estimate(Answer):
-    """The place that an answer points to. `in_map` is None where that can't be told."""
+    """Estimated place of a query photo. `in_map` is None if it can't be determined."""
 
     in_map: bool | None = None
     latitude: float | None = None
@@ -108,7 +117,7 @@ class Estimate(Answer):
 
 
 class Similar(Answer):
-    """The most similar photos, best first."""
+    """Search results, best first, with the place estimate."""
 
     query_file_id: UUID | None
     query_filename: str
@@ -130,13 +139,18 @@ class Similar(Answer):
 
 
 class Progress(Answer):
+    """Progress counters of a job."""
+
     done: int
     total: int
     failed: int
 
 
 class Job(Answer):
-    """`state` is queued, running, succeeded, failed or cancelled; `error` an RFC 9457 problem."""
+    """A job.
+
+    `state` is queued, running, succeeded, failed or cancelled; `error` is an RFC 9457 problem.
+    """
 
     job_id: UUID
     kind: str
@@ -158,11 +172,12 @@ class Job(Answer):
 
     @property
     def finished(self) -> bool:
+        """Whether the job has succeeded, failed or been cancelled."""
         return self.state in FINISHED
 
 
 class Started(Answer):
-    """Work that is queued: `wait(started.job_id)`."""
+    """A job that was queued; wait for it with `wait(started)`."""
 
     job_id: UUID
     status: str
@@ -171,11 +186,13 @@ class Started(Answer):
 
 
 class BatchStarted(Started):
+    """A batch upload that was queued."""
+
     items_url: str
 
 
 class BatchItem(Answer):
-    """One photo of a batch, by its number from 1."""
+    """An item of a batch; `number` starts at 1."""
 
     number: int
     name: str
@@ -188,6 +205,8 @@ class BatchItem(Answer):
 
 
 class Vocabulary(Answer):
+    """A VLAD vocabulary of a map."""
+
     vocabulary_id: UUID
     origin: str
     clusters: int
@@ -198,7 +217,7 @@ class Vocabulary(Answer):
 
 
 class Generation(Answer):
-    """One complete set of descriptors; the one whose `state` is `active` answers."""
+    """A complete set of descriptors of a map; searches use the one in the state `active`."""
 
     generation_id: UUID
     state: str
@@ -214,6 +233,8 @@ class Generation(Answer):
 
 
 class Evaluation(Answer):
+    """Retrieval metrics of a generation."""
+
     evaluation_id: UUID
     generation_id: UUID
     automatic: bool
@@ -223,7 +244,7 @@ class Evaluation(Answer):
 
 
 class Search(Answer):
-    """A question that was asked."""
+    """An entry of the search history."""
 
     search_id: UUID
     query_file_id: UUID | None
@@ -238,6 +259,8 @@ class Search(Answer):
 
 
 class Map(Answer):
+    """A map with its counts and its active generation."""
+
     name: str
     extractor: str
     version: int
@@ -253,6 +276,8 @@ class Map(Answer):
 
 
 class Stats(Answer):
+    """Statistics of a map."""
+
     map: str
     map_version: int
     total_images: int

@@ -1,6 +1,6 @@
-"""The client with typed answers.
+"""The client with typed responses.
 
-Made of `async_client.py` by `make client`: change that one, not this.
+Generated from `async_client.py` by `make client`. Edit that file.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from shared.errors import Unavailable, Unprocessable
 
 Id = UUID | str
 Work = Uploaded | Started | Job | UUID | str
-"""A job: what has started it, itself, or its id."""
+"""A job: the response that started it, the job itself, or its ID."""
 
 
 class Client:
-    """One server and one map. `raw` has the same calls with the API's own JSON."""
+    """Client of one server and one map. `raw` provides the same calls with plain JSON."""
 
     def __init__(self, raw: RawClient) -> None:
         self.raw = raw
@@ -56,51 +56,66 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """End the connections."""
+        """Close all connections."""
         self.raw.close()
 
     def upload(self, photo: str | Path, filename: str | None = None, **fields: Any) -> Uploaded:
-        """Store a photo, streamed from its file. `fields` are the form's: `latitude` and
-        `longitude` (degrees), `heading`, `captured_at`, `place`, `tags`, `metadata`, `role`.
+        """Upload a photo, streamed from its file.
 
-        Raises Conflict (`photo_differs`) where the map has these bytes and something else was said
-        of them, UnsupportedMedia, TooLarge, Unprocessable.
+        Args:
+            photo: The file.
+            filename: Name to store; None for the file's own name.
+            fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
+                `place`, `tags`, `metadata`, `role`.
+
+        Raises:
+            Conflict: `photo_differs` if the map contains the same image with other metadata.
+            UnsupportedMedia: The file is not a supported image.
+            TooLarge: The file exceeds the server's limit.
+            Unprocessable: A field or the image is invalid.
         """
         return Uploaded(**self.raw.upload(Path(photo), filename, **fields))
 
     def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
     ) -> Uploaded:
-        """`upload` past the server, straight to its bucket; `fields` as JSON values.
+        """Upload a photo directly to the server's bucket with a presigned URL.
 
-        Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
+        The arguments are those of `upload`; `fields` are JSON values.
+
+        Raises:
+            Conflict: `no_direct_uploads` if the server stores photos in a folder.
         """
         return Uploaded(**self.raw.upload_direct(Path(photo), filename, **fields))
 
     def upload_archive(
         self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
     ) -> BatchStarted:
-        """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
+        """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
         return BatchStarted(**self.raw.upload_archive(Path(archive), on_sent))
 
     def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[dict[str, Any]] = ()
     ) -> BatchStarted:
-        """Start a batch with these photos; each line of the manifest has a `filename` and fields
-        of `upload`."""
+        """Start a batch upload of photo files.
+
+        Each manifest entry contains a `filename` and fields of `upload`.
+        """
         return BatchStarted(**self.raw.upload_files([Path(p) for p in photos], manifest))
 
     def import_objects(self, manifest: Sequence[dict[str, Any]]) -> BatchStarted:
-        """Start a batch with objects of the server's store; each line has a `key` and fields of
-        `upload`."""
+        """Start a batch import of objects in the server's store.
+
+        Each manifest entry contains an object `key` and fields of `upload`.
+        """
         return BatchStarted(**self.raw.import_objects(manifest))
 
     def import_prefix(self, prefix: str) -> BatchStarted:
-        """Start a batch with every photo of the server's store whose key begins with `prefix`."""
+        """Start a batch import of all photos in the server's store below a key prefix."""
         return BatchStarted(**self.raw.import_prefix(prefix))
 
     def batch_items(self, work: Work, *states: str) -> Iterator[BatchItem]:
-        """The photos of a batch that are in one of the states, or all of them."""
+        """Iterate over the items of a batch, optionally only those in the given states."""
         for item in self.raw.batch_items(_job_id(work), *states):
             yield BatchItem(**item)
 
@@ -113,25 +128,31 @@ class Client:
         explain: bool = False,
         **filters: Any,
     ) -> Similar:
-        """The photos most similar to the one in a file (which is not stored), or to a stored one
-        (a Photo, or its UUID): of those that pass the filters `near` ("LAT,LON,RADIUS_M"), `box`
-        ("S,W,N,E"), `captured_after`, `captured_before`, `place`, `tags`, `ids` (separated by
-        commas). The first `rerank` of them are compared patch by patch.
+        """Find the most similar photos and estimate the place.
+
+        Args:
+            photo: A file, which is not stored, or a stored photo (a Photo or its UUID).
+            top_k: Maximum number of results.
+            min_score: Minimum cosine similarity.
+            rerank: Number of first results to rerank by comparing patches.
+            explain: Add explanations to the results.
+            filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
+                `captured_before`, `place`, `tags` and `ids` (comma-separated).
         """
-        wanted = {"top_k": top_k, "min_score": min_score, "rerank": rerank, "explain": explain}
+        params = {"top_k": top_k, "min_score": min_score, "rerank": rerank, "explain": explain}
         if isinstance(photo, (Photo, UUID)):
             file_id = photo.image_id if isinstance(photo, Photo) else photo
-            return Similar(**self.raw.similar_to(file_id, **{**wanted, **filters}))
-        return Similar(**self.raw.similar_to_file(Path(photo), **{**wanted, **filters}))
+            return Similar(**self.raw.similar_to(file_id, **{**params, **filters}))
+        return Similar(**self.raw.similar_to_file(Path(photo), **{**params, **filters}))
 
     def job(self, work: Work, wait_seconds: float = 0) -> Job:
-        """The job as it is; the server answers at once when it ends within `wait_seconds`."""
+        """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
         return Job(**self.raw.job(_job_id(work), wait_seconds))
 
     def jobs(self, **filters: Any) -> Iterator[Job]:
-        """The map's jobs, newest first; `state` and `kind` may be given."""
-        for one in self.raw.each("/jobs", "jobs", **filters):
-            yield Job(**one)
+        """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
+        for job in self.raw.each("/jobs", "jobs", **filters):
+            yield Job(**job)
 
     def wait(
         self,
@@ -139,15 +160,21 @@ class Client:
         timeout_seconds: float | None = None,
         on_progress: Callable[[Job], object] = lambda job: None,
     ) -> Job:
-        """The job once it has succeeded; `on_progress` sees it after every poll.
+        """Wait until a job succeeds.
 
-        Raises Unprocessable with the `code` of a job that has failed (`job_ended` where it was
-        cancelled), Unavailable (`job_unfinished`) after `timeout_seconds`.
+        Args:
+            work: The job.
+            timeout_seconds: Maximum time to wait; None for no limit.
+            on_progress: Called with the job after every poll.
+
+        Raises:
+            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
+            Unavailable: `job_unfinished` if the timeout expires.
         """
         deadline = None if timeout_seconds is None else time.monotonic() + timeout_seconds
         while True:
-            left = POLL_SECONDS if deadline is None else deadline - time.monotonic()
-            job = self.job(work, max(0.0, min(left, POLL_SECONDS)))
+            remaining = POLL_SECONDS if deadline is None else deadline - time.monotonic()
+            job = self.job(work, max(0.0, min(remaining, POLL_SECONDS)))
             on_progress(job)
             if job.state == "succeeded":
                 return job
@@ -161,81 +188,90 @@ class Client:
                     f"The job {job.job_id} is still {job.state} after {timeout_seconds:g} s.",
                 )
             if job.waiting_for:
-                time.sleep(1.0)  # a server that knows so answers at once
+                time.sleep(1.0)  # the server does not hold long polls of such jobs
 
     def cancel(self, work: Work) -> Job:
+        """Cancel a job."""
         return Job(**self.raw.cancel_job(_job_id(work)))
 
     def retry(self, work: Work) -> Job:
-        """Queue a failed job again; of a batch, its failed items."""
+        """Queue a failed job again; for a batch, its failed items."""
         return Job(**self.raw.retry_job(_job_id(work)))
 
     def photo(self, file_id: Id) -> OnePhoto:
+        """Get a stored photo's metadata and state."""
         return OnePhoto(**self.raw.photo(file_id))
 
     def image(self, file_id: Id) -> bytes:
-        """The photo's bytes as they were uploaded."""
+        """Download the original bytes of a photo."""
         return self.raw.image(file_id)
 
     def photos(self, **filters: Any) -> Iterator[Photo]:
-        """Photos by what is known of them, newest first; see `GET /search`."""
-        for one in self.raw.each("/search", "images", **filters):
-            yield Photo(**one)
+        """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
+        for photo in self.raw.each("/search", "images", **filters):
+            yield Photo(**photo)
 
     def patch_photo(self, file_id: Id, **fields: Any) -> OnePhoto:
-        """Change what is said of a photo: what is left out stays, None clears."""
+        """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
         return OnePhoto(**self.raw.patch_photo(file_id, **fields))
 
     def delete_photo(self, file_id: Id) -> Deleted:
+        """Delete a photo."""
         return Deleted(**self.raw.delete_photo(file_id))
 
-    def fit_vocabulary(self, **wanted: int) -> Started:
-        """Learn a vocabulary from the map's photos; `clusters`, `sample`, `seed` may be given."""
-        return Started(**self.raw.fit_vocabulary(**wanted))
+    def fit_vocabulary(self, **options: int) -> Started:
+        """Start fitting a vocabulary on the map's photos.
+
+        Options are `clusters`, `sample` and `seed`.
+        """
+        return Started(**self.raw.fit_vocabulary(**options))
 
     def import_vocabulary(self, file: str | Path) -> Started:
-        """Switch to the vocabulary in a `.npz` or `.npy` file."""
+        """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
         return Started(**self.raw.import_vocabulary(Path(file)))
 
     def vocabularies(self) -> list[Vocabulary]:
-        return [Vocabulary(**one) for one in self.raw.vocabularies()]
+        """List the map's vocabularies, newest first."""
+        return [Vocabulary(**item) for item in self.raw.vocabularies()]
 
     def start_generation(
         self, *, vocabulary_id: Id | None = None, pca: int | None = None
     ) -> Started:
-        """Switch to a vocabulary that the map has, or to descriptors of `pca` dimensions."""
+        """Start reindexing with one of the map's vocabularies or to `pca` dimensions."""
         return Started(**self.raw.start_generation(vocabulary_id=vocabulary_id, pca=pca))
 
     def generations(self) -> list[Generation]:
-        """The map's generations, newest first."""
-        return [Generation(**one) for one in self.raw.generations()]
+        """List the map's generations, newest first."""
+        return [Generation(**item) for item in self.raw.generations()]
 
-    def evaluate(self, **wanted: int) -> Started:
-        """Measure the map; `sample` and `seed` may be given."""
-        return Started(**self.raw.evaluate(**wanted))
+    def evaluate(self, **options: int) -> Started:
+        """Start an evaluation of the map; options are `sample` and `seed`."""
+        return Started(**self.raw.evaluate(**options))
 
     def evaluations(self) -> Iterator[Evaluation]:
-        """Newest first."""
-        for one in self.raw.each("/evaluations", "evaluations"):
-            yield Evaluation(**one)
+        """Iterate over the map's evaluations, newest first."""
+        for evaluation in self.raw.each("/evaluations", "evaluations"):
+            yield Evaluation(**evaluation)
 
     def searches(self) -> Iterator[Search]:
-        """What was asked, newest first."""
-        for one in self.raw.each("/searches", "searches"):
-            yield Search(**one)
+        """Iterate over the search history, newest first."""
+        for search in self.raw.each("/searches", "searches"):
+            yield Search(**search)
 
     def maps(self) -> list[Map]:
-        """Every map of the server."""
-        return [Map(**one) for one in self.raw.maps()]
+        """List the maps of the server."""
+        return [Map(**item) for item in self.raw.maps()]
 
     def create_map(self, name: str, extractor: str | None = None) -> Map:
+        """Create a map; `extractor` defaults to the server's setting."""
         return Map(**self.raw.create_map(name, extractor))
 
     def delete_map(self, name: str) -> None:
-        """Delete a map with all its photos."""
+        """Delete a map and all its photos."""
         self.raw.delete_map(name)
 
     def stats(self) -> Stats:
+        """Get statistics of the map."""
         return Stats(**self.raw.stats())
 
 
@@ -243,5 +279,7 @@ def _job_id(work: Work) -> Id:
     if isinstance(work, (UUID, str)):
         return work
     if work.job_id is None:
-        raise Unprocessable("no_job", "This upload has no job: its photo is described already.")
+        raise Unprocessable(
+            "no_job", "This upload has no job: its photo has already been described."
+        )
     return work.job_id

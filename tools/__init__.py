@@ -1,1 +1,1 @@
-"""What is run by hand while Placewise is developed; nothing of it is installed."""
+"""Development tools that are run by hand and not installed."""

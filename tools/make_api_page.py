@@ -1,4 +1,4 @@
-"""`docs/api-calls.md`, made of the API's own description: `make api-page`."""
+"""Generates `docs/api-calls.md` from the OpenAPI description: `make api-page`."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from shared.config.settings import Settings
 PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
 HEAD = """# Every call
 
-Made of the description that a server gives on `/openapi.json`, by `make api-page`. What the calls
-have in common stands on [the API in short](api.md).
+Generated from the server's OpenAPI description (`/openapi.json`) by `make api-page`. For what all
+calls have in common, see [the API in short](api.md).
 """
 
 
 def openapi_description() -> dict[str, Any]:
-    """The OpenAPI description. Its ports are never used: no call is made."""
-    nothing = cast(Any, None)
+    """Build the OpenAPI description; the dependencies are None because no route is called."""
+    unused = cast(Any, None)
     return create_app(
-        GatewayContext(nothing, nothing, nothing, nothing, Settings(), LocalhostAuthenticator())
+        GatewayContext(unused, unused, unused, unused, Settings(), LocalhostAuthenticator())
     ).openapi()
 
 
 def render_page() -> str:
-    """The page's text: a table for each tag, in the order of the calls."""
+    """Render the page: a table per tag, in the order of the calls."""
     tables: dict[str, list[str]] = {}
     for path, methods in openapi_description()["paths"].items():
         for method, call in methods.items():
@@ -43,16 +43,16 @@ def render_page() -> str:
 
 
 def _call_row(path: str, method: str, call: dict[str, Any]) -> str:
-    said = [
-        f"`{one['name']}`{'' if one.get('required') else '?'}"
-        for one in call.get("parameters", [])
-        if one["in"] == "query" and one["name"] != "map"
+    inputs = [
+        f"`{parameter['name']}`{'' if parameter.get('required') else '?'}"
+        for parameter in call.get("parameters", [])
+        if parameter["in"] == "query" and parameter["name"] != "map"
     ]
     if body := call.get("requestBody"):
-        said.append(" or ".join(f"body: {kind}" for kind in body["content"]))
-    answers = ", ".join(sorted(code for code in call["responses"] if code < "400"))
-    what = re.split(r"(?<=[.;])\s", " ".join(call.get("description", "").split()))[0]
-    cells = (f"`{method.upper()} {path}`", ", ".join(said), answers, what.rstrip(".;"))
+        inputs.append(" or ".join(f"body: {kind}" for kind in body["content"]))
+    statuses = ", ".join(sorted(code for code in call["responses"] if code < "400"))
+    summary = re.split(r"(?<=[.;])\s", " ".join(call.get("description", "").split()))[0]
+    cells = (f"`{method.upper()} {path}`", ", ".join(inputs), statuses, summary.rstrip(".;"))
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

@@ -1,10 +1,10 @@
-"""Makes the general vocabulary that is shipped with EfficientNet-Lite0:
+"""Generates the vocabulary that is shipped with EfficientNet-Lite0:
 
     python -m tools.make_shipped_vocabulary
 
-It is learnt on photographs that installed packages bring (scikit-learn, scikit-image), cut into
-overlapping views at several scales. It has never seen your places: that is why every answer made
-with it says `vocabulary: foreign`, and why fitting one on your own photos is the first thing to do.
+It is fitted on photographs contained in installed packages (scikit-learn, scikit-image), cut into
+overlapping views at several scales. Since it is not fitted on a map's own photos, searches with it
+report `vocabulary: foreign`, and a map should fit its own.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shared.descriptors.vocabulary import encode_centres, parse_centres
 from shared.descriptors.vocabulary_fit import TOLERANCE
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS
 
-# Photographs only: no drawings, scans, microscope or depth pictures, none of them generated.
+# Photographs only: no drawings, scans, microscope images, depth maps or generated images.
 PHOTOGRAPHS = {
     "sklearn": ("datasets/images", ("china.jpg", "flower.jpg")),
     "skimage": (
@@ -46,13 +46,13 @@ PHOTOGRAPHS = {
 }
 PACKAGES = {"sklearn": "scikit-learn", "skimage": "scikit-image"}
 VIEW_SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
-VIEWS_PER_SIDE = 4  # views along each side, at every scale below the whole
+VIEWS_PER_SIDE = 4  # views along each side, at every scale below 1
 SEED = 0
 MAX_KMEANS_PASSES = 100
 
 
 def main() -> None:
-    """Fit the centres and write them beside their provenance."""
+    """Fit the centres and write them with their provenance."""
     recipe = EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"]
     extractor = Extractor(recipe, choose_device("cpu"))
     views = [
@@ -67,15 +67,15 @@ def main() -> None:
         ]
     )
     centres, iterations = _find_centres(points, recipe.clusters)
-    checked = parse_centres(centres.numpy(), width=extractor.backbone.width)
+    vocabulary = parse_centres(centres.numpy(), width=extractor.backbone.width)
     provenance = {
         "backbone": extractor.backbone.name,
         "backbone_fingerprint": extractor.backbone.fingerprint,
         "layer": extractor.backbone.layer,
         "facet": extractor.backbone.facet,
         "preprocessing": extractor.preprocessing.as_spec(),
-        "clusters": checked.clusters,
-        "sha256": checked.sha256,
+        "clusters": vocabulary.clusters,
+        "sha256": vocabulary.sha256,
         "seed": SEED,
         "iterations": iterations,
         "views": len(views),
@@ -93,14 +93,22 @@ def main() -> None:
         },
     }
     target = SHIPPED_VOCABULARIES / str(recipe.shipped_vocabulary)
-    target.write_bytes(encode_centres(checked))
+    target.write_bytes(encode_centres(vocabulary))
     target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
-    print(f"{checked.clusters} centres from {len(points)} patches of {len(views)} views: {target}")
+    print(
+        f"{vocabulary.clusters} centres from {len(points)} patches of {len(views)} views: {target}"
+    )
 
 
 def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, int]:
-    """(clusters, D) centres and the passes that they took: all points fit into memory, so that
-    Lloyd's passes over all of them do without mini-batches.
+    """Fit centres with full-batch Lloyd iterations; all points fit into memory.
+
+    Args:
+        points: (n, D) patch features.
+        clusters: Number of centres.
+
+    Returns:
+        (clusters, D) centres and the number of iterations.
     """
     seeding = KMeansPlusPlus(points, SEED)
     while len(seeding.chosen) < clusters:
@@ -108,29 +116,29 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
     centres = seeding.centres()
     passes, movement = 0, float("inf")
     while passes < MAX_KMEANS_PASSES and movement > TOLERANCE:
-        one = KMeansPass.begin(centres)
-        one.accumulate(points, centres)
-        moved = one.end(centres)
-        movement = float(((moved - centres) ** 2).sum())
-        centres = moved
+        kmeans_pass = KMeansPass.begin(centres)
+        kmeans_pass.accumulate(points, centres)
+        new_centres = kmeans_pass.end(centres)
+        movement = float(((new_centres - centres) ** 2).sum())
+        centres = new_centres
         passes += 1
     return centres, passes
 
 
 def list_photographs() -> list[Path]:
-    """The photographs' files inside the installed packages."""
-    found = []
+    """List the photograph files of the installed packages."""
+    paths = []
     for package, (folder, names) in PHOTOGRAPHS.items():
         spec = importlib.util.find_spec(package)
         if spec is None or spec.origin is None:
-            raise SystemExit(f"{PACKAGES[package]} is not installed: make setup")
+            raise SystemExit(f"{PACKAGES[package]} is not installed. Run make setup.")
         root = Path(spec.origin).parent / folder
-        found += [root / name for name in names]
-    return found
+        paths += [root / name for name in names]
+    return paths
 
 
 def cut_views(photograph: Image.Image) -> list[Image.Image]:
-    """Square views: the middle of the whole, and a grid of overlapping ones at smaller scales."""
+    """Cut square views: one at full scale, and a grid of overlapping ones at smaller scales."""
     width, height = photograph.size
     views = []
     for scale in VIEW_SCALES:

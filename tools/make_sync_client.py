@@ -1,7 +1,7 @@
-"""The synchronous client, made of the asynchronous one: `make client`.
+"""Generates the synchronous client from the asynchronous one: `make client`.
 
-Both are one implementation, written once. Only words differ: `await` is left out, and names are
-replaced by those of REPLACED.
+Both clients share one implementation: the generator removes `await` and replaces names according to
+REPLACEMENTS.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ GENERATED_FILES = {
     "shared/client/async_calls.py": "shared/client/calls.py",
     "placewise/async_client.py": "placewise/client.py",
 }
-# In this order: what is replaced first is seen by none of those below it.
+# Applied in this order, each to the result of the ones before.
 REPLACEMENTS = (
     (r"^import asyncio\n", ""),
     (r"asyncio\.sleep", "time.sleep"),
-    (r"`(\w+)\.py` is made of this file by `make client`: change this one\.", r"MADE"),
+    (r"`(\w+)\.py` is generated from this file by `make client`\. Edit this file\.", r"NOTICE"),
     (r"\bawait ", ""),
     (r"\basync (def|for|with) ", r"\1 "),
     (r"Callable\[\[\], Awaitable\[Answer\]\]", "Callable[[], Answer]"),
@@ -40,12 +40,12 @@ REPLACEMENTS = (
 
 
 def to_synchronous(source: str) -> str:
-    """The text of an asynchronous module as that of its synchronous twin, formatted."""
+    """Convert the source of an asynchronous module to formatted synchronous source."""
     text = (ROOT / source).read_text()
-    for pattern, word in REPLACEMENTS:
-        text = re.sub(pattern, word, text, flags=re.MULTILINE)
+    for pattern, replacement in REPLACEMENTS:
+        text = re.sub(pattern, replacement, text, flags=re.MULTILINE)
     text = text.replace(
-        "MADE", f"Made of `{Path(source).name}` by `make client`: change that one, not this.", 1
+        "NOTICE", f"Generated from `{Path(source).name}` by `make client`. Edit that file.", 1
     )
     return _format_source(text, GENERATED_FILES[source])
 
@@ -53,7 +53,7 @@ def to_synchronous(source: str) -> str:
 def _format_source(text: str, name: str) -> str:
     ruff = shutil.which("ruff", path=Path(sys.executable).parent) or "ruff"
     for arguments in (["check", "--select", "I", "--fix", "--quiet"], ["format", "--quiet"]):
-        done = subprocess.run(  # noqa: S603
+        result = subprocess.run(  # noqa: S603
             [ruff, *arguments, "--stdin-filename", name, "-"],
             input=text,
             capture_output=True,
@@ -61,10 +61,10 @@ def _format_source(text: str, name: str) -> str:
             check=True,
             cwd=ROOT,
         )
-        text = done.stdout
+        text = result.stdout
     return text
 
 
 if __name__ == "__main__":
-    for source, made in GENERATED_FILES.items():
-        (ROOT / made).write_text(to_synchronous(source))
+    for source, target in GENERATED_FILES.items():
+        (ROOT / target).write_text(to_synchronous(source))

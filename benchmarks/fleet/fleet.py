@@ -182,7 +182,7 @@ class Fleet:
             environment(self._folder / "home", **own),
             self._folder / f"{name}.log",
             f"http://127.0.0.1:{port}/readyz" if port else None,
-            f"Placewise {service} is at work",
+            f"Placewise {service} is running",
             executed=self._executed,
         )
 

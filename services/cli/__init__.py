@@ -1,19 +1,20 @@
-"""The `placewise` command: one module per group of commands, most of them clients of a server.
+"""The `placewise` command-line interface: one module per command group.
 
-When no server is named or running on the folder, a command starts the embedded one for as long as
-it needs it, so that there is one way of doing everything: over HTTP. `describe` alone keeps nothing
-and needs none.
+Most commands are HTTP clients. A command connects to the server given by `--server`, or to the one
+that runs on PLACEWISE_HOME, and otherwise starts an embedded server for its own duration, so that
+every operation takes the same path. Commands that work on files alone (`describe`, `compare`,
+`datasets`, `train`) need no server.
 """
 
 import os
 
 
 def main() -> None:
-    """The console script."""
-    # Read when torch is loaded: OpenMP's threads sleep while they wait for each other instead of
-    # spinning. With spinning, a forward pass beside any other load took 50 times as long.
+    """Run the `placewise` console script."""
+    # OpenMP reads this when torch is loaded. PASSIVE makes its threads sleep at barriers instead of
+    # spinning: with spinning, a forward pass took 50 times as long on a machine under other load.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Imported here: decoding child processes import the script anew, and must stay free of torch.
+    # Imported here: decoding child processes re-import this script and must not load torch.
     from services.cli.main import run
 
     run()

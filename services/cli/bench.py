@@ -1,7 +1,7 @@
-"""`placewise bench`: what this machine does, and whether it is what is wanted.
+"""`placewise bench`: run the benchmarks of a checkout.
 
-The measuring programs lie in `benchmarks/` of a checkout: they start PostgreSQL, Redis and an S3
-store of their own. One that misses a wanted figure ends with exit code 1.
+The benchmark programs are in `benchmarks/` and start their own PostgreSQL, Redis and S3 servers. A
+benchmark that misses its target exits with code 1.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import typer
 from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
 from shared.errors import Misconfigured
 
-app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
+app = typer.Typer(help="Run benchmarks on this machine.", no_args_is_help=True)
 
-DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+DeviceOption = Annotated[str, typer.Option("--device", help="Device: auto, cpu or cuda.")]
 
 DEV_PACKAGES = (
     "benchmarks",
@@ -37,19 +37,21 @@ def spine(
     queries: Annotated[int, typer.Option(min=1)] = 50,
     as_json: JsonOption = False,
 ) -> None:
-    """How long do upload, description and both kinds of query take on an embedded server?"""
+    """Measure upload, description and query latency of an embedded server."""
     _run_benchmark("spine", as_json, photos=photos, queries=queries)
 
 
 @app.command("scaling")
 def scaling(
-    workers: Annotated[str, typer.Option(help="Numbers of extractors.")] = "1,2,4,8",
-    photos: Annotated[int, typer.Option(min=1, help="For each extractor.")] = 60,
-    milliseconds: Annotated[int, typer.Option(min=0, help="Slept for each photo.")] = 500,
-    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 4,
+    workers: Annotated[
+        str, typer.Option(help="Numbers of extractor processes, comma-separated.")
+    ] = "1,2,4,8",
+    photos: Annotated[int, typer.Option(min=1, help="Photos per extractor.")] = 60,
+    milliseconds: Annotated[int, typer.Option(min=0, help="Simulated work per photo.")] = 500,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 4,
     as_json: JsonOption = False,
 ) -> None:
-    """Do more extractors describe as many more photos, and none of them twice?"""
+    """Measure how throughput scales with extractors, and check that no photo is done twice."""
     numbers = _parse_integers(workers)
     _run_benchmark(
         "scaling", as_json, workers=numbers, photos=photos, milliseconds=milliseconds, batch=batch
@@ -58,13 +60,15 @@ def scaling(
 
 @app.command("pipeline")
 def pipeline(
-    widths: Annotated[str, typer.Option(help="Dimensions of the descriptors.")] = "7168,98304",
+    widths: Annotated[
+        str, typer.Option(help="Descriptor dimensions, comma-separated.")
+    ] = "7168,98304",
     photos: Annotated[int, typer.Option(min=1)] = 320,
-    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 32,
-    rounds: Annotated[int, typer.Option(min=1, help="Of uploads to either gateway.")] = 5,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 32,
+    rounds: Annotated[int, typer.Option(min=1, help="Upload rounds per gateway.")] = 5,
     as_json: JsonOption = False,
 ) -> None:
-    """How much CPU time does a photo take around the model, and how fast are uploads?"""
+    """Measure CPU time per photo outside the model, and upload throughput."""
     _run_benchmark(
         "pipeline",
         as_json,
@@ -78,20 +82,18 @@ def pipeline(
 @app.command("extract")
 def extract(
     extractor: Annotated[
-        str, typer.Option("--extractor", help="By name, with options as in EXTRACTOR.")
+        str, typer.Option("--extractor", help="Extractor name, with options as in EXTRACTOR.")
     ] = "anyloc-vits14",
     photos: Annotated[int, typer.Option(min=1)] = 32,
     device: DeviceOption = "auto",
-    precision: Annotated[
-        str, typer.Option(help="auto, float32 or bfloat16, as PRECISION.")
-    ] = "auto",
-    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
-    rounds: Annotated[int, typer.Option(min=1, help="Of all photos, by either way.")] = 3,
+    precision: Annotated[str, typer.Option(help="Precision: auto, float32 or bfloat16.")] = "auto",
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
+    rounds: Annotated[int, typer.Option(min=1, help="Passes over all photos per method.")] = 3,
     as_json: JsonOption = False,
 ) -> None:
-    """How fast do photos become descriptors, beside AnyLoc as published and this device's ceiling?
+    """Compare extraction throughput with AnyLoc as published and with the device's peak.
 
-    Without weights on this machine, random ones are measured, and the title says so.
+    Without local weights, random weights are used, and the title of the report says so.
     """
     _check_choice(device, "--device", "auto", "cpu", "cuda")
     _check_choice(precision, "--precision", "auto", "float32", "bfloat16")
@@ -110,15 +112,17 @@ def extract(
 @app.command("precision")
 def precision(
     extractor: Annotated[
-        str, typer.Option("--extractor", help="By name, with options as in EXTRACTOR.")
+        str, typer.Option("--extractor", help="Extractor name, with options as in EXTRACTOR.")
     ] = "efficientnet-lite0-vlad",
-    places: Annotated[int, typer.Option(min=2, help="Of the generated city.")] = 60,
+    places: Annotated[
+        int, typer.Option(min=2, help="Number of places in the generated city.")
+    ] = 60,
     queries: Annotated[int, typer.Option(min=1)] = 60,
     device: DeviceOption = "auto",
-    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
     as_json: JsonOption = False,
 ) -> None:
-    """What does bfloat16 change of patches, descriptors and recall, against float32?"""
+    """Compare patches, descriptors and recall in bfloat16 with those in float32."""
     _check_choice(device, "--device", "auto", "cpu", "cuda")
     _run_benchmark(
         "precision",
@@ -133,19 +137,27 @@ def precision(
 
 @app.command("train")
 def train(
-    places: Annotated[int, typer.Option(min=20, help="Of the generated city.")] = 300,
+    places: Annotated[
+        int, typer.Option(min=20, help="Number of places in the generated city.")
+    ] = 300,
     epochs: Annotated[int, typer.Option(min=1)] = 20,
-    image_size: Annotated[int, typer.Option(min=32, help="Pixels of a side.")] = 112,
-    photos: Annotated[int, typer.Option(min=64, help="For the figures of speed.")] = 512,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that read photos.")] = 2,
-    device: Annotated[str, typer.Option("--device", help="auto, cpu, gpu or mps.")] = "auto",
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Image height and width in pixels.")
+    ] = 112,
+    photos: Annotated[
+        int, typer.Option(min=64, help="Photos for the throughput measurement.")
+    ] = 512,
+    workers: Annotated[int, typer.Option(min=1, help="Data loader processes.")] = 2,
+    device: Annotated[
+        str, typer.Option("--device", help="Device: auto, cpu, gpu or mps.")
+    ] = "auto",
     grid: Annotated[
-        bool, typer.Option("--grid", help="Three aggregators x two losses as well.")
+        bool, typer.Option("--grid", help="Also train three aggregators with two losses each.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the city and the network.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the city and the network.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """How fast is training, does it wait for photos, and is what it learns real?"""
+    """Measure training throughput, data loading stalls and the recall that training achieves."""
     _check_choice(device, "--device", "auto", "cpu", "gpu", "mps")
     _run_benchmark(
         "train",
@@ -163,13 +175,13 @@ def train(
 
 @app.command("query-latency")
 def query_latency(
-    backlog: Annotated[int, typer.Option(min=1, help="Uploads that wait.")] = 5000,
-    seconds: Annotated[float, typer.Option(min=1, help="How long queries are asked.")] = 60,
-    milliseconds: Annotated[int, typer.Option(min=0, help="Slept for each photo.")] = 50,
-    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
+    backlog: Annotated[int, typer.Option(min=1, help="Number of queued uploads.")] = 5000,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 60,
+    milliseconds: Annotated[int, typer.Option(min=0, help="Simulated work per photo.")] = 50,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
     as_json: JsonOption = False,
 ) -> None:
-    """How long does a query photo take while thousands of uploads wait?"""
+    """Measure query latency while thousands of uploads are queued."""
     _run_benchmark(
         "query_latency",
         as_json,
@@ -182,61 +194,70 @@ def query_latency(
 
 @app.command("rerank")
 def rerank(
-    places: Annotated[int, typer.Option(min=20, help="Of a generated city.")] = 150,
-    seed: Annotated[int, typer.Option(min=0, help="Which city.")] = 0,
+    places: Annotated[
+        int, typer.Option(min=20, help="Number of places in the generated city.")
+    ] = 150,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the city.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """How often does the right place come first with `rerank=10`, 25 and 50, and what does it take?
+    """Measure recall@1 and latency with `rerank=10`, 25 and 50.
 
-    With PLACEWISE_TEST_DATA also the ranks of the true places of real photos.
+    With PLACEWISE_TEST_DATA, also report the ranks of true places for real photos.
     """
     _run_benchmark("rerank", as_json, places=places, seed=seed)
 
 
 @app.command("search")
 def search(
-    photos: Annotated[str, typer.Option(help="Numbers of photos in the map.")] = "2000",
+    photos: Annotated[
+        str, typer.Option(help="Numbers of photos in the map, comma-separated.")
+    ] = "2000",
     dimensions: Annotated[
-        str, typer.Option(help="Of the descriptors; multiples of 64.")
+        str, typer.Option(help="Descriptor dimensions, multiples of 64, comma-separated.")
     ] = "512,7168,98304",
-    queries: Annotated[int, typer.Option(min=2, help="Of each kind.")] = 20,
+    queries: Annotated[int, typer.Option(min=2, help="Queries of each kind.")] = 20,
     growth: Annotated[
-        bool, typer.Option("--growth", help="Scan the codes of up to a million photos.")
+        bool, typer.Option("--growth", help="Also scan the sign codes of up to a million photos.")
     ] = False,
     load: Annotated[
-        float, typer.Option("--load", min=0, help="Seconds that 32 clients ask at once.")
+        float,
+        typer.Option(
+            "--load", min=0, help="Duration of a load test with 32 concurrent clients, in seconds."
+        ),
     ] = 0,
-    everything: Annotated[
+    full: Annotated[
         bool,
-        typer.Option("--long", help="1,000, 5,000 and 10,000 photos, --growth, --load 60."),
+        typer.Option("--long", help="Use 1,000, 5,000 and 10,000 photos, --growth and --load 60."),
     ] = False,
     folder: Annotated[
         Path | None,
-        typer.Option(exists=True, file_okay=False, help="Where the map is made: 4 GB of disk."),
+        typer.Option(
+            exists=True, file_okay=False, help="Folder for the map; requires 4 GB of disk."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """How fast is search, next to NumPy, faiss and reading every chunk, and is it ever wrong?"""
+    """Compare search latency with NumPy, faiss and full chunk reads, and check the results."""
     _run_benchmark(
         "search",
         as_json,
-        photos=_parse_integers("1000,5000,10000" if everything else photos),
+        photos=_parse_integers("1000,5000,10000" if full else photos),
         dimensions=_parse_integers(dimensions),
         queries=queries,
-        growth=growth or everything,
-        load_seconds=load or (60.0 if everything else 0.0),
+        growth=growth or full,
+        load_seconds=load or (60.0 if full else 0.0),
         folder=folder,
     )
 
 
 @app.command("catalog")
 def catalog(
-    photos: Annotated[int, typer.Option(min=100_000, help="Rows to make.")] = 1_000_000,
+    photos: Annotated[int, typer.Option(min=100_000, help="Number of rows to create.")] = 1_000_000,
     as_json: JsonOption = False,
 ) -> None:
-    """Does any statement of the services read a large table from end to end?
+    """Check that no statement of the services scans a large table sequentially.
 
-    Fills a database of its own on the server of DATABASE_URL, and drops it in the end.
+    Creates a temporary database on the server of DATABASE_URL and drops it at the end.
     """
     with report_errors(as_json):
         program = _load_benchmark("catalog.command")
@@ -245,33 +266,37 @@ def catalog(
 
 @app.command("chaos")
 def chaos(
-    photos: Annotated[int, typer.Option(min=30, help="Uploaded while parts die.")] = 2000,
-    fault_seconds: Annotated[
-        float, typer.Option(min=0.1, help="How long a part stays away, where that has a length.")
-    ] = 30,
-    seed: Annotated[int, typer.Option(help="Decides the order and the moments.")] = 1,
+    photos: Annotated[
+        int, typer.Option(min=30, help="Photos to upload while services are killed.")
+    ] = 2000,
+    fault_seconds: Annotated[float, typer.Option(min=0.1, help="Duration of each outage.")] = 30,
+    seed: Annotated[int, typer.Option(help="Seed of the order and times of faults.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Is anything lost, doubled, stuck or wrong while every part dies, one after the other?"""
+    """Kill every service and server in turn; check that nothing is lost, duplicated or stuck."""
     _run_benchmark("chaos", as_json, photos=photos, fault_seconds=fault_seconds, seed=seed)
 
 
 @app.command("rolling")
 def rolling(as_json: JsonOption = False) -> None:
-    """Is a request refused or a job lost while every service is restarted, one after the other?"""
+    """Restart every service in turn; check that no request fails and no job is lost."""
     _run_benchmark("rolling", as_json)
 
 
 @app.command("slow-clients")
 def slow_clients(
-    seconds: Annotated[float, typer.Option(min=1, help="Of each phase.")] = 30,
-    idle: Annotated[int, typer.Option(min=0, help="Connections that send nothing.")] = 1100,
-    bodies: Annotated[int, typer.Option(min=0, help="Uploads of a byte a second.")] = 32,
-    streams: Annotated[int, typer.Option(min=0, help="Event streams.")] = 500,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of each phase.")] = 30,
+    idle: Annotated[int, typer.Option(min=0, help="Number of idle connections.")] = 1100,
+    bodies: Annotated[
+        int, typer.Option(min=0, help="Number of uploads at one byte per second.")
+    ] = 32,
+    streams: Annotated[int, typer.Option(min=0, help="Number of event streams.")] = 500,
     as_json: JsonOption = False,
 ) -> None:
-    """How long do other calls take while clients are slow on purpose? The server may open 1,024
-    files."""
+    """Measure the latency of other calls under slow clients.
+
+    The server's limit of open files is 1,024.
+    """
     _run_benchmark(
         "slow_clients", as_json, seconds=seconds, idle=idle, bodies=bodies, streams=streams
     )
@@ -279,12 +304,12 @@ def slow_clients(
 
 @app.command("scale")
 def scale(
-    given: Annotated[
+    inputs: Annotated[
         list[str] | None,
-        typer.Option("--set", help="An input, as price_gpu_hour=2; may be repeated."),
+        typer.Option("--set", help="Override an input, such as price_gpu_hour=2. Can be repeated."),
     ] = None,
     measured: Annotated[
-        bool, typer.Option("--measure", help="Measure on this machine what it can tell.")
+        bool, typer.Option("--measure", help="Measure inputs on this machine where possible.")
     ] = False,
     page: Annotated[
         Path | None,
@@ -292,19 +317,19 @@ def scale(
             "--markdown",
             exists=True,
             dir_okay=False,
-            help="Renew this page's tables: docs/scale.md",
+            help="Update the tables of this page (docs/scale.md).",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """What do 10 thousand, 1 million and 100 million photos take: machines, bytes, money?"""
+    """Estimate machines, storage and cost for 10 thousand, 1 million and 100 million photos."""
     with report_errors(as_json):
         program = _load_benchmark("scale")
-        found = None
+        measurements = None
         if measured:
             with progress_bar() as progress:
-                found = program.measure(progress)
-        sizing = program.size_up(given or [], found)
+                measurements = program.measure(progress)
+        sizing = program.size_up(inputs or [], measurements)
         if page is not None:
             page.write_text(sizing.put_into(page.read_text(encoding="utf-8")), encoding="utf-8")
     if as_json:
@@ -315,7 +340,7 @@ def scale(
 
 
 def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
-    # As the command does before torch is loaded; see services/cli/__init__.py.
+    # Must be set before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with report_errors(as_json):
         program = _load_benchmark(name)
@@ -331,7 +356,7 @@ def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
 
 
 def _load_benchmark(name: str) -> Any:
-    """The module `benchmarks.NAME`. Misconfigured (`no_benchmarks`) where it can't be loaded."""
+    """Import `benchmarks.NAME`; Misconfigured (`no_benchmarks`) if a dev package is missing."""
     try:
         return importlib.import_module(f"benchmarks.{name}")
     except ModuleNotFoundError as error:
@@ -339,21 +364,21 @@ def _load_benchmark(name: str) -> Any:
             raise
         raise Misconfigured(
             "no_benchmarks",
-            f"`placewise bench {name}` needs a checkout of Placewise with the dev extra: {error}. "
-            "In the checkout: make setup, then .venv/bin/placewise bench.",
+            f"`placewise bench {name}` requires a checkout of Placewise with the dev extra: "
+            f"{error}. In the checkout, run make setup, then .venv/bin/placewise bench.",
         ) from error
 
 
 def _check_choice(value: str, option: str, *allowed: str) -> None:
     if value not in allowed:
-        raise typer.BadParameter(f"{option} is one of {', '.join(allowed)}, not {value!r}")
+        raise typer.BadParameter(f"{option} must be one of {', '.join(allowed)}, not {value!r}")
 
 
 def _parse_integers(text: str) -> list[int]:
     try:
-        found = sorted({int(part) for part in text.split(",")})
+        numbers = sorted({int(part) for part in text.split(",")})
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no list such as 1,2,4") from None
-    if found[0] < 1:
-        raise typer.BadParameter("numbers from 1 up")
-    return found
+        raise typer.BadParameter(f"{text!r} is not a list of integers such as 1,2,4") from None
+    if numbers[0] < 1:
+        raise typer.BadParameter("numbers must be at least 1")
+    return numbers

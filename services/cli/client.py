@@ -1,7 +1,4 @@
-"""Which server a command talks to: the one named, the one on the folder, or one of its own.
-
-Waiting for a job with a bar.
-"""
+"""Server selection for commands, and waiting for jobs with a progress bar."""
 
 from __future__ import annotations
 
@@ -22,29 +19,42 @@ START_TIMEOUT_SECONDS = 30.0
 
 @contextlib.contextmanager
 def connect(server: str | None, map_name: str | None, key: str | None = None) -> Iterator[Client]:
-    """A client of `server`, else of the server on PLACEWISE_HOME, else of one started for it.
+    """Connect to a server, starting an embedded one if none runs.
 
-    `key` is what `server` wants. The server on PLACEWISE_HOME leaves one there for its own user.
+    Args:
+        server: URL of the server. By default the server that runs on PLACEWISE_HOME; if none runs
+            there, an embedded server is started on a free port and stopped at the end.
+        map_name: The map that calls refer to; None for the server's default.
+        key: API key. The server on PLACEWISE_HOME stores one there for the local user.
+
+    Raises:
+        Unavailable: `server_unreachable` if the embedded server does not start in time.
     """
     settings = read_settings()
-    found = RunningServer(server) if server else find_running_server(settings.placewise_home)
-    if found is not None:
-        with Client(found.url, map_name, key or found.key) as client:
+    running_server = (
+        RunningServer(server) if server else find_running_server(settings.placewise_home)
+    )
+    if running_server is not None:
+        with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
-    # Imported only here: torch takes seconds, and a client of a running server needs none of it.
+    # Imported here: loading torch takes seconds, and clients of a running server don't need it.
     from services.standalone import run_standalone
 
-    own = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
-    with run_standalone(own) as running:
-        # Not the main thread: uvicorn would take over the command's signals there.
+    embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
+    with run_standalone(embedded_settings) as running:
+        # In a thread: in the main thread, uvicorn would install its own signal handlers.
         serving = threading.Thread(target=running.serve, name="http")
         serving.start()
         try:
             deadline = time.monotonic() + START_TIMEOUT_SECONDS
             while not running.server.started:
                 if time.monotonic() > deadline or not serving.is_alive():
-                    raise Unavailable("server_unreachable", "The embedded server did not start.")
+                    raise Unavailable(
+                        "server_unreachable",
+                        "The embedded server did not start within "
+                        f"{START_TIMEOUT_SECONDS:.0f} s. Check the log messages above.",
+                    )
                 time.sleep(0.01)
             with Client(running.url, map_name, running.local_key) as client:
                 yield client
@@ -53,20 +63,27 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
             serving.join()
 
 
-POLL_SECONDS = 1.0  # so that the bar moves
+POLL_SECONDS = 1.0  # short, so that the progress bar moves
 
 
 def wait_for_job(client: Client, job_id: str, progress: Progress, label: str) -> Json:
-    """The job once it has succeeded; its stored reason as an error when it has not."""
+    """Wait until a job ends, showing its progress in a bar.
+
+    Returns:
+        The job, which has succeeded.
+
+    Raises:
+        Unprocessable: The job failed or was cancelled; `code` and `detail` are the job's.
+    """
     bar = progress.add_task(label, total=None)
 
     def show(job: Json) -> None:
-        done = job["progress"]
+        counts = job["progress"]
         progress.update(
             bar,
             description=f"{label}: {job['stage'] or job['state']}",
-            completed=done["done"],
-            total=done["total"],
+            completed=counts["done"],
+            total=counts["total"],
         )
 
     job = client.wait_for(job_id, show, poll_seconds=POLL_SECONDS)
@@ -78,5 +95,5 @@ def wait_for_job(client: Client, job_id: str, progress: Progress, label: str) ->
 def _job_error(job: Json) -> PlacewiseError:
     error = job["error"] or {}
     return Unprocessable(
-        error.get("code", "job_ended"), error.get("detail", f"The job is {job['state']}.")
+        error.get("code", "job_ended"), error.get("detail", f"The job ended as {job['state']}.")
     )

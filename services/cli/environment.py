@@ -1,7 +1,4 @@
-"""`placewise config`: what is in force.
-
-The packages that training and data sets need, and serving does not.
-"""
+"""`placewise config`, settings loading and checks for optional packages."""
 
 from __future__ import annotations
 
@@ -16,23 +13,27 @@ from shared.errors import Misconfigured
 
 
 def read_settings() -> Settings:
-    """The settings in force; Misconfigured (`bad_setting`) names what can't be read."""
+    """Load the settings from the environment.
+
+    Raises:
+        Misconfigured: `bad_setting`, which lists every setting that is invalid.
+    """
     try:
         return Settings()
     except ValidationError as error:
-        faults = [
+        errors = [
             ": ".join(
-                # A fault of several settings together has no place of its own: it names them.
-                [str(part).upper() for part in fault["loc"]]
-                + [fault["msg"].removeprefix("Value error, ")]
+                # `loc` is empty for an error of several settings: its message names them.
+                [str(part).upper() for part in item["loc"]]
+                + [item["msg"].removeprefix("Value error, ")]
             )
-            for fault in error.errors(include_input=False)  # a value may hold a password
+            for item in error.errors(include_input=False)  # a value may hold a password
         ]
-        raise Misconfigured("bad_setting", "; ".join(faults)) from None
+        raise Misconfigured("bad_setting", "; ".join(errors)) from None
 
 
 def config(as_json: JsonOption = False) -> None:
-    """Print every setting that is in force, secrets masked."""
+    """Print the effective settings. Secrets are masked."""
     with report_errors(as_json):
         settings = read_settings()
     values = settings.model_dump(mode="json")
@@ -44,15 +45,22 @@ def config(as_json: JsonOption = False) -> None:
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
     console.print(table)
-    console.print(f"New maps are described by {settings.new_map_extractor}.", soft_wrap=True)
+    console.print(f"New maps use the extractor {settings.new_map_extractor}.", soft_wrap=True)
 
 
 def require_packages(*names: str) -> None:
-    """Misconfigured (`trainer_missing`) unless all are installed; left out: those of evaluation."""
+    """Check that optional packages are installed.
+
+    Args:
+        names: Import names; by default those of evaluation, `faiss` and `torch`.
+
+    Raises:
+        Misconfigured: `trainer_missing` if one of them is not installed.
+    """
     missing = [name for name in names or ("faiss", "torch") if find_spec(name) is None]
     if missing:
         raise Misconfigured(
             "trainer_missing",
-            f"This needs {', '.join(missing)}, which is not installed: "
-            "pip install 'placewise[trainer]'.",
+            f"This command requires {', '.join(missing)}. "
+            "Install it: pip install 'placewise[trainer]'.",
         )

@@ -1,10 +1,8 @@
-"""`placewise export descriptors|pairs|geojson`: what a map knows, for other programs.
+"""`placewise export`: write a map's data for other programs.
 
-A generation's descriptors into a folder.
-
-Retrieval pairs as hloc reads them: two names a line, the best match of a photo first.
-
-A map's photos as a GeoJSON FeatureCollection (RFC 7946): longitude first, WGS 84.
+`descriptors` writes a generation's descriptors as NumPy and CSV files, `pairs` writes retrieval
+pairs in hloc's format (two names per line, best match first), and `geojson` writes the photos as an
+RFC 7946 FeatureCollection (WGS 84, longitude first).
 """
 
 from __future__ import annotations
@@ -46,56 +44,72 @@ EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
 def export_descriptors(
     client: Client, out: Path, generation_id: str | None, progress: Progress
 ) -> Json:
-    """Write FILES into the folder; each is whole or not there.
+    """Download a generation's descriptors and write EXPORTED_FILES, each of them atomically.
 
-    Raises InvalidRequest (`bad_id`), Conflict (`nothing_described`), NotFound, Misconfigured
-    (`out_unwritable`).
+    Args:
+        client: Client of the map.
+        out: Output folder; created if it does not exist.
+        generation_id: The generation; None for the active one.
+        progress: Shows the number of bytes received.
+
+    Returns:
+        `file`, `generation_id`, `rows` and `dimension`.
+
+    Raises:
+        InvalidRequest: `bad_id`.
+        Conflict: `nothing_described` if the map has no active generation.
+        NotFound: The map has no such generation.
+        Misconfigured: `out_unwritable`.
     """
-    chosen = (
-        _validate_generation_id(generation_id) if generation_id else _active_generation_id(client)
-    )
+    if generation_id is None:
+        generation_id = _active_generation_id(client)
+    else:
+        generation_id = _validate_generation_id(generation_id)
     receiving = progress.add_task("receiving (bytes)", total=None)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out) as received:
             client.export_descriptors(
-                chosen, received, lambda size: progress.update(receiving, completed=size)
+                generation_id, received, lambda size: progress.update(receiving, completed=size)
             )
             received.seek(0)
             with tarfile.open(fileobj=received, mode="r:") as tar:
                 for name in EXPORTED_FILES:
                     member = tar.extractfile(name)
-                    assert member is not None, "the server sends files"
+                    assert member is not None, "the archive contains regular files"
                     with member, atomic_write(out / name) as file:
                         shutil.copyfileobj(member, file)
     except OSError as error:
         raise Misconfigured(
-            "out_unwritable", f"{printable_path(out)} can't be written: {error.strerror}."
+            "out_unwritable", f"Can't write to {printable_path(out)}: {error.strerror}."
         ) from error
     rows = np.load(out / "descriptors.npy", mmap_mode="r")
     return {
         "file": printable_path(out / "descriptors.npy"),
-        "generation_id": chosen,
+        "generation_id": generation_id,
         "rows": rows.shape[0],
         "dimension": rows.shape[1],
     }
 
 
 def _active_generation_id(client: Client) -> str:
-    for one in client.generations():
-        if one["state"] == "active":
-            return str(one["generation_id"])
+    for generation in client.generations():
+        if generation["state"] == "active":
+            return str(generation["generation_id"])
     raise Conflict(
-        "nothing_described", "The map has no described photo yet. Upload some: placewise index."
+        "nothing_described",
+        "The map has no photos with descriptors yet. Upload photos: placewise index.",
     )
 
 
 def _validate_generation_id(generation_id: str) -> str:
-    """What is no id would be another path."""
+    """Reject anything but a UUID: the value becomes part of the URL's path."""
     try:
         return str(UUID(generation_id))
     except ValueError:
-        raise InvalidRequest("bad_id", f"{generation_id!r} is no generation's id.") from None
+        raise InvalidRequest(
+            "bad_id", f"Invalid generation ID {generation_id!r}: a UUID is required."
+        ) from None
 
 
 class PairNames(StrEnum):
@@ -106,33 +120,37 @@ class PairNames(StrEnum):
 def export_pairs(
     client: Client, file: BinaryIO, top_k: int, names: PairNames, progress: Progress
 ) -> Json:
-    """Ask with each labelled query, or with every photo where there is none.
+    """Search with each labelled query, or with every photo of a map without any, and write pairs.
 
-    Returns counts: `asked`, `pairs`, and `passed_over` of photos that are not described. Raises
-    Conflict (`no_photos`), InvalidRequest (`ambiguous_names`: two photos of one name, or a name
-    with a space, which hloc's format has no way to write).
+    Returns:
+        Counts: `asked` (queries), `pairs`, and `passed_over` (queries without a descriptor).
+
+    Raises:
+        Conflict: `no_photos` if the map is empty.
+        InvalidRequest: `ambiguous_names` if two photos share a name, or if a name contains white
+            space, which hloc's format can't represent.
     """
     photos = list(client.each("/search", "images"))
     if names == PairNames.FILENAME:
         _check_unique_names(photos)
-    asked = [one for one in photos if one["role"] == "query"] or photos
-    if not asked:
-        raise Conflict("no_photos", "The map has no photos yet. Upload some: placewise index.")
-    asking = progress.add_task("asking", total=len(asked))
-    pairs = passed_over = 0
-    for photo in asked:
+    queries = [photo for photo in photos if photo["role"] == "query"] or photos
+    if not queries:
+        raise Conflict("no_photos", "The map has no photos yet. Upload photos: placewise index.")
+    bar = progress.add_task("querying", total=len(queries))
+    pairs = skipped = 0
+    for photo in queries:
         try:
-            found = client.similar_to(photo["image_id"], top_k=top_k)["similar_images"]
+            matches = client.similar_to(photo["image_id"], top_k=top_k)["similar_images"]
         except Conflict as error:
             if error.code != "not_searchable":
                 raise
-            passed_over += 1
-            found = []
-        for match in found:
+            skipped += 1
+            matches = []
+        for match in matches:
             file.write(f"{_photo_name(photo, names)} {_photo_name(match, names)}\n".encode())
             pairs += 1
-        progress.advance(asking)
-    return {"asked": len(asked), "pairs": pairs, "passed_over": passed_over}
+        progress.advance(bar)
+    return {"asked": len(queries), "pairs": pairs, "passed_over": skipped}
 
 
 def _photo_name(photo: Json, names: PairNames) -> str:
@@ -140,13 +158,13 @@ def _photo_name(photo: Json, names: PairNames) -> str:
 
 
 def _check_unique_names(photos: list[Json]) -> None:
-    times = Counter(photo["original_filename"] for photo in photos)
-    bad = [name for name, count in times.items() if count > 1 or name.split() != [name]]
+    counts = Counter(photo["original_filename"] for photo in photos)
+    bad = [name for name, count in counts.items() if count > 1 or name.split() != [name]]
     if bad:
         raise InvalidRequest(
             "ambiguous_names",
-            f"{len(bad)} names stand for several photos, or have a space: {bad[0]!r}. Call photos "
-            "by their ids: --names id.",
+            f"{len(bad)} file names are shared by several photos or contain white space, for "
+            f"example {bad[0]!r}. Identify photos by ID instead: --names id.",
         )
 
 
@@ -164,86 +182,107 @@ PHOTO_PROPERTIES = (
 
 
 def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Progress) -> Json:
-    """One feature for each photo, without a geometry where it has no coordinates. With
-    `estimates`, each labelled query is asked with, and its estimate is a feature of its own.
+    """Write one feature per photo; a photo without coordinates has a null geometry.
 
-    Returns counts: `photos`, `estimates`, `passed_over` of queries that are not described.
+    Args:
+        client: Client of the map.
+        file: Output file.
+        estimates: Also search with each labelled query and write its estimate as a feature.
+        progress: Shows the photos written and the queries searched.
+
+    Returns:
+        Counts: `photos`, `estimates`, and `passed_over` (queries without a descriptor).
     """
     writing = progress.add_task("photos", total=client.stats()["total_images"])
     photos = 0
     queries: list[Json] = []
     out = _FeatureWriter(file)
     for photo in client.each("/search", "images"):
-        kept = {name: photo[name] for name in PHOTO_PROPERTIES}
-        out.add(photo["image_id"], photo, {"kind": "photo", **kept})
+        properties = {name: photo[name] for name in PHOTO_PROPERTIES}
+        out.add(photo["image_id"], photo, {"kind": "photo", **properties})
         photos += 1
         if estimates and photo["role"] == "query":
             queries.append(photo)
         progress.advance(writing)
-    passed_over = 0
-    asking = progress.add_task("asking", total=len(queries), visible=estimates)
+    skipped = 0
+    bar = progress.add_task("querying", total=len(queries), visible=estimates)
     for photo in queries:
         try:
             estimate = client.similar_to(photo["image_id"])["estimate"]
         except Conflict as error:
             if error.code != "not_searchable":
                 raise
-            passed_over += 1
+            skipped += 1
         else:
-            about = {"kind": "estimate", "query": photo["image_id"], **estimate}
-            out.add(f"{photo['image_id']}#estimate", estimate, about)
-        progress.advance(asking)
+            properties = {"kind": "estimate", "query": photo["image_id"], **estimate}
+            out.add(f"{photo['image_id']}#estimate", estimate, properties)
+        progress.advance(bar)
     out.end()
     return {
         "photos": photos,
-        "estimates": len(queries) - passed_over,
-        "passed_over": passed_over,
+        "estimates": len(queries) - skipped,
+        "passed_over": skipped,
     }
 
 
 class _FeatureWriter:
-    """Features, one a line, written as they come."""
+    """Streams GeoJSON features to a file, one per line."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._between = b"\n"
+        self._separator = b"\n"
         file.write(b'{"type": "FeatureCollection", "features": [')
 
-    def add(self, feature_id: str, where: Json, properties: Json) -> None:
+    def add(self, feature_id: str, position: Json, properties: Json) -> None:
         geometry: dict[str, Any] | None = None
-        if where["latitude"] is not None:
-            geometry = {"type": "Point", "coordinates": [where["longitude"], where["latitude"]]}
+        if position["latitude"] is not None:
+            geometry = {
+                "type": "Point",
+                "coordinates": [position["longitude"], position["latitude"]],
+            }
         feature = {
             "type": "Feature",
             "id": feature_id,
             "geometry": geometry,
             "properties": properties,
         }
-        self._file.write(self._between + json.dumps(feature, ensure_ascii=False).encode())
-        self._between = b",\n"
+        self._file.write(self._separator + json.dumps(feature, ensure_ascii=False).encode())
+        self._separator = b",\n"
 
     def end(self) -> None:
         self._file.write(b"\n]}\n")
 
 
-app = typer.Typer(help="Write a map's descriptors, pairs for hloc, or its photos as GeoJSON.")
+app = typer.Typer(
+    help="Export a map's descriptors, retrieval pairs for hloc, or photos as GeoJSON."
+)
 
 
 @app.command("descriptors")
 def descriptors(
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", file_okay=False, help="Made if need be.")
+        Path,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            file_okay=False,
+            help="Output folder; created if it does not exist.",
+        ),
     ],
     generation: Annotated[
-        str | None, typer.Option(metavar="ID", help="Left out: the generation that answers.")
+        str | None,
+        typer.Option(metavar="ID", help="Generation to export. Default: the active one."),
     ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write descriptors.npy (photos x dimension, float32), and photos.csv and names.txt in the
-    order of its rows. np.load(..., mmap_mode="r") reads it without loading it."""
+    """Export descriptors as NumPy and CSV files.
+
+    Writes descriptors.npy (photos x dimension, float32), and photos.csv and names.txt in the order
+    of its rows. Use np.load(..., mmap_mode="r") to read descriptors.npy without loading it.
+    """
     with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             written = export_descriptors(client, out, generation, progress)
@@ -254,21 +293,21 @@ def descriptors(
 
 @app.command("pairs")
 def pairs(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.txt")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.txt", help="Output file.")],
     top_k: Annotated[
-        int, typer.Option("--top-k", min=1, max=100, help="Matches of each photo.")
+        int, typer.Option("--top-k", min=1, max=100, help="Maximum number of matches per query.")
     ] = 20,
     names: Annotated[
-        PairNames, typer.Option(help="What photos are called: by their file's name or their id.")
+        PairNames, typer.Option(help="Identify photos by their original file name or by ID.")
     ] = PairNames.FILENAME,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write each photo's most similar ones as hloc reads them: `NAME NAME` in each line.
+    """Export retrieval pairs in hloc's format: `QUERY MATCH` on each line.
 
-    Asked are the map's labelled queries; where it has none, all of its photos.
+    The queries are the map's labelled queries, or all of its photos if it has none.
     """
     with report_errors(as_json):
         check_output_path(out, ".txt", "a list of pairs")
@@ -281,26 +320,26 @@ def pairs(
         _print_result(
             {"file": str(out), **written},
             as_json,
-            f"{written['pairs']} pairs of {written['asked']} photos, "
-            f"{written['passed_over']} not described",
+            f"{written['pairs']} pairs for {written['asked']} queries, "
+            f"{written['passed_over']} of them without a descriptor",
         )
 
 
 @app.command("geojson")
 def geojson(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.geojson")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.geojson", help="Output file.")],
     estimates: Annotated[
         bool,
-        typer.Option(help="Ask with each labelled query, and add where the map places it."),
+        typer.Option(help="Also search with each labelled query and export its estimated place."),
     ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write every photo with what is known of it as a GeoJSON feature (RFC 7946)."""
+    """Export every photo with its metadata as a GeoJSON feature (RFC 7946)."""
     with report_errors(as_json):
-        check_output_path(out, ".geojson", "GeoJSON")
+        check_output_path(out, ".geojson", "a GeoJSON export")
         with (
             connect(server, map_name, key) as client,
             progress_bar() as progress,

@@ -1,4 +1,4 @@
-"""Choosing an extractor on the command line: by its name, or by its parts."""
+"""Command-line options that select an extractor, by name or by its components."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shared.extractor_config.configs import (
     add_extractor_options,
 )
 
-# `dinov2_vits14`, as its publisher writes it.
+# Keyed by the publisher's names, such as `dinov2_vits14`.
 BACKBONES = {
     recipe.backbone.replace("dinov2-", "dinov2_"): name
     for name, recipe in EXTRACTOR_CONFIGS.items()
@@ -26,47 +26,58 @@ PreprocessingOption = Annotated[
     str | None,
     typer.Option(
         "--preprocessing",
-        help=f"How photos are brought to size: {', '.join(PREPROCESSING_NAMES)}; left out: the "
-        "extractor's own.",
+        help=f"Resizing and cropping: {', '.join(PREPROCESSING_NAMES)}. "
+        "Default: the extractor's own.",
     ),
 ]
 BackboneOption = Annotated[
     str | None,
-    typer.Option("--backbone", help=f"Instead of --extractor: {', '.join(BACKBONES)}."),
+    typer.Option("--backbone", help=f"Backbone, instead of --extractor: {', '.join(BACKBONES)}."),
 ]
-LayerOption = Annotated[int | None, typer.Option("--layer", help="Block of a transformer, from 0.")]
+LayerOption = Annotated[
+    int | None, typer.Option("--layer", help="Transformer block, counted from 0.")
+]
 FacetOption = Annotated[
-    str | None, typer.Option("--facet", help=f"What is taken of it: {', '.join(FACETS)}.")
+    str | None,
+    typer.Option("--facet", help=f"Facet of the transformer layer: {', '.join(FACETS)}."),
 ]
 AggregatorOption = Annotated[
     str | None,
     typer.Option(
         "--aggregator",
-        help=f"What makes one descriptor of them: {', '.join(EXTRACTOR_AGGREGATORS)}.",
+        help=f"Aggregation of local features: {', '.join(EXTRACTOR_AGGREGATORS)}.",
     ),
 ]
 TemperatureOption = Annotated[
-    float | None, typer.Option("--temperature", help="Of soft-vlad: how hard; left out: 1.")
+    float | None,
+    typer.Option("--temperature", help="Softmax temperature of soft-vlad. Default: 1."),
 ]
 
 
 def extractor_name(
     extractor: str | None, backbone: str | None, **options: str | int | float | None
 ) -> str:
-    """The name of the extractor that has one or the other, with the options that are not None.
+    """Build the full extractor name from `--extractor` or `--backbone` and further options.
 
-    InvalidRequest: `unknown_backbone`, `two_extractors`, `no_extractor` (options, but of what?).
+    Args:
+        extractor: An extractor's name.
+        backbone: A key of `BACKBONES`, instead of `extractor`.
+        options: Extractor options by name; None means that the option was not given.
+
+    Raises:
+        InvalidRequest: `unknown_backbone`; `two_extractors` if both are given; `no_extractor` if
+            options are given with neither.
     """
     if extractor is None and backbone is None:
         named = ", ".join(f"--{option}" for option, value in options.items() if value is not None)
-        raise InvalidRequest("no_extractor", f"{named}: say of which --extractor, too.")
+        raise InvalidRequest("no_extractor", f"{named} requires --extractor. Add --extractor NAME.")
     if extractor is not None and backbone is not None:
         raise InvalidRequest(
-            "two_extractors", "--extractor and --backbone say the same thing: give one of them."
+            "two_extractors", "--extractor and --backbone exclude each other. Use one of them."
         )
     if backbone is not None and backbone not in BACKBONES:
         raise InvalidRequest(
             "unknown_backbone",
-            f"There is no backbone {backbone!r}. Known: {', '.join(BACKBONES)}.",
+            f"Unknown backbone {backbone!r}. Available: {', '.join(BACKBONES)}.",
         )
     return add_extractor_options(extractor or BACKBONES[str(backbone)], options)

@@ -1,4 +1,8 @@
-"""The command's tree, of which a run imports only the branch that it is asked for."""
+"""The Typer application of `placewise`, with lazily imported commands.
+
+A run imports only the module of the command it executes: some commands load torch or Lightning,
+which takes seconds and is not installed in every image.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from collections.abc import Collection
 
 import typer
 
-# In the order of the help: the module below services.cli, and what of it is the command.
+# Command -> (module below services.cli, attribute). The order is that of the help.
 COMMANDS = {
     "serve": ("operations.servers", "serve"),
     "search": ("operations.servers", "search"),
@@ -44,10 +48,10 @@ COMMANDS = {
 
 
 def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
-    """The commands of these names. Each brings libraries that the others can do without."""
+    """Build the application with the named commands, importing only their modules."""
     app = typer.Typer(
         name="placewise",
-        help="Photo in, place out: visual place recognition on your own photos.",
+        help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         add_completion=False,
@@ -64,14 +68,15 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
 
 
 def run() -> None:
-    """Parse the command line and do it."""
+    """Parse the command line and run the command."""
     logging.basicConfig(
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
-    asked = sys.argv[1:2]
-    # What is no command is answered by the whole tree: the help, or what was meant.
-    build_app(asked if asked and asked[0] in COMMANDS else COMMANDS.keys())()
+    names = sys.argv[1:2]
+    # Anything but a known command (--help, a typo) needs every command: for the help text and
+    # for the suggestion of a similar name.
+    build_app(names if names and names[0] in COMMANDS else COMMANDS.keys())()
 
 
 def _root_callback() -> None:
-    """Makes a tree of one command a tree, too."""
+    """Keep the application a command group even if it has only one command."""

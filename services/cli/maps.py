@@ -1,4 +1,4 @@
-"""`placewise maps list|create|switch|delete`."""
+"""`placewise maps`: list, create, switch and delete maps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ from services.cli.output import (
 from shared.client import Json
 from shared.errors import Conflict
 
-app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
+app = typer.Typer(
+    help="Manage maps: named photo databases, each with its own extractor and vocabulary."
+)
 
 MapName = Annotated[str, typer.Argument(metavar="NAME")]
 
@@ -31,16 +33,16 @@ MapName = Annotated[str, typer.Argument(metavar="NAME")]
 def list_maps(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
-    """Show every map."""
+    """List all maps with their photo counts and extractors."""
     with report_errors(as_json):
         with connect(server, None, key) as client:
-            found = client.maps()
+            maps = client.maps()
         if as_json:
-            print_json(found)
+            print_json(maps)
             return
         counts = ("photos", "searchable", "queries")
         table = Table("map", *counts, "extractor", "vocabulary", "dimension")
-        for map_ in found:
+        for map_ in maps:
             table.add_row(
                 map_["name"],
                 str(map_["photos"]),
@@ -56,50 +58,57 @@ def list_maps(
 def _format_dimension(map_: Json) -> str:
     if map_["dimension"] is None:
         return ""
-    whole = "" if map_["pca_from"] is None else f" (PCA of {map_['pca_from']})"
-    return f"{map_['dimension']}{whole}"
+    pca_note = "" if map_["pca_from"] is None else f" (PCA of {map_['pca_from']})"
+    return f"{map_['dimension']}{pca_note}"
 
 
 @app.command("create")
 def create(
     name: MapName,
     extractor: Annotated[
-        str | None, typer.Option(help="How its photos are described; left out: as configured.")
+        str | None, typer.Option(help="Extractor of the map. Default: the setting EXTRACTOR.")
     ] = None,
     preprocessing: PreprocessingOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make an empty map."""
+    """Create an empty map."""
     with report_errors(as_json):
         if preprocessing is not None:
             extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
-            made = client.create_map(name, extractor)
+            created = client.create_map(name, extractor)
         if as_json:
-            print_json(made)
+            print_json(created)
             return
-        console.print(f"The map {name} is there, for photos described by {made['extractor']}.")
+        console.print(f"Created map {name} with extractor {created['extractor']}.")
 
 
 @app.command("switch")
 def switch(
     name: MapName,
     extractor: Annotated[
-        str, typer.Option("--extractor", help="By name: gsv:NAME of a model that was added, say.")
+        str,
+        typer.Option(
+            "--extractor", help="Extractor name, for example gsv:NAME for an added model."
+        ),
     ],
     vocabulary: Annotated[
         str | None,
         typer.Option(
-            metavar="ID", help="One that the map has; left out: the one that comes with it, if any."
+            metavar="ID",
+            help="Vocabulary of the map. Default: the one shipped with the extractor, if any.",
         ),
     ] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Describe a map's photos with another extractor; search goes on, and switches at the end."""
+    """Reindex a map with another extractor.
+
+    Searches use the current descriptors until the new ones are complete.
+    """
     with report_errors(as_json):
         with connect(server, name, key) as client, progress_bar() as progress:
             started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
@@ -109,7 +118,7 @@ def switch(
             return
         result = job["result"]
         console.print(
-            f"The map {name} is described by {extractor}: {result['photos']} photos, "
+            f"Map {name} now uses {extractor}: {result['photos']} photos, "
             f"{result['dimension']} dimensions, {result['failed']} failed.",
             soft_wrap=True,
             markup=False,
@@ -119,22 +128,22 @@ def switch(
 @app.command("delete")
 def delete(
     name: MapName,
-    yes: Annotated[bool, typer.Option("--yes", help="Don't ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete without confirmation.")] = False,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Delete a map with all its photos."""
+    """Delete a map and all its photos."""
     with report_errors(as_json):
         with connect(server, None, key) as client:
             photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
             if photos and not yes and not sys.stdin.isatty():
                 raise Conflict(
                     "not_confirmed",
-                    f"The map {name} has {photos} photos. To delete them: --yes.",
+                    f"Map {name} contains {photos} photos. Pass --yes to delete them.",
                 )
             if photos and not yes:
-                typer.confirm(f"Delete the map {name} with its {photos} photos?", abort=True)
+                typer.confirm(f"Delete map {name} and its {photos} photos?", abort=True)
             deleted = client.delete_map(name)
         if as_json:
             print_json(deleted)

@@ -1,6 +1,6 @@
-"""What a command prints: tables and progress for people, JSON for programs, errors for both.
+"""Command output: tables and progress bars, JSON, error reporting and atomic file writes.
 
-Files that are there when they are whole.
+Answers are written to stdout; progress and messages are written to stderr.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
-# Progress and messages go to stderr: stdout is the answer, and can be piped.
+# Progress and messages go to stderr, so that the answer on stdout can be piped.
 err_console = Console(stderr=True, highlight=False)
 console = Console(highlight=False)
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")]
-MapOption = Annotated[str | None, typer.Option("--map", help="The map that is meant.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+MapOption = Annotated[
+    str | None, typer.Option("--map", help="Name of the map. Default: `default`.")
+]
 ServerOption = Annotated[
     str | None,
     typer.Option(
         "--server",
         envvar="PLACEWISE_SERVER",
-        help="Address of a running Placewise; left out: the one on PLACEWISE_HOME.",
+        help="URL of a Placewise server. Default: the server on PLACEWISE_HOME.",
     ),
 ]
 
@@ -40,14 +42,14 @@ KeyOption = Annotated[
     typer.Option(
         "--key",
         envvar="PLACEWISE_KEY",
-        help="The key that the server wants. Better in the variable: others on this machine can "
-        "see a command's options. Not needed for the server on PLACEWISE_HOME.",
+        help="API key. Prefer the environment variable: other users of this machine can see "
+        "command-line options. Not required for the server on PLACEWISE_HOME.",
     ),
 ]
 
 
 def printable_path(path: Path) -> str:
-    """The path as text that can be printed, also where it is not UTF-8."""
+    """Return the path as printable text; bytes that are not UTF-8 are replaced."""
     return os.fsencode(path).decode("utf-8", "replace")
 
 
@@ -57,7 +59,7 @@ def print_json(value: Any) -> None:
 
 @contextlib.contextmanager
 def report_errors(as_json: bool) -> Iterator[None]:
-    """Turn an error that can be explained into one line and exit code 1."""
+    """Report a PlacewiseError or database outage in one line and exit with code 1."""
     try:
         yield
     except PlacewiseError as error:
@@ -72,10 +74,10 @@ def report_errors(as_json: bool) -> Iterator[None]:
 
 
 def _database_problem(error: Exception) -> PlacewiseError | None:
-    """The explanation of a failure of the catalog; None for every other error."""
+    """The Unavailable error of a database failure; None for any other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.database_errors import to_unavailable  # most commands do without a database
+    from shared.catalog.database_errors import to_unavailable  # few commands use a database
 
     return to_unavailable(error)
 
@@ -84,12 +86,12 @@ def _print_error(error: PlacewiseError, as_json: bool) -> None:
     if as_json:
         print_json(error.as_problem())
     else:
-        # What went wrong is no markup: a file's name may hold brackets.
+        # Escaped: file names may contain brackets, which rich would read as markup.
         err_console.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
 
 
 def progress_bar() -> Progress:
-    """A bar on stderr; silent where stderr is no terminal."""
+    """A progress bar on stderr, hidden if stderr is not a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -99,24 +101,30 @@ def progress_bar() -> Progress:
     )
 
 
-def print_failures(report: dict[str, Any], *words: str) -> None:
-    """What is listed under each of the words, with its reason."""
-    for word in words:
-        if report[word]:
-            err_console.print(f"{len(report[word])} {word}:")
-        for item in report[word]:
+def print_failures(report: dict[str, Any], *outcomes: str) -> None:
+    """Print the items of a report with their reasons.
+
+    Args:
+        report: Lists of items with `path`, `reason` and optionally `filename`.
+        outcomes: The lists to print, such as `refused` and `failed`.
+    """
+    for outcome in outcomes:
+        if report[outcome]:
+            err_console.print(f"{len(report[outcome])} {outcome}:")
+        for item in report[outcome]:
             name = f" ({item['filename']})" if "filename" in item else ""
             err_console.print(
-                f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
+                f"[red]{outcome}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
                 soft_wrap=True,
             )
 
 
 @contextlib.contextmanager
 def atomic_write(out: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name when the block has ended well; else nothing is left of it.
+    """Open a temporary file that replaces `out` if the block succeeds and is removed otherwise.
 
-    Raises Misconfigured (`out_unwritable`).
+    Raises:
+        Misconfigured: `out_unwritable`.
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     try:
@@ -127,20 +135,30 @@ def atomic_write(out: Path) -> Iterator[BinaryIO]:
         partial.replace(out)
     except OSError as error:
         raise Misconfigured(
-            "out_unwritable", f"{printable_path(out)} can't be written: {error.strerror}."
+            "out_unwritable", f"Can't write {printable_path(out)}: {error.strerror}."
         ) from error
     finally:
-        # Where even the folder is missing, there is nothing to take away.
+        # Fails if the folder itself is missing: then there is no file to remove.
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
 
 
 def check_output_path(out: Path, suffix: str, what: str) -> None:
-    """InvalidRequest (`bad_out`) unless `out` ends in `suffix` and its folder is there.
+    """Check an output path before the long computation of its content.
 
-    Asked before the minutes that it takes to make `what` ("a vocabulary", say).
+    Args:
+        out: The path.
+        suffix: The required file name extension.
+        what: What is written, for the error message, such as "a vocabulary".
+
+    Raises:
+        InvalidRequest: `bad_out` if the extension is wrong or the folder does not exist.
     """
     if out.suffix != suffix:
-        raise InvalidRequest("bad_out", f"{printable_path(out)}: {what}'s file ends in {suffix}.")
+        raise InvalidRequest(
+            "bad_out", f"{printable_path(out)}: the file name of {what} must end in {suffix}."
+        )
     if not out.parent.is_dir():
-        raise InvalidRequest("bad_out", f"There is no folder {printable_path(out.parent)}.")
+        raise InvalidRequest(
+            "bad_out", f"Folder {printable_path(out.parent)} does not exist. Create it first."
+        )

@@ -1,4 +1,4 @@
-"""`placewise query PHOTO`: which known place is this?"""
+"""`placewise query PHOTO`: find the photos most similar to a photo and estimate its place."""
 
 from __future__ import annotations
 
@@ -21,25 +21,32 @@ from services.cli.output import (
 from shared.client import Json
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 
-MAX_CLUSTERS_SHOWN = 3  # shown of an explanation
+MAX_CLUSTERS_SHOWN = 3  # per explanation
 
 
 def query(
     photo: Annotated[Path, typer.Argument(metavar="PHOTO", exists=True, dir_okay=False)],
-    top_k: Annotated[int, typer.Option(min=1, max=100, help="How many photos to answer.")] = 10,
-    min_score: Annotated[float | None, typer.Option(min=-1, max=1)] = None,
-    near: Annotated[
-        str | None, typer.Option(help="LAT,LON,RADIUS_M: only photos taken there.")
+    top_k: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of results.")] = 10,
+    min_score: Annotated[
+        float | None, typer.Option(min=-1, max=1, help="Minimum cosine similarity.")
     ] = None,
-    box: Annotated[str | None, typer.Option(help="S,W,N,E in degrees.")] = None,
-    captured_after: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
-    captured_before: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
-    place: Annotated[str | None, typer.Option(help="Only photos with this label.")] = None,
-    tags: Annotated[str | None, typer.Option(help="Separated by commas: all are wanted.")] = None,
+    near: Annotated[str | None, typer.Option(help="Only photos within LAT,LON,RADIUS_M.")] = None,
+    box: Annotated[str | None, typer.Option(help="Only photos within S,W,N,E (degrees).")] = None,
+    captured_after: Annotated[
+        str | None, typer.Option(help="Only photos taken after this ISO 8601 time.")
+    ] = None,
+    captured_before: Annotated[
+        str | None, typer.Option(help="Only photos taken before this ISO 8601 time.")
+    ] = None,
+    place: Annotated[str | None, typer.Option(help="Only photos with this place label.")] = None,
+    tags: Annotated[
+        str | None, typer.Option(help="Only photos that have all of these comma-separated tags.")
+    ] = None,
     word_weights: Annotated[
         bool,
         typer.Option(
-            "--word-weights/--no-word-weights", help="Rank by the map's word weights, if any."
+            "--word-weights/--no-word-weights",
+            help="Rank by the map's word weights, if it has any.",
         ),
     ] = True,
     rerank: Annotated[
@@ -47,19 +54,22 @@ def query(
         typer.Option(
             min=1,
             max=MAX_RERANK_CANDIDATES,
-            help="Compare the first N photos patch by patch.",
+            help="Rerank the first N results by comparing patches.",
             metavar="N",
         ),
     ] = None,
     explain: Annotated[
-        bool, typer.Option(help="Say of each photo what makes it similar; --json has the overlays.")
+        bool,
+        typer.Option(
+            help="Show which image parts make each result similar. --json includes the overlays."
+        ),
     ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the indexed photos most similar to a photo, which is not stored."""
+    """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
     with report_errors(as_json):
         with connect(server, map_name, key) as client:
             answer = client.similar_to_file(
@@ -89,24 +99,24 @@ def query(
             Column("latitude", no_wrap=True),
             Column("longitude", no_wrap=True),
             "place",
-            *([Column("made of", overflow="fold")] if explain else []),
+            *([Column("explained by", overflow="fold")] if explain else []),
         )
-        for rank, found in enumerate(answer["similar_images"], start=1):
+        for rank, match in enumerate(answer["similar_images"], start=1):
             table.add_row(
                 str(rank),
-                f"{found['similarity_score']:.4f}",
-                *([f"{found['weighted_score']:.4f}"] if weighted else []),
-                *([_format_score(found["rerank_score"])] if rerank else []),
-                found["original_filename"],
-                _format_degrees(found["latitude"]),
-                _format_degrees(found["longitude"]),
-                found["place"] or "",
-                *([_format_explanation(found["explanation"])] if explain else []),
+                f"{match['similarity_score']:.4f}",
+                *([f"{match['weighted_score']:.4f}"] if weighted else []),
+                *([_format_score(match["rerank_score"])] if rerank else []),
+                match["original_filename"],
+                _format_degrees(match["latitude"]),
+                _format_degrees(match["longitude"]),
+                match["place"] or "",
+                *([_format_explanation(match["explanation"])] if explain else []),
             )
         console.print(table)
         console.print(_format_estimate(answer["estimate"]), soft_wrap=True)
         console.print(
-            f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
+            f"{answer['rows_scanned']} photos compared (certificate: {answer['certificate']}), "
             f"vocabulary: {answer['vocabulary']}, word weights: {answer['word_weights']}",
             soft_wrap=True,
         )
@@ -117,34 +127,34 @@ def _format_score(value: float | None) -> str:
 
 
 def _format_explanation(explanation: Json | None) -> str:
-    """The clusters that add most to the score; without a vocabulary, its grid."""
+    """The clusters that contribute most to the score; without a vocabulary, the patch grid."""
     if explanation is None:
         return ""
     if explanation["clusters"] is None:
         return f"{explanation['rows']} x {explanation['columns']} patches"
-    most = explanation["clusters"][:MAX_CLUSTERS_SHOWN]
-    return ", ".join(f"cluster {one['cluster']}: {one['share']:+.4f}" for one in most)
+    top = explanation["clusters"][:MAX_CLUSTERS_SHOWN]
+    return ", ".join(f"cluster {item['cluster']}: {item['share']:+.4f}" for item in top)
 
 
 def _format_estimate(estimate: Json) -> str:
     """The estimate in one line."""
     if estimate["in_map"] is False:
         return str(estimate["reason"])
-    where = [estimate["place"]] if estimate["place"] else []
+    parts = [estimate["place"]] if estimate["place"] else []
     if estimate["latitude"] is not None:
-        where.append(
+        parts.append(
             f"{estimate['latitude']:.6f}, {estimate['longitude']:.6f} "
-            f"(right means within {estimate['radius_m']:g} m)"
+            f"(positive-match radius {estimate['radius_m']:g} m)"
         )
-    if not where:
-        return f"No place: {estimate['reason']}"
-    sure = (
+    if not parts:
+        return f"No place estimate: {estimate['reason']}"
+    confidence = (
         f"confidence {estimate['confidence']:.0%}"
         if estimate["confidence"] is not None
         else "confidence uncalibrated"
     )
-    known = "" if estimate["in_map"] else "; whether it is in the map at all can't be told yet"
-    return f"Estimate: {'; '.join(where)}, {sure}{known}"
+    in_map_note = "" if estimate["in_map"] else "; can't tell yet whether the place is in the map"
+    return f"Estimate: {'; '.join(parts)}, {confidence}{in_map_note}"
 
 
 def _format_degrees(value: float | None) -> str:

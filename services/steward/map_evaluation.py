@@ -268,7 +268,7 @@ class MapEvaluation:
         """Return the ranking as it would be if the query's place were not in the map."""
         depth = EVIDENCE_DEPTH
         while True:
-            others = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.spot)]
+            others = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.location)]
             if len(others) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
                 return others[:EVIDENCE_DEPTH]
             depth *= 2

@@ -1,6 +1,6 @@
-"""One call of the API after the other: keys, time limits, repetition.
+"""HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
 
-`wire.py` is made of this file by `make client`: change this one.
+`wire.py` is generated from this file by `make client`. Edit this file.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from shared.client.sending import (
 from shared.errors import Conflict, TooManyRequests, Unavailable
 from shared.ids import new_id
 
-PAGE_SIZE = 1000  # records asked for at once: the most that a server grants
+PAGE_SIZE = 1000  # the server's maximum
 
 Answer = TypeVar("Answer")
 
 
 class AsyncTransport:
-    """One server and one map; close it, or use it as a context manager."""
+    """Transport to one server and one map; close it, or use it as a context manager."""
 
     def __init__(
         self,
@@ -51,14 +51,20 @@ class AsyncTransport:
         on_wait: OnWait = lambda error, seconds: None,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """`key` is what a server beyond loopback wants; others don't look at it.
+        """Create a transport. No request is sent yet.
 
-        A call is repeated for `patience_seconds` while the server is away or can't do it (503,
-        507), after waits that double. One that says when to come again (429) is obeyed for as long
-        as it says so: it works, and has too much to do. 0 repeats nothing. A single call takes
-        `timeout_seconds` at most without a byte from the server.
+        Args:
+            url: URL of the server.
+            map_name: Name of the map; None for the server's default.
+            key: API key; a server on a loopback address may not require one.
+            patience_seconds: How long calls are retried, with exponential backoff, while the
+                server is unreachable or unavailable (503, 507). A busy server (429) is retried as
+                its Retry-After says, without a limit. 0 disables retries.
+            on_wait: Called before each wait with the error and the seconds.
+            timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
 
-        Raises InvalidRequest: `bad_key` for a key that no header can carry, `bad_address`.
+        Raises:
+            InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
         """
         self.url = validate_url(url, key)
         self._patience = RetryPolicy(patience_seconds, on_wait)
@@ -82,124 +88,125 @@ class AsyncTransport:
         await self.aclose()
 
     async def aclose(self) -> None:
+        """Close all connections."""
         await self._http.aclose()
 
     def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
-        """The same client with more patience, over the same connections."""
+        """A copy with another retry policy that shares the connections."""
         other = copy.copy(self)
         other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
     async def _send_file(
-        self, path: str, file: Path, called: str | None = None, **options: Any
+        self, path: str, file: Path, filename: str | None = None, **options: Any
     ) -> Json:
         with open_file(file) as stream:
-            files = {"file": (called or printable_name(file), stream)}
+            files = {"file": (filename or printable_name(file), stream)}
             return await self._call("POST", path, stream, files=files, **options)
 
     async def _call(
         self, method: str, path: str, body: Seekable | None = None, **options: Any
     ) -> Json:
-        """One call of the API, repeated as patience allows; `body` is read from its begin."""
+        """Send a request with retries; `body` is rewound before each attempt."""
         if method == "POST" and self._patience.seconds:
             key = {IDEMPOTENCY_KEY: str(new_id())}
             options["headers"] = {**options.get("headers", {}), **key}
 
-        async def once() -> Json:
+        async def attempt() -> Json:
             if body is not None:
                 body.seek(0)
-            answer = await self._ask(self._http, method, f"{API}{path}", **options)
-            found: Json = answer.json()
-            return found
+            response = await self._request(self._http, method, f"{API}{path}", **options)
+            result: Json = response.json()
+            return result
 
-        return await self._repeat(once)
+        return await self._retry(attempt)
 
     async def _get_bytes(self, path: str) -> bytes:
-        async def once() -> bytes:
-            return (await self._ask(self._http, "GET", f"{API}{path}")).content
+        async def attempt() -> bytes:
+            return (await self._request(self._http, "GET", f"{API}{path}")).content
 
-        return await self._repeat(once)
+        return await self._retry(attempt)
 
     async def each(self, path: str, field: str, **params: Any) -> AsyncIterator[Json]:
-        """Every record of a list that comes in pages, each fetched when it is reached."""
+        """Iterate over all records of a paginated list; pages are fetched on demand."""
         cursor: str | None = None
         while True:
-            asked = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
-            page = await self._call("GET", path, params=asked)
-            for one in page[field]:
-                yield one
+            page_params = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
+            page = await self._call("GET", path, params=page_params)
+            for record in page[field]:
+                yield record
             cursor = page["next_cursor"]
             if cursor is None:
                 return
 
     async def _fetch(self, path: str, file: BinaryIO, on_received: Callable[[int], object]) -> None:
-        """Stream an answer into the file, which is emptied before each attempt."""
+        """Stream a response into a file, which is truncated before each attempt."""
 
-        async def once() -> None:
+        async def attempt() -> None:
             file.seek(0)
             file.truncate()
             received = 0
             try:
-                async with self._http.stream("GET", f"{API}{path}") as answer:
-                    if not answer.is_success:
-                        await answer.aread()
-                        raise response_error(answer)
-                    async for piece in answer.aiter_bytes(CHUNK_BYTES):
-                        file.write(piece)
-                        received += len(piece)
+                async with self._http.stream("GET", f"{API}{path}") as response:
+                    if not response.is_success:
+                        await response.aread()
+                        raise response_error(response)
+                    async for chunk in response.aiter_bytes(CHUNK_BYTES):
+                        file.write(chunk)
+                        received += len(chunk)
                         on_received(received)
             except httpx2.TransportError as error:
                 raise self._unreachable("/", error) from error
 
-        await self._repeat(once)
+        await self._retry(attempt)
 
-    async def _put(self, begun: Json, file: BinaryIO) -> None:
-        """Send a direct upload's bytes to where the server has said: no key of ours goes there."""
+    async def _put(self, upload: Json, file: BinaryIO) -> None:
+        """Send a file to a presigned URL, without the API key."""
 
-        async def once() -> None:
+        async def attempt() -> None:
             file.seek(0)
             async with httpx2.AsyncClient(timeout=self._timeout_seconds) as http:
-                await self._ask(
+                await self._request(
                     http,
-                    begun["method"],
-                    begun["url"],
+                    upload["method"],
+                    upload["url"],
                     content=_iter_chunks(file),
-                    headers=begun["headers"],
+                    headers=upload["headers"],
                 )
 
-        await self._repeat(once)
+        await self._retry(attempt)
 
-    async def _ask(
+    async def _request(
         self, http: httpx2.AsyncClient, method: str, url: str, **options: Any
     ) -> httpx2.Response:
-        """A successful answer; anything else as the error that it means."""
+        """Send one request; an error response is raised as the matching PlacewiseError."""
         try:
-            answer = await http.request(method, url, **options)
+            response = await http.request(method, url, **options)
         except httpx2.TransportError as error:
             raise self._unreachable(url, error) from error
-        if answer.is_success:
-            return answer
-        raise response_error(answer)
+        if response.is_success:
+            return response
+        raise response_error(response)
 
     def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
         host = self.url if url.startswith("/") else httpx2.URL(url).host
         return Unavailable(
             "server_unreachable",
-            f"No Placewise answers at {host} ({type(error).__name__}). Is it running?",
+            f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
         )
 
-    async def _repeat(self, call: Callable[[], Awaitable[Answer]]) -> Answer:
+    async def _retry(self, call: Callable[[], Awaitable[Answer]]) -> Answer:
         deadline = time.monotonic() + self._patience.seconds
-        times = 0
+        attempt = 0
         while True:
             try:
                 return await call()
             except (Unavailable, TooManyRequests, Conflict) as error:
-                late = time.monotonic() >= deadline
-                await asyncio.sleep(self._patience.wait_seconds(error, times, late))
-                times += 1
+                is_late = time.monotonic() >= deadline
+                await asyncio.sleep(self._patience.wait_seconds(error, attempt, is_late))
+                attempt += 1
 
 
 async def _iter_chunks(file: BinaryIO) -> AsyncIterator[bytes]:
-    while piece := file.read(CHUNK_BYTES):
-        yield piece
+    while chunk := file.read(CHUNK_BYTES):
+        yield chunk

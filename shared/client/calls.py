@@ -1,6 +1,6 @@
-"""The calls of the HTTP API, as JSON.
+"""The calls of the HTTP API, returning JSON.
 
-Made of `async_calls.py` by `make client`: change that one, not this.
+Generated from `async_calls.py` by `make client`. Edit that file.
 """
 
 from __future__ import annotations
@@ -25,55 +25,65 @@ from shared.client.sending import (
     to_jsonl,
     unreadable_file_error,
 )
-from shared.client.wire import Transport
+from shared.client.wire import AsyncTransport
 
 
-class Client(Transport):
-    """Every call of one server and one map, answered with the API's JSON."""
+class Client(AsyncTransport):
+    """Client of one server and one map. All calls return the API's JSON."""
 
     def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
-        """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...).
+        """Upload a photo.
 
-        It is called `filename`, or as its file is.
+        Args:
+            photo: The file.
+            filename: Name to store; None for the file's own name.
+            fields: Form fields of `POST /upload`: `latitude`, `longitude`, `place`, ...
         """
-        said = {name: str(value) for name, value in fields.items() if value is not None}
-        return self._send_file("/upload", photo, filename, data=said)
+        data = {name: str(value) for name, value in fields.items() if value is not None}
+        return self._send_file("/upload", photo, filename, data=data)
 
     def upload_direct(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
-        """`upload` past the server, straight to its bucket; `fields` as JSON values.
+        """Upload a photo directly to the server's bucket with a presigned URL.
 
-        Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
+        The arguments are those of `upload`; `fields` are JSON values.
+
+        Raises:
+            Conflict: `no_direct_uploads` if the server stores photos in a folder.
         """
         with open_file(photo) as file:
             size, sha256 = size_and_sha256(file)
-            about = {
+            file_info = {
                 "filename": filename or printable_name(photo),
                 "file_size": size,
                 "sha256": sha256,
             }
-            begun = self._call("POST", "/uploads/presign", json={**about, **drop_none(**fields)})
-            self._put(begun, file)
-        return self._call("POST", begun["complete_url"].removeprefix(API))
+            upload = self._call(
+                "POST", "/uploads/presign", json={**file_info, **drop_none(**fields)}
+            )
+            self._put(upload, file)
+        return self._call("POST", upload["complete_url"].removeprefix(API))
 
     def upload_archive(
         self, archive: Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
     ) -> Json:
-        """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
+        """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
         try:
-            with ReadProgressFile(archive.open("rb"), on_sent) as open_file:
-                files = {"archive": (printable_name(archive), open_file)}
-                return self._call("POST", "/upload/batch", open_file, files=files)
+            with ReadProgressFile(archive.open("rb"), on_sent) as stream:
+                files = {"archive": (printable_name(archive), stream)}
+                return self._call("POST", "/upload/batch", stream, files=files)
         except OSError as error:
             raise unreadable_file_error(archive, error) from error
 
     def upload_files(self, photos: Sequence[Path], manifest: Sequence[Json] = ()) -> Json:
-        """Start a batch with these photos; each line of the manifest has a `filename` and the
-        form's fields."""
-        with contextlib.ExitStack() as open_file:
+        """Start a batch upload of photo files.
+
+        Each manifest entry contains a `filename` and form fields of `upload`.
+        """
+        with contextlib.ExitStack() as stack:
             files: list[tuple[str, Any]] = []
             for photo in photos:
                 try:
-                    file = open_file.enter_context(photo.open("rb"))
+                    file = stack.enter_context(photo.open("rb"))
                 except OSError as error:
                     raise unreadable_file_error(photo, error) from error
                 files.append(("file", (photo.name, file)))
@@ -82,28 +92,31 @@ class Client(Transport):
             return self._call("POST", "/upload/batch", files=files)
 
     def import_objects(self, manifest: Sequence[Json]) -> Json:
-        """Start a batch with objects of the server's store; each line has a `key` and the form's
-        fields."""
+        """Start a batch import of objects in the server's store.
+
+        Each manifest entry contains an object `key` and form fields of `upload`.
+        """
         return self.import_manifest(to_jsonl(manifest))
 
     def import_manifest(self, lines: bytes) -> Json:
-        """`import_objects` with the lines as JSONL."""
+        """Start a batch import like `import_objects`, with the manifest as JSONL."""
         headers = {"Content-Type": "application/x-ndjson"}
         return self._call("POST", "/upload/batch", content=lines, headers=headers)
 
     def import_prefix(self, prefix: str) -> Json:
-        """Start a batch with every photo of the server's store whose key begins with `prefix`."""
+        """Start a batch import of all photos in the server's store below a key prefix."""
         return self._call("POST", "/upload/batch", files={"prefix": (None, prefix)})
 
     def batch_items(self, job_id: UUID | str, *states: str) -> Iterator[Json]:
-        """The photos of a batch that are in one of the states, or all of them."""
+        """Iterate over the items of a batch, optionally only those in the given states."""
         return self.each(f"/jobs/{job_id}/items", "items", state=list(states) or None)
 
     def cancel_job(self, job_id: UUID | str) -> Json:
+        """Cancel a job."""
         return self._call("POST", f"/jobs/{job_id}/cancel")
 
     def retry_job(self, job_id: UUID | str) -> Json:
-        """Queue a failed job again; of a batch, its failed items."""
+        """Queue a failed job again; for a batch, its failed items."""
         return self._call("POST", f"/jobs/{job_id}/retry")
 
     def similar_to_file(
@@ -116,7 +129,11 @@ class Client(Transport):
         explain: bool = False,
         **filters: Any,
     ) -> Json:
-        """The photos most similar to one that is not stored; the rest as in `similar_to`."""
+        """Find the stored photos most similar to a file, which is not stored.
+
+        The call waits up to `wait_seconds` for a synchronous response and otherwise polls the job.
+        The other arguments are those of `similar_to`.
+        """
         params = drop_none(
             top_k=top_k,
             min_score=min_score,
@@ -141,11 +158,18 @@ class Client(Transport):
         explain: bool = False,
         **filters: Any,
     ) -> Json:
-        """The photos most similar to a stored one, of those that pass the filters: `near`
-        ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
-        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
-        The first `rerank` of them are compared patch by patch; `explain` says of each what makes
-        it similar."""
+        """Find the photos most similar to a stored one.
+
+        Args:
+            file_id: ID of the query photo.
+            top_k: Maximum number of results.
+            min_score: Minimum cosine similarity.
+            rerank: Number of first results to rerank by comparing patches.
+            explain: Add explanations to the results.
+            filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
+                `captured_before`, `place`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity.
+        """
         params = drop_none(
             top_k=top_k,
             min_score=min_score,
@@ -156,13 +180,14 @@ class Client(Transport):
         return self._result_of(self._call("POST", f"/similarity/{file_id}", params=params))
 
     def _result_of(self, answer: Json) -> Json:
-        """The answer itself, waited for where it is a job's: one job may lead to another."""
+        """Follow `result_url` until the result is available; one job may lead to another."""
         while "result_url" in answer:
             self.wait_for(answer["job_id"])
             answer = self._call("GET", answer["result_url"].removeprefix(API))
         return answer
 
     def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
+        """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
         return self._call("GET", f"/jobs/{job_id}", params={"wait": wait_seconds})
 
     def wait_for(
@@ -171,7 +196,7 @@ class Client(Transport):
         on_progress: Callable[[Json], object] = lambda job: None,
         poll_seconds: float = POLL_SECONDS,
     ) -> Json:
-        """The job once it has ended; `on_progress` sees it after every poll."""
+        """Wait until a job ends; `on_progress` is called with the job after every poll."""
         while True:
             job = self.job(job_id, wait_seconds=poll_seconds)
             on_progress(job)
@@ -179,39 +204,44 @@ class Client(Transport):
                 return job
 
     def photo(self, file_id: UUID | str) -> Json:
+        """Get a stored photo's metadata and state."""
         return self._call("GET", f"/uploads/{file_id}")
 
     def image(self, file_id: UUID | str) -> bytes:
-        """The photo's bytes as they were uploaded."""
+        """Download the original bytes of a photo."""
         return self._get_bytes(f"/uploads/{file_id}/image")
 
     def patch_photo(self, file_id: UUID | str, **fields: Any) -> Json:
+        """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
         return self._call("PATCH", f"/uploads/{file_id}", json=fields)
 
     def delete_photo(self, file_id: UUID | str) -> Json:
+        """Delete a photo."""
         return self._call("DELETE", f"/uploads/{file_id}")
 
     def search(self, **filters: Any) -> Json:
-        """Photos by what is known of them; see `GET /search`."""
+        """Search photos by metadata; for filters see `GET /search`."""
         return self._call("GET", "/search", params=drop_none(**filters))
 
-    def fit_vocabulary(self, **wanted: int) -> Json:
-        """Start fitting; `clusters`, `sample` and `seed` may be given."""
-        return self._call("POST", "/vocabularies", json=wanted)
+    def fit_vocabulary(self, **options: int) -> Json:
+        """Start fitting a vocabulary; options are `clusters`, `sample` and `seed`."""
+        return self._call("POST", "/vocabularies", json=options)
 
     def import_vocabulary(self, file: Path) -> Json:
-        """Start switching to the vocabulary in a `.npz` or `.npy` file."""
+        """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
         return self._send_file("/vocabularies/import", file)
 
     def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
-        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with
-        `PK`), or
-        `.npy` where no one knows what it was learnt with."""
+        """Download a vocabulary file that `import_vocabulary` accepts.
+
+        The format is `.npz` (starting with `PK`), or `.npy` if its provenance is unknown.
+        """
         return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 
     def vocabularies(self) -> list[Json]:
-        found: Any = self._call("GET", "/vocabularies")
-        return list(found)
+        """List the map's vocabularies, newest first."""
+        response: Any = self._call("GET", "/vocabularies")
+        return list(response)
 
     def start_generation(
         self,
@@ -220,41 +250,48 @@ class Client(Transport):
         pca: int | None = None,
         extractor: str | None = None,
     ) -> Json:
-        """Start switching to a vocabulary that the map has, to descriptors of `pca` dimensions, or
-        to another extractor; with none, to whole ones of an extractor without vocabulary."""
-        wanted = drop_none(
+        """Start a new generation of the map's descriptors.
+
+        Args:
+            vocabulary_id: One of the map's vocabularies.
+            pca: Number of dimensions to reduce to by PCA whitening.
+            extractor: Another extractor.
+
+        Without arguments, PCA is undone for an extractor without a vocabulary.
+        """
+        params = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
         )
-        return self._call("POST", "/generations", json=wanted)
+        return self._call("POST", "/generations", json=params)
 
     def generations(self) -> list[Json]:
-        found: Any = self._call("GET", "/generations")
-        return list(found)
+        """List the map's generations, newest first."""
+        response: Any = self._call("GET", "/generations")
+        return list(response)
 
-    def evaluate(self, **wanted: int) -> Json:
-        """Start an evaluation of the map; `sample` and `seed` may be given."""
-        return self._call("POST", "/evaluations", json=wanted)
+    def evaluate(self, **options: int) -> Json:
+        """Start an evaluation of the map; options are `sample` and `seed`."""
+        return self._call("POST", "/evaluations", json=options)
 
-    def learn_word_weights(self, generation_id: UUID | str, **wanted: int) -> Json:
-        """Start learning the weights of the active generation's words; `sample` and `seed` may be
-        given."""
-        return self._call("POST", f"/generations/{generation_id}/word-weights", json=wanted)
+    def learn_word_weights(self, generation_id: UUID | str, **options: int) -> Json:
+        """Start fitting word weights of the active generation; options are `sample` and `seed`."""
+        return self._call("POST", f"/generations/{generation_id}/word-weights", json=options)
 
     def word_weights(self, generation_id: UUID | str) -> Json:
-        """What the map's places have taught of the generation's words."""
+        """Get the word weights that were fitted for a generation."""
         return self._call("GET", f"/generations/{generation_id}/word-weights")
 
     def evaluations(self, limit: int = 50) -> list[Json]:
-        """The map's evaluations, newest first."""
+        """List the map's evaluations, newest first."""
         page = self._call("GET", "/evaluations", params={"limit": limit})
-        found: list[Json] = page["evaluations"]
-        return found
+        evaluations: list[Json] = page["evaluations"]
+        return evaluations
 
     def searches(self, limit: int = 50) -> list[Json]:
-        """What was asked, newest first."""
+        """List the search history, newest first."""
         page = self._call("GET", "/searches", params={"limit": limit})
-        found: list[Json] = page["searches"]
-        return found
+        searches: list[Json] = page["searches"]
+        return searches
 
     def export_descriptors(
         self,
@@ -262,19 +299,20 @@ class Client(Transport):
         file: BinaryIO,
         on_received: Callable[[int], object] = lambda received_bytes: None,
     ) -> None:
-        """Write a tar with `descriptors.npy`, `names.txt` and `photos.csv` to `file`."""
+        """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file."""
         self._fetch(f"/generations/{generation_id}/descriptors", file, on_received)
 
     def maps(self) -> list[Json]:
-        """Every map of the server."""
-        found: Any = self._call("GET", "/maps")
-        return list(found)
+        """List the maps of the server."""
+        response: Any = self._call("GET", "/maps")
+        return list(response)
 
     def create_map(self, name: str, extractor: str | None = None) -> Json:
+        """Create a map; `extractor` defaults to the server's setting."""
         return self._call("POST", "/maps", json=drop_none(name=name, extractor=extractor))
 
     def delete_map(self, name: str) -> Json:
-        """Delete a map with all its photos."""
+        """Delete a map and all its photos."""
         return self._call("DELETE", f"/maps/{quote(name, safe='')}")
 
     def add_model(
@@ -286,36 +324,46 @@ class Client(Transport):
         note: str | None = None,
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
     ) -> Json:
-        """Start adding a checkpoint as the model `name`; `on_sent` sees the bytes sent so far."""
-        said = drop_none(name=name, licence=licence, note=note)
+        """Start adding a checkpoint as a model; `on_sent` receives the bytes sent so far."""
+        data = drop_none(name=name, licence=licence, note=note)
         with open_file(checkpoint) as file:
             files = {"file": (printable_name(checkpoint), ReadProgressFile(file, on_sent))}
-            return self._call("POST", "/models", file, files=files, data=said)
+            return self._call("POST", "/models", file, files=files, data=data)
 
     def models(self) -> list[Json]:
-        """The models that were added."""
+        """List the added models."""
         answer = self._call("GET", "/models")
         return list(answer["models"])
 
     def remove_model(self, name: str) -> Json:
+        """Remove a model that no map uses."""
         return self._call("DELETE", f"/models/{quote(name, safe='')}")
 
     def keys(self) -> list[Json]:
-        """Every key of the server, for an admin; the keys themselves are shown to nobody."""
-        found: Any = self._call("GET", "/keys")
-        return list(found)
+        """List the API keys of the server, without their secrets (admin only)."""
+        response: Any = self._call("GET", "/keys")
+        return list(response)
 
     def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> Json:
-        """A new key: `key` of the answer is shown this once. `limits` are those of POST /keys."""
-        wanted = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
-        return self._call("POST", "/keys", json=wanted)
+        """Create an API key; the field `key` of the response is shown only once.
+
+        `limits` are the optional fields of `POST /keys`.
+        """
+        params = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
+        return self._call("POST", "/keys", json=params)
 
     def revoke_key(self, key_id: str) -> Json:
+        """Revoke an API key."""
         return self._call("DELETE", f"/keys/{key_id}")
 
     def health(self) -> Json:
-        """The state of each part; Unavailable where one is away."""
+        """Get the health of each part.
+
+        Raises:
+            Unavailable: A part is unavailable.
+        """
         return self._call("GET", "/health")
 
     def stats(self) -> Json:
+        """Get statistics of the map."""
         return self._call("GET", "/database/stats")

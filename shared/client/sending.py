@@ -1,4 +1,4 @@
-"""What the asynchronous and the synchronous client share: files, and when to repeat a call."""
+"""Parts shared by the asynchronous and the synchronous client: retry policy, errors and files."""
 
 from __future__ import annotations
 
@@ -26,77 +26,94 @@ from shared.errors import (
 API = "/api/v1"
 IDEMPOTENCY_KEY = "Idempotency-Key"
 FINISHED = ("succeeded", "failed", "cancelled")
-POLL_SECONDS = 20.0  # one long poll
-TIMEOUT_SECONDS = 90.0  # of one call: longer than the longest wait that a server grants
+POLL_SECONDS = 20.0  # duration of a long poll
+TIMEOUT_SECONDS = 90.0  # per call; exceeds the longest long poll that a server allows
 CHUNK_BYTES = 256 * 1024
-INITIAL_BACKOFF_SECONDS = 0.5  # the first wait, where the server has not said how long; it doubles
-MAX_BACKOFF_SECONDS = 8.0  # what it doubles to
-MAX_RETRY_AFTER_SECONDS = 300.0  # whatever the server says
+INITIAL_BACKOFF_SECONDS = 0.5  # doubles with each attempt, without Retry-After
+MAX_BACKOFF_SECONDS = 8.0
+MAX_RETRY_AFTER_SECONDS = 300.0  # upper limit for Retry-After
 
 Json = dict[str, Any]
 OnWait = Callable[[PlacewiseError, float], object]
-"""Told of each wait before it begins: why, and how many seconds."""
+"""Called before each wait with the error and the number of seconds."""
 
 
 class Seekable(Protocol):
+    """A request body that can be rewound for another attempt."""
+
     def seek(self, offset: int, whence: int = ..., /) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
 class RetryPolicy:
-    """For how long a call is repeated, and who is told."""
+    """How long calls are retried (`seconds`; 0 disables retries), and a callback for waits."""
 
     seconds: float = 0.0
     on_wait: OnWait = lambda error, seconds: None
 
     def wait_seconds(self, error: PlacewiseError, attempt: int, deadline_passed: bool) -> float:
-        """How long to wait after the `attempt`th failure (from 0); raises the error where waiting
-        does not help, or patience has ended."""
+        """Compute the wait before the next attempt, with exponential backoff and jitter.
+
+        Args:
+            error: The error of the failed attempt.
+            attempt: Number of the failed attempt, from 0.
+            deadline_passed: Whether the retry period is over.
+
+        Returns:
+            Seconds to wait.
+
+        Raises:
+            PlacewiseError: `error` itself, if it is not retryable or the retry period is over.
+        """
         if not self.seconds or not _is_retryable(error, deadline_passed):
             raise error
-        said = error.extra.get("retry_after_seconds")
-        if said is None:
-            # Up to a quarter more: callers that were cut off together don't come back together.
-            doubled = min(INITIAL_BACKOFF_SECONDS * 2.0**attempt, MAX_BACKOFF_SECONDS)
-            seconds = doubled * random.uniform(1, 1.25)  # noqa: S311
+        retry_after = error.extra.get("retry_after_seconds")
+        if retry_after is None:
+            # Jitter of up to a quarter keeps clients from retrying at the same time.
+            backoff = min(INITIAL_BACKOFF_SECONDS * 2.0**attempt, MAX_BACKOFF_SECONDS)
+            seconds = backoff * random.uniform(1, 1.25)  # noqa: S311
         else:
-            seconds = min(max(float(said), INITIAL_BACKOFF_SECONDS), MAX_RETRY_AFTER_SECONDS)
+            seconds = min(max(float(retry_after), INITIAL_BACKOFF_SECONDS), MAX_RETRY_AFTER_SECONDS)
         self.on_wait(error, seconds)
         return seconds
 
 
 def _is_retryable(error: PlacewiseError, deadline_passed: bool) -> bool:
-    """Is it worth waiting for what the error speaks of to pass?"""
+    """Whether a retry may succeed."""
     if isinstance(error, TooManyRequests):
         return True
-    if isinstance(error, Conflict):  # our own call, whose answer was lost, is still under way
+    if isinstance(error, Conflict):  # our earlier attempt, whose response was lost, still runs
         return error.code == "idempotency_key_in_use" and not deadline_passed
     return not deadline_passed
 
 
 def validate_url(url: str, key: str | None) -> str:
-    """The address without its last slash.
+    """Validate a server's URL and API key; returns the URL without a trailing slash.
 
-    Raises InvalidRequest: `bad_key` for a key that no header can carry, `bad_address`.
+    Raises:
+        InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
     """
     if key is not None and not (key.isascii() and key.isprintable()):
-        raise InvalidRequest("bad_key", "A key is made of printable ASCII characters.")
+        raise InvalidRequest("bad_key", "An API key must consist of printable ASCII characters.")
     if not url.startswith(("http://", "https://")):
-        raise InvalidRequest("bad_address", f"{url!r} is no address such as http://127.0.0.1:8000.")
+        raise InvalidRequest(
+            "bad_address", f"{url!r} is not a valid URL such as http://127.0.0.1:8000."
+        )
     return url.rstrip("/")
 
 
-def response_error(answer: httpx2.Response) -> PlacewiseError:
-    """What an answer that is no success means."""
-    error = error_from_response(answer.status_code, answer.text)
-    after = answer.headers.get("retry-after", "")
-    if after.isdigit():  # a proxy may be the one who says it
-        error.extra.setdefault("retry_after_seconds", int(after))
+def response_error(response: httpx2.Response) -> PlacewiseError:
+    """Convert an error response to a PlacewiseError."""
+    error = error_from_response(response.status_code, response.text)
+    retry_after = response.headers.get("retry-after", "")
+    if retry_after.isdigit():  # may also come from a proxy, without a problem document
+        error.extra.setdefault("retry_after_seconds", int(retry_after))
     return error
 
 
 @contextlib.contextmanager
 def open_file(file: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading; InvalidRequest (`unreadable_file`) if that fails."""
     try:
         with file.open("rb") as stream:
             yield stream
@@ -105,35 +122,36 @@ def open_file(file: Path) -> Iterator[BinaryIO]:
 
 
 def unreadable_file_error(file: Path, error: OSError) -> InvalidRequest:
+    """The error of a file that can't be read."""
     return InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}")
 
 
 def printable_name(file: Path) -> str:
-    """The file's name as text, also where it is not UTF-8."""
+    """The file's name as text; bytes that are not UTF-8 are replaced."""
     return os.fsencode(file.name).decode("utf-8", "replace")
 
 
 def size_and_sha256(file: BinaryIO) -> tuple[int, str]:
-    """Bytes, and their SHA-256 in hexadecimal."""
+    """Size in bytes and hexadecimal SHA-256 of a file."""
     digest, size = hashlib.sha256(), 0
-    while piece := file.read(CHUNK_BYTES):
-        digest.update(piece)
-        size += len(piece)
+    while chunk := file.read(CHUNK_BYTES):
+        digest.update(chunk)
+        size += len(chunk)
     return size, digest.hexdigest()
 
 
 def drop_none(**params: Any) -> Json:
-    """Those that are not None."""
+    """The keyword arguments that are not None."""
     return {name: value for name, value in params.items() if value is not None}
 
 
 def to_jsonl(objects: Sequence[Json]) -> bytes:
-    """JSONL."""
-    return b"".join(json.dumps(one).encode() + b"\n" for one in objects)
+    """Encode objects as JSONL."""
+    return b"".join(json.dumps(item).encode() + b"\n" for item in objects)
 
 
 class ReadProgressFile(io.BufferedIOBase):
-    """A file that tells how far it was read."""
+    """A file wrapper that reports the position after each read."""
 
     def __init__(self, file: BinaryIO, on_read: Callable[[int], object]) -> None:
         self._file = file

@@ -1,6 +1,6 @@
-"""One call of the API after the other: keys, time limits, repetition.
+"""HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
 
-Made of `async_wire.py` by `make client`: change that one, not this.
+Generated from `async_wire.py` by `make client`. Edit that file.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from shared.client.sending import (
 from shared.errors import Conflict, TooManyRequests, Unavailable
 from shared.ids import new_id
 
-PAGE_SIZE = 1000  # records asked for at once: the most that a server grants
+PAGE_SIZE = 1000  # the server's maximum
 
 Answer = TypeVar("Answer")
 
 
-class Transport:
-    """One server and one map; close it, or use it as a context manager."""
+class AsyncTransport:
+    """Transport to one server and one map; close it, or use it as a context manager."""
 
     def __init__(
         self,
@@ -50,14 +50,20 @@ class Transport:
         on_wait: OnWait = lambda error, seconds: None,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """`key` is what a server beyond loopback wants; others don't look at it.
+        """Create a transport. No request is sent yet.
 
-        A call is repeated for `patience_seconds` while the server is away or can't do it (503,
-        507), after waits that double. One that says when to come again (429) is obeyed for as long
-        as it says so: it works, and has too much to do. 0 repeats nothing. A single call takes
-        `timeout_seconds` at most without a byte from the server.
+        Args:
+            url: URL of the server.
+            map_name: Name of the map; None for the server's default.
+            key: API key; a server on a loopback address may not require one.
+            patience_seconds: How long calls are retried, with exponential backoff, while the
+                server is unreachable or unavailable (503, 507). A busy server (429) is retried as
+                its Retry-After says, without a limit. 0 disables retries.
+            on_wait: Called before each wait with the error and the seconds.
+            timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
 
-        Raises InvalidRequest: `bad_key` for a key that no header can carry, `bad_address`.
+        Raises:
+            InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
         """
         self.url = validate_url(url, key)
         self._patience = RetryPolicy(patience_seconds, on_wait)
@@ -81,117 +87,122 @@ class Transport:
         self.close()
 
     def close(self) -> None:
+        """Close all connections."""
         self._http.close()
 
     def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
-        """The same client with more patience, over the same connections."""
+        """A copy with another retry policy that shares the connections."""
         other = copy.copy(self)
         other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
-    def _send_file(self, path: str, file: Path, called: str | None = None, **options: Any) -> Json:
+    def _send_file(
+        self, path: str, file: Path, filename: str | None = None, **options: Any
+    ) -> Json:
         with open_file(file) as stream:
-            files = {"file": (called or printable_name(file), stream)}
+            files = {"file": (filename or printable_name(file), stream)}
             return self._call("POST", path, stream, files=files, **options)
 
     def _call(self, method: str, path: str, body: Seekable | None = None, **options: Any) -> Json:
-        """One call of the API, repeated as patience allows; `body` is read from its begin."""
+        """Send a request with retries; `body` is rewound before each attempt."""
         if method == "POST" and self._patience.seconds:
             key = {IDEMPOTENCY_KEY: str(new_id())}
             options["headers"] = {**options.get("headers", {}), **key}
 
-        def once() -> Json:
+        def attempt() -> Json:
             if body is not None:
                 body.seek(0)
-            answer = self._ask(self._http, method, f"{API}{path}", **options)
-            found: Json = answer.json()
-            return found
+            response = self._request(self._http, method, f"{API}{path}", **options)
+            result: Json = response.json()
+            return result
 
-        return self._repeat(once)
+        return self._retry(attempt)
 
     def _get_bytes(self, path: str) -> bytes:
-        def once() -> bytes:
-            return (self._ask(self._http, "GET", f"{API}{path}")).content
+        def attempt() -> bytes:
+            return (self._request(self._http, "GET", f"{API}{path}")).content
 
-        return self._repeat(once)
+        return self._retry(attempt)
 
     def each(self, path: str, field: str, **params: Any) -> Iterator[Json]:
-        """Every record of a list that comes in pages, each fetched when it is reached."""
+        """Iterate over all records of a paginated list; pages are fetched on demand."""
         cursor: str | None = None
         while True:
-            asked = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
-            page = self._call("GET", path, params=asked)
+            page_params = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
+            page = self._call("GET", path, params=page_params)
             yield from page[field]
             cursor = page["next_cursor"]
             if cursor is None:
                 return
 
     def _fetch(self, path: str, file: BinaryIO, on_received: Callable[[int], object]) -> None:
-        """Stream an answer into the file, which is emptied before each attempt."""
+        """Stream a response into a file, which is truncated before each attempt."""
 
-        def once() -> None:
+        def attempt() -> None:
             file.seek(0)
             file.truncate()
             received = 0
             try:
-                with self._http.stream("GET", f"{API}{path}") as answer:
-                    if not answer.is_success:
-                        answer.read()
-                        raise response_error(answer)
-                    for piece in answer.iter_bytes(CHUNK_BYTES):
-                        file.write(piece)
-                        received += len(piece)
+                with self._http.stream("GET", f"{API}{path}") as response:
+                    if not response.is_success:
+                        response.read()
+                        raise response_error(response)
+                    for chunk in response.iter_bytes(CHUNK_BYTES):
+                        file.write(chunk)
+                        received += len(chunk)
                         on_received(received)
             except httpx2.TransportError as error:
                 raise self._unreachable("/", error) from error
 
-        self._repeat(once)
+        self._retry(attempt)
 
-    def _put(self, begun: Json, file: BinaryIO) -> None:
-        """Send a direct upload's bytes to where the server has said: no key of ours goes there."""
+    def _put(self, upload: Json, file: BinaryIO) -> None:
+        """Send a file to a presigned URL, without the API key."""
 
-        def once() -> None:
+        def attempt() -> None:
             file.seek(0)
             with httpx2.Client(timeout=self._timeout_seconds) as http:
-                self._ask(
+                self._request(
                     http,
-                    begun["method"],
-                    begun["url"],
+                    upload["method"],
+                    upload["url"],
                     content=_iter_chunks(file),
-                    headers=begun["headers"],
+                    headers=upload["headers"],
                 )
 
-        self._repeat(once)
+        self._retry(attempt)
 
-    def _ask(self, http: httpx2.Client, method: str, url: str, **options: Any) -> httpx2.Response:
-        """A successful answer; anything else as the error that it means."""
+    def _request(
+        self, http: httpx2.Client, method: str, url: str, **options: Any
+    ) -> httpx2.Response:
+        """Send one request; an error response is raised as the matching PlacewiseError."""
         try:
-            answer = http.request(method, url, **options)
+            response = http.request(method, url, **options)
         except httpx2.TransportError as error:
             raise self._unreachable(url, error) from error
-        if answer.is_success:
-            return answer
-        raise response_error(answer)
+        if response.is_success:
+            return response
+        raise response_error(response)
 
     def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
         host = self.url if url.startswith("/") else httpx2.URL(url).host
         return Unavailable(
             "server_unreachable",
-            f"No Placewise answers at {host} ({type(error).__name__}). Is it running?",
+            f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
         )
 
-    def _repeat(self, call: Callable[[], Answer]) -> Answer:
+    def _retry(self, call: Callable[[], Answer]) -> Answer:
         deadline = time.monotonic() + self._patience.seconds
-        times = 0
+        attempt = 0
         while True:
             try:
                 return call()
             except (Unavailable, TooManyRequests, Conflict) as error:
-                late = time.monotonic() >= deadline
-                time.sleep(self._patience.wait_seconds(error, times, late))
-                times += 1
+                is_late = time.monotonic() >= deadline
+                time.sleep(self._patience.wait_seconds(error, attempt, is_late))
+                attempt += 1
 
 
 def _iter_chunks(file: BinaryIO) -> Iterator[bytes]:
-    while piece := file.read(CHUNK_BYTES):
-        yield piece
+    while chunk := file.read(CHUNK_BYTES):
+        yield chunk

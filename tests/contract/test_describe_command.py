@@ -247,7 +247,7 @@ def test_the_program_itself_describes(photos: list[Path], out: Path) -> None:
         check=False,
     )
     assert ended.returncode == 0, ended.stderr
-    assert "5 rows of 16 numbers" in ended.stdout.replace("\n", " ")
+    assert "5 rows of 16 dimensions" in ended.stdout.replace("\n", " ")
     assert np.load(out).shape == (5, 16)
 
 

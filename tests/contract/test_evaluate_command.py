@@ -224,7 +224,7 @@ def test_vocabulary_is_fitted_on_the_database_where_none_comes_with_the_extracto
 ) -> None:
     answer = run_json("evaluate", "--data", city, "--extractor", "test-tiny-vlad:clusters=3")
     assert answer["dimension"] == 3 * 16
-    assert answer["run"]["vocabulary"] == "fitted on the database's photos"
+    assert answer["run"]["vocabulary"] == "fitted on the database photos"
 
 
 def test_photo_that_does_not_decode_is_named_and_nothing_is_measured(

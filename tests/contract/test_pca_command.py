@@ -113,12 +113,12 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
     [
         (unit_rows(), ["--dimension", "17"], "pca_too_many_dimensions", "16"),
         (unit_rows(4), ["--dimension", "4"], "pca_too_few_rows", "there are 4"),
-        (2 * unit_rows(), [], "bad_rows", "Row 0 has the length 2"),
+        (2 * unit_rows(), [], "bad_rows", "Row 0 has the L2 norm 2"),
         (np.arange(12).reshape(3, 4), [], "bad_rows", "floating point"),
         (unit_rows()[0], [], "bad_rows", "rows"),
         (unit_rows(), ["--extractor", "test-tiny-avg"], "options_contradict", "--extractor"),
         (unit_rows(), ["--map", "town"], "options_contradict", "--map"),
-        (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "no folder"),
+        (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "does not exist"),
         (unit_rows(), ["--out", "a.npz"], "bad_out", ".safetensors"),
     ],
 )

@@ -258,8 +258,8 @@ def test_command_makes_the_bucket_and_is_content_with_one(
         monkeypatch.setenv(variable.upper(), str(value))
     said = [CliRunner().invoke(storage.app, ["create-bucket"]) for _ in range(2)]
     assert [result.exit_code for result in said] == [0, 0]
-    assert "is made" in said[0].stdout
-    assert "was there already" in said[1].stdout
+    assert "was created" in said[0].stdout
+    assert "already exists" in said[1].stdout
     S3Store(s3.bucket(name)).check()
 
 

@@ -110,5 +110,5 @@ def test_index_waits_for_a_full_queue_says_so_and_goes_on(
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)
     assert (report["uploaded"], report["refused"], report["failed"]) == (PHOTOS, [], [])
-    assert "Waiting, then going on:" in ended.stderr
-    assert "queue is full" in ended.stderr
+    assert "Retrying:" in ended.stderr
+    assert "wait already" in ended.stderr

@@ -168,7 +168,7 @@ def test_index_fits_a_vocabulary_from_fifty_photos_on(indexed: Indexed) -> None:
 def test_index_run_again_has_nothing_to_do(indexed: Indexed) -> None:
     again = indexed.without_the_broken
     assert again.code == 0, again.stderr
-    assert f"{PHOTOS} photos looked at, {PHOTOS} were there already" in again.stderr
+    assert f"{PHOTOS} photos processed, {PHOTOS} already stored" in again.stderr
     assert f"{PHOTOS} searchable" in again.stderr
 
 

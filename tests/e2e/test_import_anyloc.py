@@ -90,8 +90,8 @@ def test_what_is_refused_is_named_and_ends_with_exit_code_1(
     assert "JPEG" in report["refused"][0]["reason"]
     shown = run_command("import-anyloc", house.root, env=environment(server.home), cwd=tmp_path)
     assert shown.returncode == 1
-    assert "4 rows" not in shown.stderr
-    assert "0 photos imported, 3 were there already" in shown.stderr
+    assert "4 database rows" not in shown.stderr
+    assert "0 photos imported, 3 already stored" in shown.stderr
     assert "1 missing, 1 refused" in shown.stderr
     assert "[odd] name.jpg" in shown.stderr
 

@@ -82,6 +82,6 @@ def test_doctor_writes_nothing(tmp_path: Path) -> None:
     from shared.config.settings import Settings
 
     settings = Settings(placewise_home=tmp_path / "not" / "there")
-    assert "can be made" in _check_home(settings)
+    assert "can be created" in _check_home(settings)
     assert "nothing is stored" in _check_server(settings)
     assert not (tmp_path / "not").exists()

@@ -52,7 +52,7 @@ def refused(check: Any, *arguments: Any) -> PlacewiseError:
 def test_postgres_tells_its_version_tables_and_clock(
     deployed: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "tables up to date" in check_postgres(Settings())
+    assert "schema up to date" in check_postgres(Settings())
     monkeypatch.setattr(server_checks, "MAX_CLOCK_SKEW_SECONDS", -1.0)
     assert refused(check_postgres, Settings()).code == "clocks_differ"
     monkeypatch.setattr(server_checks, "MIN_POSTGRES_VERSION", 10**9)
@@ -80,8 +80,8 @@ def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
 
 def test_objects_are_written_read_and_deleted(monkeypatch: pytest.MonkeyPatch) -> None:
     said = check_object_store(Settings())
-    assert "written, read, listed and deleted" in said
-    store = FolderStore(Settings().placewise_home / "objects", exclusive=False)
+    assert "wrote, read, listed and deleted" in said
+    store = FolderStore(Settings().placewise_home / "objects", alone=False)
     assert list(store.list("")) == []
     monkeypatch.setattr(FolderStore, "read_range", lambda *_: b"all of it")
     assert refused(check_object_store, Settings()).code == "object_store_unfit"
@@ -103,7 +103,7 @@ def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) ->
         with deployed.write() as session:
             session.execute(update(RegisteredProcess).values(seen_at=db_now_plus(-60)))
         gone = refused(check_processes, settings, "extractor")
-        assert re.search(r"The last sign of one is \d+ s old", gone.detail)
+        assert re.search(r"The last heartbeat was \d+ s ago", gone.detail)
     with deployed.read() as session:
         assert list_processes(session) == [], "it has signed off"
 
@@ -112,7 +112,7 @@ def test_a_steward_that_lives_and_frees_no_lease_is_found_out(deployed: Catalog)
     with deployed.write() as session:
         session.add(RegisteredProcess(role="steward", name="one", release="1"))
         add_job(session, add_map(session).id)
-    assert "no lease is overdue" in check_steward(Settings())
+    assert "no overdue leases" in check_steward(Settings())
     job = take(deployed, 1)[0]
     set_columns(deployed, job.id, lease_until=db_now_plus(-60))
     assert refused(check_steward, Settings()).code == "leases_overdue"
@@ -130,7 +130,7 @@ def test_every_shard_has_to_be_answered_for(
         second.stop()
         ill = refused(check_search, Settings())
         assert ill.code == "search_ill"
-        assert "nobody answers for shard 1/2" in ill.detail
+        assert "no worker serves shard 1/2" in ill.detail
     finally:
         first.stop()
         second.stop()

@@ -52,7 +52,7 @@ def test_weights_that_fit_are_named_without_being_loaded(
     said = check_extractor(settings)
     assert "anyloc-vits14:layer=0" in said
     assert str(small) in said
-    assert "GB) fit" in said
+    assert "GB) match" in said
 
 
 def test_weights_without_the_chosen_layer_are_found_out(
@@ -99,7 +99,7 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     assert str(tmp_path) not in caught.value.detail
     monkeypatch.setenv("EXTRACTOR", f"torchhub:{write_hub(tmp_path / 'hub')}:colours")
     assert "load" in check_extractor(Settings())
-    assert "tells its size only when it is loaded" in check_memory(Settings())
+    assert "is unknown until it is loaded" in check_memory(Settings())
 
 
 # --- device and memory -----------------------------------------------------------------------
@@ -123,7 +123,7 @@ def pretend_gpu(monkeypatch: pytest.MonkeyPatch, total: int) -> None:
 def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_gpu(monkeypatch, 16 * GB)
     said = check_memory(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
-    assert "anyloc-vitg14 takes about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in said
+    assert "anyloc-vitg14 requires about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in said
     assert "the GPU has 16.0 GB" in said
 
 
@@ -143,7 +143,7 @@ def test_a_batch_that_is_too_large_comes_with_what_to_do(monkeypatch: pytest.Mon
     settings = settings_with(
         monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda", BATCH_PHOTOS="64"
     )
-    with pytest.raises(Misconfigured, match="a smaller BATCH_PHOTOS than 64"):
+    with pytest.raises(Misconfigured, match="BATCH_PHOTOS below 64"):
         check_memory(settings)
 
 

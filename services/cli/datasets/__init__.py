@@ -1,1 +1,1 @@
-"""`placewise datasets`: data sets of the field, looked at, completed and made."""
+"""`placewise datasets`: check, complete and generate place recognition data sets."""

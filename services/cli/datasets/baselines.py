@@ -1,9 +1,8 @@
-"""The ladder: how hard a generated city is, from average colour up to the default extractor.
+"""Difficulty of a generated city: recall of baselines from average colour to the default extractor.
 
-Its lower rungs must find next to nothing and its upper ones must differ, or the city measures
-nothing. Figures of a generated city are never comparable with published ones.
-
-Word weights of rows in memory: what the ladder does with files, as a map does with chunks.
+Weak baselines must find almost nothing and strong ones must differ; otherwise the city measures
+nothing. Results on a generated city are not comparable with published ones. Baselines with a
+vocabulary are also evaluated with word weights, fitted in memory on the database rows.
 """
 
 from __future__ import annotations
@@ -31,27 +30,35 @@ Rows = NDArray[np.float32]
 
 
 def fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[float] | None:
-    """One weight for each of the words of (n, words * width) rows, of photos with these @UTM@
-    names; None where they have too few pairs to learn from."""
-    said = [upload_fields_of_file_name(name, None) for name in names]
-    spots = [PhotoLocation(float(one["latitude"]), float(one["longitude"]), None) for one in said]
-    chosen = sample_pairs(spots, SEED, len(names))
-    if not chosen.is_enough:
+    """Fit a weight per visual word on pairs of near and far photos.
+
+    Args:
+        database: (n, words * width) rows.
+        names: `@UTM@` file names of the rows.
+        words: Number of visual words.
+
+    Returns:
+        One weight per word, or None if there are too few pairs.
+    """
+    fields = [upload_fields_of_file_name(name, None) for name in names]
+    locations = [PhotoLocation(float(f["latitude"]), float(f["longitude"]), None) for f in fields]
+    pairs = sample_pairs(locations, SEED, len(names))
+    if not pairs.is_enough:
         return None
-    taught = empty_pair_statistics(words)
-    for lesson in (*chosen.batches[0], *chosen.batches[1]):
-        taught += PairStatistics.from_rows(database[lesson.photos], lesson.near, lesson.far, words)
-    weights: list[float] = taught.weights().tolist()
+    statistics = empty_pair_statistics(words)
+    for batch in (*pairs.batches[0], *pairs.batches[1]):
+        statistics += PairStatistics.from_rows(database[batch.photos], batch.near, batch.far, words)
+    weights: list[float] = statistics.weights().tolist()
     return weights
 
 
 def fit_and_apply_word_weights(queries: Rows, weights: Sequence[float]) -> Rows:
-    """The queries with their words weighted; one that has none of the weighted words stays."""
-    weighted = [apply_word_weights(query, weights) for query in queries]
+    """Weight the words of each query; a query without weighted words is left unchanged."""
+    weighted_queries = [apply_word_weights(query, weights) for query in queries]
     return np.stack(
         [
-            query if found is None else found.astype(np.float32)
-            for query, found in zip(queries, weighted, strict=True)
+            query if weighted is None else weighted.astype(np.float32)
+            for query, weighted in zip(queries, weighted_queries, strict=True)
         ]
     )
 
@@ -60,24 +67,33 @@ BASELINE_KS = (1, 5, 10)
 
 
 def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[dict[str, Any]]:
-    """Each rung's name and recalls over the queries on the map, weakest first.
+    """Evaluate all baselines on a generated city, weakest first.
 
-    `recall` is over all of them; `recall_in_map` and `recall_other_way` over the two kinds, the
-    latter None where there is none.
+    Args:
+        plan: Plan of the city.
+        out: Folder of its photos.
+        progress: Shows the photos described.
+
+    Returns:
+        Per baseline: its name (`rung`) and recalls at BASELINE_KS over all queries within the map
+        (`recall`), over those that look the same way as database photos (`recall_in_map`) and over
+        those that look the other way (`recall_other_way`); None without such queries.
     """
-    database = [shot for shot in plan.photos if shot.role == "database"]
-    queries = [s for s in plan.photos if s.role == "query" and s.kind != "out_of_map"]
+    database = [photo for photo in plan.photos if photo.role == "database"]
+    queries = [p for p in plan.photos if p.role == "query" and p.kind != "out_of_map"]
     if not queries:
         return []
     positives = positives_within(_positions(queries), _positions(database))
-    other_way = np.array([shot.kind == "other_way" for shot in queries])
-    rungs = []
+    other_way = np.array([photo.kind == "other_way" for photo in queries])
+    results = []
     described = _describe_photos(
-        [out / s.folder / s.name for s in database + queries], len(database), progress
+        [out / p.folder / p.name for p in database + queries], len(database), progress
     )
-    for name, asked, rows in _add_word_weighted(*described, [shot.name for shot in database]):
-        ranked = rank_by_similarity(asked, rows, max(BASELINE_KS))
-        rungs.append(
+    for name, query_rows, database_rows in _add_word_weighted(
+        *described, [photo.name for photo in database]
+    ):
+        ranked = rank_by_similarity(query_rows, database_rows, max(BASELINE_KS))
+        results.append(
             {
                 "rung": name,
                 "recall": _recall_shares(ranked, positives, np.ones(len(queries), bool)),
@@ -85,52 +101,67 @@ def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[di
                 "recall_other_way": _recall_shares(ranked, positives, other_way),
             }
         )
-    return rungs
+    return results
 
 
 def _describe_photos(
     paths: Sequence[Path], database: int, progress: Progress
 ) -> tuple[list[tuple[str, Rows]], dict[str, int]]:
-    """(photos, D) unit rows by each rung, and the words of those that have a vocabulary; the first
-    `database` paths may be learnt from."""
-    from services.cli.datasets.network_baselines import NetworkBaselines  # torch takes seconds
+    """Describe photos with each baseline.
 
-    bar = progress.add_task("ladder: no network", total=len(paths))
-    weak: dict[str, list[Rows]] = {name: [] for name in BASELINE_DESCRIPTORS}
+    Args:
+        paths: Photo files; the first `database` of them may be fitted on.
+        database: Number of database photos.
+        progress: Shows the photos described.
+
+    Returns:
+        (photos, D) unit rows by baseline, and the number of words of those with a vocabulary.
+    """
+    from services.cli.datasets.network_baselines import NetworkBaselines  # imports torch
+
+    bar = progress.add_task("baselines: no network", total=len(paths))
+    rows_by_name: dict[str, list[Rows]] = {name: [] for name in BASELINE_DESCRIPTORS}
     for path in paths:
         with Image.open(path) as image:
             photo = image.convert("RGB")
         for name, describe in BASELINE_DESCRIPTORS.items():
-            weak[name].append(describe(photo))
+            rows_by_name[name].append(describe(photo))
         progress.advance(bar)
-    found = [(name, np.stack(rows)) for name, rows in weak.items()]
-    bar = progress.add_task("ladder: networks", total=len(paths))
+    described = [(name, np.stack(rows)) for name, rows in rows_by_name.items()]
+    bar = progress.add_task("baselines: networks", total=len(paths))
     advance: Callable[[int], None] = lambda count: progress.advance(bar, count)  # noqa: E731
     networks = NetworkBaselines(paths[:database])
-    found += networks.describe(paths, advance).items()
-    return found, networks.words
+    described += networks.describe(paths, advance).items()
+    return described, networks.words
 
 
 def _add_word_weighted(
     described: Sequence[tuple[str, Rows]], words: Mapping[str, int], names: Sequence[str]
 ) -> list[tuple[str, Rows, Rows]]:
-    """(rung, queries, database rows); after each rung with so many words one more, whose queries
-    are weighted by what the database, of those file names, has taught. A city that is too small to
-    teach has none of these."""
-    found = []
+    """Split rows into queries and database, and add a word-weighted variant per vocabulary.
+
+    Args:
+        described: Rows by baseline, database rows first.
+        words: Number of words of baselines with a vocabulary.
+        names: File names of the database photos.
+
+    Returns:
+        (name, query rows, database rows). Cities too small to fit weights get no variants.
+    """
+    entries = []
     for name, rows in described:
         database, queries = rows[: len(names)], rows[len(names) :]
-        found.append((name, queries, database))
+        entries.append((name, queries, database))
         weights = fit_word_weights(database, names, words[name]) if name in words else None
         if weights is not None:
-            found.append(
+            entries.append(
                 (f"{name}, word weights", fit_and_apply_word_weights(queries, weights), database)
             )
-    return found
+    return entries
 
 
-def _positions(shots: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
-    return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
+def _positions(photos: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
+    return np.array([(photo.camera.x, photo.camera.y) for photo in photos])
 
 
 def _recall_shares(
@@ -138,7 +169,7 @@ def _recall_shares(
 ) -> dict[str, float] | None:
     if not selected.any():
         return None
-    chosen = [found for found, meant in zip(positives, selected, strict=True) if meant]
+    chosen = [p for p, is_selected in zip(positives, selected, strict=True) if is_selected]
     return {
         str(k): share for k, share in recall_at_k(ranked[selected], chosen, BASELINE_KS).items()
     }

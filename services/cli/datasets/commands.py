@@ -1,10 +1,8 @@
-"""The group `placewise datasets`.
+"""`placewise datasets`: check data sets, compute ground truth and audit labels.
 
-`placewise datasets check`: what a folder holds, and what is wrong with it.
-
-`placewise datasets ground-truth`: which photos of one list are right for those of another.
-
-`placewise datasets audit`: answers that count as wrong although they may be right.
+`check` reports what a folder contains and what is wrong with it. `ground-truth` computes the
+positives of queries from positions. `audit` lists confident matches that the ground truth calls
+wrong although they may be right. `synth` is in its own module.
 """
 
 from __future__ import annotations
@@ -52,48 +50,48 @@ Json = dict[str, Any]
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(help="A data set, or a folder of several.")],
+    folder: Annotated[Path, typer.Argument(help="A data set, or a folder of data sets.")],
     decode: Annotated[
-        bool, typer.Option("--decode", help="Open every photo, to its last pixel.")
+        bool, typer.Option("--decode", help="Decode every photo completely.")
     ] = False,
     protocol: Annotated[
-        str | None, typer.Option(help="How sets are put together, such as msls-official or vme.")
+        str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
     ] = None,
     rule: Annotated[
         str | None,
-        typer.Option(help="Who is right: radius 25, heading 25 40, frames 5, place-label."),
+        typer.Option(
+            help="Positive-match criterion: radius 25, heading 25 40, frames 5, place-label."
+        ),
     ] = None,
-    min_photos: Annotated[
-        int, typer.Option(min=1, help="Places with fewer photos are not counted.")
-    ] = 2,
+    min_photos: Annotated[int, typer.Option(min=1, help="Ignore places with fewer photos.")] = 2,
     as_json: JsonOption = False,
 ) -> None:
-    """Say which data sets a folder holds: counts, cities, sets, fingerprints, problems.
+    """Report the data sets in a folder: counts, cities, sets, fingerprints and problems.
 
-    Exits with 1 where something is wrong.
+    The exit code is 1 if there are problems.
     """
     with report_errors(as_json), progress_bar() as progress:
-        looking = progress.add_task("looking through the folder", total=None)
-        found = inspect_dataset(folder, protocol=protocol, rule=rule, min_photos=min_photos)
-        progress.remove_task(looking)
-        problems = list(found.problems)
+        bar = progress.add_task("scanning the folder", total=None)
+        report = inspect_dataset(folder, protocol=protocol, rule=rule, min_photos=min_photos)
+        progress.remove_task(bar)
+        problems = list(report.problems)
         if decode:
-            bar = progress.add_task("decoding", total=len(found.photos()))
-            problems += find_undecodable_photos(found, lambda count: progress.advance(bar, count))
+            bar = progress.add_task("decoding", total=len(report.photos()))
+            problems += find_undecodable_photos(report, lambda count: progress.advance(bar, count))
     if as_json:
-        print_json(_check_as_json(found, problems, decode))
+        print_json(_check_as_json(report, problems, decode))
     else:
-        _print_check(found, problems, decode)
+        _print_check(report, problems, decode)
     if problems:
         raise typer.Exit(1)
 
 
-def _check_as_json(found: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> Json:
+def _check_as_json(report: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> Json:
     return {
-        "root": printable_path(found.root),
-        "layouts": list(found.layouts),
-        "training": _training_summary(found.training) if found.training else None,
-        "evaluation": [_evaluation_summary(one) for one in found.evaluation],
+        "root": printable_path(report.root),
+        "layouts": list(report.layouts),
+        "training": _training_summary(report.training) if report.training else None,
+        "evaluation": [_evaluation_summary(set_) for set_ in report.evaluation],
         "decoded": decoded,
         "problems": [asdict(problem) for problem in problems],
     }
@@ -122,32 +120,35 @@ def _training_summary(training: TrainingSet) -> Json:
     }
 
 
-def _evaluation_summary(one: EvaluationSet) -> Json:
-    counts = [len(found) for found in one.positives]
+def _evaluation_summary(set_: EvaluationSet) -> Json:
+    counts = [len(positives) for positives in set_.positives]
     return {
-        "name": one.name,
-        "database": len(one.database),
-        "queries": len(one.queries),
-        "queries_without_positives": len(one.without_positives),
+        "name": set_.name,
+        "database": len(set_.database),
+        "queries": len(set_.queries),
+        "queries_without_positives": len(set_.without_positives),
         "positives_per_query": {"mean": statistics.fmean(counts) if counts else 0.0}
         | {"most": max(counts, default=0)},
-        "rule": one.rule,
-        "protocol": one.protocol,
-        "fingerprint": one.fingerprint,
+        "rule": set_.rule,
+        "protocol": set_.protocol,
+        "fingerprint": set_.fingerprint,
     }
 
 
-def _print_check(found: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> None:
+def _print_check(report: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> None:
     console.print(
-        f"{printable_path(found.root)}: {', '.join(dict.fromkeys(found.layouts))}.", soft_wrap=True
+        f"{printable_path(report.root)}: {', '.join(dict.fromkeys(report.layouts))}.",
+        soft_wrap=True,
     )
-    if found.training is not None:
-        _print_training(_training_summary(found.training))
-    for one in found.evaluation:
-        _print_evaluation(_evaluation_summary(one))
+    if report.training is not None:
+        _print_training(_training_summary(report.training))
+    for set_ in report.evaluation:
+        _print_evaluation(_evaluation_summary(set_))
     if not problems:
         console.print(
-            "All photos decode." if decoded else "All photos are there; --decode opens them.",
+            "All photos can be decoded."
+            if decoded
+            else "All photos exist. Pass --decode to decode them.",
             soft_wrap=True,
         )
     for problem in problems:
@@ -161,9 +162,9 @@ def _print_check(found: DatasetReport, problems: list[DatasetProblem], decoded: 
 def _print_training(figures: Json) -> None:
     sizes = figures["photos_per_place"]
     console.print(
-        f"To learn from: {figures['photos']} photos of {figures['places']} places in "
+        f"Training set: {figures['photos']} photos of {figures['places']} places in "
         f"{len(figures['cities'])} cities ({figures['layout']}), {sizes['least']} to "
-        f"{sizes['most']} of a place, the median {sizes['median']:g}; fingerprint "
+        f"{sizes['most']} photos per place (median {sizes['median']:g}); fingerprint "
         f"{figures['fingerprint'][:12]}.",
         soft_wrap=True,
     )
@@ -173,66 +174,72 @@ def _print_training(figures: Json) -> None:
     console.print(table)
 
 
-def _print_evaluation(one: Json) -> None:
-    # Lines, not a table: names are long, and fingerprints must not be cut.
+def _print_evaluation(summary: Json) -> None:
+    # Not a table: it would truncate long names and fingerprints.
     console.print(
-        f"{escape(one['name'])}: {one['database']} database photos, {one['queries']} queries, of "
-        f"which {one['queries_without_positives']} have no positive; "
-        f"{one['positives_per_query']['mean']:.1f} positives each ({escape(one['rule'])}), "
-        f"protocol {one['protocol']}, fingerprint {one['fingerprint'][:12]}.",
+        f"{escape(summary['name'])}: {summary['database']} database photos, "
+        f"{summary['queries']} queries ({summary['queries_without_positives']} without positives); "
+        f"{summary['positives_per_query']['mean']:.1f} positives per query "
+        f"({escape(summary['rule'])}), protocol {summary['protocol']}, fingerprint "
+        f"{summary['fingerprint'][:12]}.",
         soft_wrap=True,
     )
 
 
 PhotoListOption = Annotated[
-    Path, typer.Option(help="A .npy of paths, a CSV, or a text of one path a line.")
+    Path, typer.Option(help="List of photos: .npy of paths, CSV, or text with a path per line.")
 ]
 
 
 def ground_truth(
     database: PhotoListOption,
     queries: PhotoListOption,
-    out: Annotated[Path, typer.Option(help="The .npy to write, and beside it a .json.")],
+    out: Annotated[
+        Path, typer.Option(help="Output file (.npy); a .json file is written next to it.")
+    ],
     radius: Annotated[
-        float | None, typer.Option(min=0, help="Metres, the bound included. Left out: 25.")
+        float | None, typer.Option(min=0, help="Radius in metres, inclusive. Default: 25.")
     ] = None,
     rule: Annotated[
         str | None,
-        typer.Option(help="Another rule: heading 25 40, frames 5, frames 5 in sequence, ..."),
+        typer.Option(help="Another criterion: heading 25 40, frames 5, frames 5 in sequence, ..."),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Where the paths begin, for EXIF positions. Left out: each list's."),
+        typer.Option(
+            help="Root of relative paths, for EXIF positions. Default: folder of each list."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write which database photos are right for each query, in the format of sf_xs's gtImages.npy.
+    """Compute the positives of each query, in the format of sf_xs's gtImages.npy.
 
-    The rows are in the order of the lists as given. OUT.json keeps the fingerprints of both lists,
-    so that they are never taken for the rows of others.
+    Rows and indices follow the order of the lists. OUT.json records the fingerprints of both lists
+    to detect a mismatch when the file is used.
     """
     with report_errors(as_json):
-        meant = _resolve_rule(radius, rule)
+        criterion = _resolve_rule(radius, rule)
         if out.suffix != ".npy":
-            raise InvalidRequest("bad_out", f"--out {out}: the file's name has to end in .npy.")
-        listed, asked = read_photo_list(database, folder), read_photo_list(queries, folder)
-        found = find_positives(meant, asked, listed)
+            raise InvalidRequest("bad_out", f"--out {out}: the file name must end in .npy.")
+        database_photos = read_photo_list(database, folder)
+        query_photos = read_photo_list(queries, folder)
+        positives = find_positives(criterion, query_photos, database_photos)
         try:
             write_ground_truth(
                 out,
-                found,
-                database=[shot.name for shot in listed],
-                queries=[shot.name for shot in asked],
-                rule=str(meant),
+                positives,
+                database=[photo.name for photo in database_photos],
+                queries=[photo.name for photo in query_photos],
+                rule=str(criterion),
             )
         except OSError as error:
             raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
-    counts = [len(positives) for positives in found]
+    counts = [len(indices) for indices in positives]
     figures = {
         "out": printable_path(out),
-        "rule": str(meant),
-        "database": len(listed),
-        "queries": len(asked),
+        "rule": str(criterion),
+        "database": len(database_photos),
+        "queries": len(query_photos),
         "positives": sum(counts),
         "queries_without_positives": counts.count(0),
     }
@@ -240,10 +247,10 @@ def ground_truth(
         print_json(figures)
         return
     console.print(
-        f"{printable_path(out)}, and {printable_path(sidecar_path(out))} beside it: "
-        f"{sum(counts)} positives ({meant}) "
-        f"of {len(asked)} queries among {len(listed)} database photos; {counts.count(0)} queries "
-        "have none.",
+        f"Wrote {printable_path(out)} and {printable_path(sidecar_path(out))}: "
+        f"{sum(counts)} positives ({criterion}) "
+        f"for {len(query_photos)} queries among {len(database_photos)} database photos; "
+        f"{counts.count(0)} queries have none.",
         soft_wrap=True,
     )
 
@@ -252,10 +259,12 @@ def _resolve_rule(radius: float | None, rule: str | None) -> PositiveRule:
     if rule is None:
         metres = 25.0 if radius is None else radius
         if not math.isfinite(metres):
-            raise InvalidRequest("unknown_rule", f"--radius {metres} is no number of metres.")
+            raise InvalidRequest(
+                "unknown_rule", f"--radius must be a finite number of metres, not {metres}."
+            )
         return PositiveRule("radius", radius_m=metres)
     if radius is not None:
-        raise InvalidRequest("which_rule", "Give --radius or --rule, not both.")
+        raise InvalidRequest("which_rule", "--radius and --rule exclude each other.")
     return parse_rule(rule)
 
 
@@ -263,26 +272,29 @@ MAX_SUSPECTS_SHOWN = 50
 
 
 def audit(
-    folder: Annotated[Path, typer.Argument(help="The data set.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the data set.")],
     predictions: Annotated[
-        Path, typer.Option(help=".npy (queries, k) of database indices, best first.")
+        Path, typer.Option(help="(queries, k) database indices, best first, .npy.")
     ],
     scores: Annotated[
-        Path | None, typer.Option(help=".npy (queries, k), the higher the better.")
+        Path | None, typer.Option(help="(queries, k) similarity scores, .npy.")
     ] = None,
     min_score: Annotated[
         float | None,
-        typer.Option(help="Confident from here on. Left out: the median score of right answers."),
+        typer.Option(help="Minimum confident score. Default: the median score of correct matches."),
     ] = None,
-    name: Annotated[str | None, typer.Option("--set", help="Which set, of several.")] = None,
-    protocol: Annotated[str | None, typer.Option()] = None,
-    rule: Annotated[str | None, typer.Option()] = None,
+    name: Annotated[
+        str | None,
+        typer.Option("--set", help="Set of the data set. Required if there are several."),
+    ] = None,
+    protocol: Annotated[str | None, typer.Option(help="Evaluation protocol.")] = None,
+    rule: Annotated[str | None, typer.Option(help="Positive-match criterion.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List confident first matches that the ground truth calls wrong, though they lie near.
+    """List confident first matches that are near the query but count as wrong.
 
-    Near is 4 times the rule's metres or frames, whatever the heading. Look at these pairs: where
-    they show one place, the ground truth errs, and not the descriptor.
+    Near means within 4 times the criterion's metres or frames, regardless of heading. Review these
+    pairs: if both photos show the same place, the ground truth is wrong, not the descriptor.
     """
     with report_errors(as_json):
         evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
@@ -291,11 +303,11 @@ def audit(
         if outside:
             raise InvalidRequest(
                 "predictions_out_of_range",
-                f"{predictions} speaks of photos {ranked.min()} to {ranked.max()}; the database of "
-                f"{evaluation.name} has {len(evaluation.database)}, from 0.",
+                f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
+                f"database of {evaluation.name} has {len(evaluation.database)} photos.",
             )
-        given = None if scores is None else _load_array(scores, "f").astype(np.float32)
-        suspects = find_suspect_labels(evaluation, ranked, given, min_score=min_score)
+        score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
+        suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
     if as_json:
         print_json(
             {
@@ -324,17 +336,17 @@ def _print_suspects(suspects: list[SuspectLabel]) -> None:
         "query",
         "first match",
     )
-    for one in suspects[:MAX_SUSPECTS_SHOWN]:
+    for suspect in suspects[:MAX_SUSPECTS_SHOWN]:
         table.add_row(
-            "-" if one.score is None else f"{one.score:.3f}",
-            "-" if one.metres is None else f"{one.metres:.1f}",
-            "-" if one.degrees is None else f"{one.degrees:.0f}",
-            escape(one.query_name),
-            escape(one.database_name),
+            "-" if suspect.score is None else f"{suspect.score:.3f}",
+            "-" if suspect.metres is None else f"{suspect.metres:.1f}",
+            "-" if suspect.degrees is None else f"{suspect.degrees:.0f}",
+            escape(suspect.query_name),
+            escape(suspect.database_name),
         )
     console.print(table)
     if len(suspects) > MAX_SUSPECTS_SHOWN:
-        console.print(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more: --json lists all.")
+        console.print(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
 
 
 def _load_array(path: Path, kinds: str) -> NDArray[Any]:
@@ -343,11 +355,13 @@ def _load_array(path: Path, kinds: str) -> NDArray[Any]:
     except (OSError, ValueError, EOFError) as error:
         raise InvalidRequest("bad_predictions", f"Can't read {path}: {error}.") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind not in kinds:
-        raise InvalidRequest("bad_predictions", f"{path} is no array (queries, k) of numbers.")
+        raise InvalidRequest(
+            "bad_predictions", f"{path} must contain a (queries, k) array of numbers."
+        )
     return rows
 
 
-app = typer.Typer(help="Data sets: check one, complete one, or draw one.", no_args_is_help=True)
+app = typer.Typer(help="Check, complete and generate data sets.", no_args_is_help=True)
 app.command("check")(check)
 app.command("ground-truth")(ground_truth)
 app.command("audit")(audit)

@@ -1,4 +1,4 @@
-"""The ladder's rungs that need a network. Imports torch: only `ladder` imports this, when asked."""
+"""Baselines of `datasets synth` that need a neural network. Imports torch."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ Rows = NDArray[np.float32]
 
 
 class NetworkBaselines:
-    """Describes photos with an untrained network and with the default extractor twice, and shortens
-    the last rows by PCA whitening.
+    """Describes photos with an untrained network and with the default extractor.
+
+    The extractor is used with its shipped and with a fitted vocabulary; the rows of the latter are
+    also reduced by PCA whitening.
     """
 
     names = (
@@ -41,11 +43,14 @@ class NetworkBaselines:
         f"{EXTRACTOR}, fitted vocabulary",
     )
     pca_dimensions = (512, 256, 128)
-    """Dimensions, as far as there are enough database photos."""
+    """PCA dimensions; those that exceed the number of database photos are skipped."""
 
     def __init__(self, database: Sequence[Path]) -> None:
-        """`database` are the photos that the fitted vocabulary and the PCA are learnt from; they
-        are the first that `describe` is given.
+        """Load the networks and fit the vocabulary.
+
+        Args:
+            database: Photos to fit the vocabulary and PCA on. They must come first in the photos
+                passed to `describe`.
         """
         self._database = len(database)
         self.extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
@@ -62,15 +67,15 @@ class NetworkBaselines:
 
     @property
     def words(self) -> dict[str, int]:
-        """Of the rungs that have a vocabulary."""
+        """Number of visual words of each baseline with a vocabulary."""
         return {self.names[1]: len(self._shipped), self.names[2]: len(self._fitted)}
 
     def _fit(self, database: Sequence[Path]) -> torch.Tensor:
-        """(clusters, width) centres, learnt as a map learns its own."""
-        chosen = sample_photos(
+        """Fit (clusters, width) centres in the same way as for a map."""
+        sampled = sample_photos(
             len(database), FIT_SAMPLE_PHOTOS, self.extractor.backbone.width, SEED
         )
-        photos = [database[number] for number in chosen]
+        photos = [database[index] for index in sampled]
         fitted = fit_vocabulary(
             self.extractor,
             (list(pixels) for pixels in self._batches(photos)),
@@ -82,31 +87,31 @@ class NetworkBaselines:
 
     @torch.inference_mode()
     def describe(self, paths: Sequence[Path], advance: Callable[[int], None]) -> dict[str, Rows]:
-        """Unit rows of every photo, by rung; `advance` is told how many more are done."""
+        """Compute (photos, D) unit rows by baseline; `advance` receives each batch's size."""
         rows: dict[str, list[Rows]] = {name: [] for name in self.names}
         for pixels in self._batches(paths):
             features = self.extractor.features(pixels)
-            described = (
+            batches = (
                 self._untrained_rows(pixels),
                 vlad(features, self._shipped),
                 vlad(features, self._fitted),
             )
-            for name, batch in zip(self.names, described, strict=True):
+            for name, batch in zip(self.names, batches, strict=True):
                 rows[name].append(batch.cpu().numpy())
             advance(len(pixels))
-        found = {name: np.concatenate(parts) for name, parts in rows.items()}
-        return found | self._whitened_rows(found[self.names[-1]])
+        described = {name: np.concatenate(parts) for name, parts in rows.items()}
+        return described | self._whitened_rows(described[self.names[-1]])
 
     def _whitened_rows(self, rows: Rows) -> dict[str, Rows]:
-        """The rows, whitened as a map whitens its own."""
-        shorter = {}
-        for kept in self.pca_dimensions:
-            if self._database > kept:
-                size = sample_size(rows.shape[1], kept)
-                found = fit_pca(rows[sample_rows(self._database, size, SEED)], kept)
-                projection = PcaProjection(found, self.extractor.backbone.device)
-                shorter[f"{self.names[-1]}, PCA to {kept}"] = projection.project(rows)
-        return shorter
+        """Reduce the rows by PCA whitening in the same way as for a map."""
+        reduced = {}
+        for dimension in self.pca_dimensions:
+            if self._database > dimension:
+                size = sample_size(rows.shape[1], dimension)
+                whitening = fit_pca(rows[sample_rows(self._database, size, SEED)], dimension)
+                projection = PcaProjection(whitening, self.extractor.backbone.device)
+                reduced[f"{self.names[-1]}, PCA to {dimension}"] = projection.project(rows)
+        return reduced
 
     def _untrained_rows(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
         on_device = torch.from_numpy(pixels).to(self.extractor.backbone.device)
@@ -114,7 +119,7 @@ class NetworkBaselines:
         return normalize(normalize(maps.flatten(2), dim=1).mean(dim=-1), dim=-1)
 
     def _batches(self, paths: Sequence[Path]) -> Iterator[NDArray[np.uint8]]:
-        """(up to BATCH, H, W, 3) uint8, in the order of the paths."""
+        """Batches of up to (BATCH_PHOTOS, H, W, 3) uint8 pixels, in the order of the paths."""
 
         def read(path: Path) -> NDArray[np.uint8]:
             with Image.open(path) as image:
@@ -123,7 +128,7 @@ class NetworkBaselines:
         def read_batch(start: int) -> NDArray[np.uint8]:
             return np.stack([read(path) for path in paths[start : start + BATCH_PHOTOS]])
 
-        with ThreadPoolExecutor(1) as reader:  # the next batch is decoded beside the network
+        with ThreadPoolExecutor(1) as reader:  # prefetches the next batch
             pending = None
             for start in range(0, len(paths), BATCH_PHOTOS):
                 upcoming = reader.submit(read_batch, start)

@@ -1,4 +1,4 @@
-"""`placewise datasets synth`: a generated city in the layouts of the field."""
+"""`placewise datasets synth`: generate a synthetic city in the layouts of public data sets."""
 
 from __future__ import annotations
 
@@ -29,63 +29,67 @@ SIZE_PATTERN = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """`320x240` -> (320, 240); typer.BadParameter for anything else, and outside 64 to 1920."""
+    """Parse `320x240` to (width, height).
+
+    Raises:
+        typer.BadParameter: Invalid format, or a side outside 64 to 1920.
+    """
     match = SIZE_PATTERN.fullmatch(text)
     if match is None or not all(64 <= int(side) <= 1920 for side in match.groups()):
-        raise typer.BadParameter("WxH is needed, each side from 64 to 1920, such as 320x240.")
+        raise typer.BadParameter("must be WxH with sides from 64 to 1920, such as 320x240.")
     return int(match[1]), int(match[2])
 
 
 def synth(
-    out: Annotated[Path, typer.Argument(help="Folder to write; it must not hold anything yet.")],
-    places: Annotated[int, typer.Option(min=1, max=20_000)] = 1000,
+    out: Annotated[Path, typer.Argument(help="Output folder; must be empty or not exist.")],
+    places: Annotated[int, typer.Option(min=1, max=20_000, help="Number of places.")] = 1000,
     views: Annotated[int, typer.Option(min=1, max=32, help="Database photos per place.")] = 4,
     queries: Annotated[
-        int | None, typer.Option(min=1, max=100_000, help="Left out: half as many as places.")
+        int | None, typer.Option(min=1, max=100_000, help="Number of queries. Default: places / 2.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Which city of that style.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the city.")] = 0,
     catalogue_seed: Annotated[
-        int, typer.Option(min=0, help="Which style: walls, colours, windows.")
+        int, typer.Option(min=0, help="Seed of the style: walls, colours, windows.")
     ] = 0,
     out_of_map: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, help="Share of the queries taken outside the database."),
+        typer.Option(min=0.0, max=1.0, help="Share of queries outside the map."),
     ] = 0.1,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of a photo, in pixels.")] = "320x240",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Photo size in pixels.")] = "320x240",
     ladder: Annotated[
-        bool, typer.Option(help="Measure how hard the city is; takes a network and minutes.")
+        bool, typer.Option(help="Evaluate baselines on the city; takes minutes and needs torch.")
     ] = True,
     train: Annotated[
-        bool, typer.Option(help="Draw a training set as well: nearly half of the work.")
+        bool, typer.Option(help="Also generate a training set; nearly half of the run time.")
     ] = True,
     layout: Annotated[
-        TrainingLayoutName, typer.Option(help="Of the training set: folders, names, table.")
+        TrainingLayoutName, typer.Option(help="Layout of the training set.")
     ] = TrainingLayoutName.GSV_XS,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw a made-up city: database, queries and a training set, the same for the same arguments.
+    """Generate a synthetic city with a database, queries and a training set.
 
-    OUT/database and OUT/queries have @UTM@ names; OUT/gsv_xs (or OUT/gsv-cities) is what a trainer
-    learns from, drawn in streets of their own; OUT/city.json says how it was made and what kind
-    each query is.
+    The output is deterministic for given arguments. Photos in OUT/database and OUT/queries have
+    @UTM@ names. OUT/gsv_xs (or OUT/gsv-cities) is the training set, with separate streets.
+    OUT/city.json contains the arguments and the kind of each query.
     """
     width, height = parse_size(size)
-    asked = queries if queries is not None else max(1, places // 2)
+    query_count = queries if queries is not None else max(1, places // 2)
     options = CityOptions(
-        places, views, asked, seed, catalogue_seed, out_of_map, width, height, train
+        places, views, query_count, seed, catalogue_seed, out_of_map, width, height, train
     )
     with report_errors(as_json):
         check_output_empty(out)
         started = time.perf_counter()
         plan = with_training_layout(make_plan(options), layout)
         with progress_bar() as progress:
-            bar = progress.add_task("drawing", total=len(plan.photos))
+            bar = progress.add_task("rendering", total=len(plan.photos))
             write_city(plan, out, lambda count: progress.advance(bar, count))
             seconds = time.perf_counter() - started
-            rungs = evaluate_baselines(plan, out, progress) if ladder else []
+            baselines = evaluate_baselines(plan, out, progress) if ladder else []
         figures = {
             **_city_summary(plan, out, seconds),
-            "ladder": rungs,
+            "ladder": baselines,
             "seconds": time.perf_counter() - started,
         }
     if as_json:
@@ -98,28 +102,30 @@ def _print_figures(figures: Json) -> None:
     counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
     console.print(
         f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
-        f"{counts.get('train', 0)} to learn from; {drawing['photos_per_second']:.0f} photos/s "
-        f"drawn, {figures['seconds']:.0f} s in all.",
+        f"{counts.get('train', 0)} training photos; rendered at "
+        f"{drawing['photos_per_second']:.0f} photos/s, {figures['seconds']:.0f} s in total.",
         soft_wrap=True,
     )
     if not figures["ladder"]:
         return
     table = Table(
-        "rung", *(Column(f"R@{k}", justify="right") for k in BASELINE_KS), *RECALL_COLUMNS
+        "baseline", *(Column(f"R@{k}", justify="right") for k in BASELINE_KS), *RECALL_COLUMNS
     )
-    for rung in figures["ladder"]:
+    for baseline in figures["ladder"]:
         table.add_row(
-            rung["rung"],
-            *(_format_percent(rung["recall"][str(k)]) for k in BASELINE_KS),
+            baseline["rung"],
+            *(_format_percent(baseline["recall"][str(k)]) for k in BASELINE_KS),
             *(
-                _format_percent(rung[f"recall_{kind}"]["1"]) if rung[f"recall_{kind}"] else "-"
+                _format_percent(baseline[f"recall_{kind}"]["1"])
+                if baseline[f"recall_{kind}"]
+                else "-"
                 for kind in ("in_map", "other_way")
             ),
         )
     console.print(table)
     console.print(
-        f"Over the {kinds.get('in_map', 0)} queries in the map and the "
-        f"{kinds.get('other_way', 0)} there that look the other way; 25 m rule.",
+        f"Recall over {kinds.get('in_map', 0)} queries in the map and "
+        f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m.",
         soft_wrap=True,
     )
     console.print(NOT_COMPARABLE, soft_wrap=True)
@@ -130,10 +136,10 @@ def _format_percent(share: float) -> str:
 
 
 def _city_summary(plan: CityPlan, out: Path, seconds: float) -> Json:
-    about = describe_city(plan)
+    description = describe_city(plan)
     return {
         "out": str(out),
         "note": NOT_COMPARABLE,
-        **{key: about[key] for key in ("arguments", "counts", "query_kinds")},
+        **{key: description[key] for key in ("arguments", "counts", "query_kinds")},
         "drawing": {"seconds": seconds, "photos_per_second": len(plan.photos) / seconds},
     }

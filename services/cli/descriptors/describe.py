@@ -1,4 +1,4 @@
-"""`placewise describe PHOTOS... --out FILE.npy`: descriptors of photos, without a server."""
+"""`placewise describe PHOTOS --out FILE`: compute descriptors of photos without a server."""
 
 from __future__ import annotations
 
@@ -33,25 +33,28 @@ from shared.extractor_config.configs import get_extractor_config
 
 
 def describe(
-    photos: Annotated[list[Path], typer.Argument(metavar="PHOTOS...", help="Files, in order.")],
+    photos: Annotated[
+        list[Path], typer.Argument(metavar="PHOTOS...", help="Photo files, in row order.")
+    ],
     out: Annotated[
         Path,
         typer.Option(
             "--out",
             metavar="FILE.npy|FILE.h5",
-            help="What to write: a row for each photo; as .h5, hloc's global features by name.",
+            help="Output file: one row per photo (.npy), or hloc global features (.h5).",
         ),
     ],
     extractor: Annotated[
         str | None,
         typer.Option(
-            "--extractor", help="By name, with options as in EXTRACTOR; left out: of new maps."
+            "--extractor",
+            help="Extractor name, with options as in EXTRACTOR. Default: the setting EXTRACTOR.",
         ),
     ] = None,
     backbone: BackboneOption = None,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", help="DINOv2's weights: .pth, .pt or .safetensors."),
+        typer.Option("--weights", help="DINOv2 weights: .pth, .pt or .safetensors."),
     ] = None,
     layer: LayerOption = None,
     facet: FacetOption = None,
@@ -64,7 +67,7 @@ def describe(
             "--vocabulary",
             exists=True,
             dir_okay=False,
-            help="Of VLAD: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
+            help="VLAD vocabulary: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
         ),
     ] = None,
     pca: Annotated[
@@ -73,7 +76,7 @@ def describe(
             "--pca",
             exists=True,
             dir_okay=False,
-            help="Shorten the rows: .safetensors of `pca fit ROWS.npy` or `pca fit DIR`.",
+            help="PCA whitening to apply: .safetensors of `pca fit ROWS.npy` or `pca fit DIR`.",
         ),
     ] = None,
     root: Annotated[
@@ -82,17 +85,18 @@ def describe(
             "--root",
             exists=True,
             file_okay=False,
-            help="With FILE.h5: photos are named from this folder on; left out: as they are given.",
+            help="With FILE.h5: name photos by paths relative to this folder. Default: as given.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the descriptors of photos into a .npy file: float32, a row for each, in their order.
+    """Compute descriptors of photos and write them to a file.
 
-    Into an .h5 file: a group for each photo's name with a dataset `global_descriptor`. A photo that
-    can't be described is named, and then no file is written at all.
+    A .npy file contains one float32 row per photo, in the given order. An .h5 file contains a group
+    per photo with the dataset `global_descriptor`. If a photo can't be described, it is reported
+    and no file is written.
     """
-    # Read when torch is loaded, which is below; see services/cli/__init__.py.
+    # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with report_errors(as_json):
         names = _hdf5_names(photos, out, root)
@@ -111,8 +115,7 @@ def describe(
             if recipe.depth is None:
                 raise InvalidRequest(
                     "weights_unused",
-                    f"The extractor {recipe.name} brings its own weights; --weights is for those "
-                    "on DINOv2.",
+                    f"--weights applies only to extractors based on DINOv2, not to {recipe.name}.",
                 )
             settings = settings.model_copy(update={"dino_weights": weights.absolute()})
 
@@ -120,7 +123,7 @@ def describe(
 
         with progress_bar() as progress:
             bar = progress.add_task("describing", total=len(photos))
-            found = describe_files(
+            result = describe_files(
                 photos,
                 out,
                 recipe,
@@ -131,33 +134,36 @@ def describe(
                 names=names,
             )
     if as_json:
-        print_json(found.as_json())
+        print_json(result.as_json())
         return
     console.print(
-        f"{found.rows} rows of {found.spec['dimension']} numbers are in {printable_path(out)} "
-        f"({recipe.name}, {found.seconds['total']:.1f} s).",
+        f"Wrote {result.rows} rows of {result.spec['dimension']} dimensions to "
+        f"{printable_path(out)} ({recipe.name}, {result.seconds['total']:.1f} s).",
         soft_wrap=True,
         markup=False,
     )
 
 
 def _hdf5_names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
-    """What an .h5 file calls the photos; None for a file of rows alone.
+    """The names of the photos in an .h5 file; None for an .npy file.
 
-    InvalidRequest: `options_contradict`, `bad_names` (not below the root, or the same name twice);
-    Misconfigured (`trainer_missing`).
+    Raises:
+        InvalidRequest: `options_contradict`; `bad_names` for photos outside `root` and duplicates.
+        Misconfigured: `trainer_missing` if h5py is not installed.
     """
     if out.suffix not in (".h5", ".hdf5"):
         if root is not None:
-            raise InvalidRequest("options_contradict", "--root: only with --out FILE.h5.")
+            raise InvalidRequest("options_contradict", "--root requires --out FILE.h5.")
         return None
     require_packages("h5py")
     try:
-        named = [(p.absolute().relative_to(root.absolute()) if root else p) for p in photos]
+        paths = [(p.absolute().relative_to(root.absolute()) if root else p) for p in photos]
     except ValueError as error:
-        raise InvalidRequest("bad_names", f"Not every photo lies below --root: {error}.") from error
-    names = [path.as_posix().lstrip("/") for path in named]
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise InvalidRequest("bad_names", f"{twice[0]} is given twice: one name is one photo.")
+        raise InvalidRequest("bad_names", f"All photos must be below --root: {error}.") from error
+    names = [path.as_posix().lstrip("/") for path in paths]
+    duplicates = [name for name, count in Counter(names).items() if count > 1]
+    if duplicates:
+        raise InvalidRequest(
+            "bad_names", f"{duplicates[0]} is given more than once. Names must be unique."
+        )
     return names

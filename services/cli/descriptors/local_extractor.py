@@ -1,13 +1,8 @@
-"""Photos to rows of a .npy file by the path of every upload: decoding children, then one batch
-after the other. Imports torch.
+"""Local feature extraction for commands that run without a server. Imports torch.
 
-Extractors for the commands that describe photos without a server, those of added models as well.
-
-Imports torch.
-
-Photos of this machine to pixels, by the decoding children of the extractor.
-
-Files of descriptors, written batch by batch.
+Photos take the same path as uploads: child processes decode them, then the extractor describes them
+batch by batch, while the next batch is decoded. Descriptors are written as `.npy` or HDF5, batch by
+batch.
 """
 
 from __future__ import annotations
@@ -51,8 +46,10 @@ from shared.storage.open_store import open_store
 
 
 def load_extractor(recipe: ExtractorConfig, settings: Settings) -> Extractor:
-    """On the device and in the precision that the settings say; raises what loading it does, and as
-    `_added_backbone`.
+    """Load an extractor on the device and in the precision of the settings.
+
+    Raises:
+        Misconfigured: The weights are missing or don't fit; `model_missing`.
     """
     device = choose_device(settings.device)
     return Extractor(
@@ -67,10 +64,10 @@ def load_extractor(recipe: ExtractorConfig, settings: Settings) -> Extractor:
 def _added_backbone(
     recipe: ExtractorConfig, settings: Settings, device: torch.device
 ) -> Backbone | None:
-    """The model that the recipe names, from the catalog and the store of the settings, which a
-    server may be using; None for an extractor that is no added model.
+    """Load an added model from the catalog and store of the settings, which may be in use.
 
-    Misconfigured (`model_missing`), and what the catalog, the store and `AddedModels.load` raise.
+    Returns None for an extractor that is not an added model. Raises Misconfigured (`model_missing`)
+    and the errors of the catalog, the store and `AddedModelLoader.load`.
     """
     name = recipe.trained.registered if recipe.trained else None
     if name is None:
@@ -79,9 +76,9 @@ def _added_backbone(
     if settings.database_url is None and not catalog_file.exists():
         raise Misconfigured(
             "model_missing",
-            f"The model {name!r} is looked for in the catalog of PLACEWISE_HOME, and there is none "
-            f"in {settings.placewise_home}. Add it there (`placewise models add CHECKPOINT --name "
-            f"{name}`), or describe with the checkpoint itself: gsv:/FOLDER/FILE.ckpt.",
+            f"Can't load the model {name!r}: there is no catalog in PLACEWISE_HOME "
+            f"({settings.placewise_home}). Add the model there (`placewise models add CHECKPOINT "
+            f"--name {name}`), or use the checkpoint itself: gsv:/FOLDER/FILE.ckpt.",
             model=name,
         )
     with contextlib.closing(open_catalog(settings, "describe")) as catalog:
@@ -105,35 +102,43 @@ def decode_batches(
     settings: Settings,
     seconds: defaultdict[str, float],
 ) -> Iterator[list[tuple[Path, DecodeOutcome]]]:
-    """Batches in the order of the photos; the next one is read while this one is described.
+    """Decode photos in batches; the next batch is prefetched in the background.
 
-    What that takes is added to `seconds["decode"]`. Where a photo can't be had, that says why.
+    Args:
+        photos: Photo files.
+        preprocessing: Applied to each photo.
+        settings: Batch size and decoder limits.
+        seconds: The decoding time is added to `seconds["decode"]`.
+
+    Yields:
+        Batches in the order of `photos`: each photo with its pixels, or the error of a photo that
+        can't be read or decoded.
     """
     decoders = DecoderPool(settings)
 
     def read(begin: int) -> list[tuple[Path, DecodeOutcome]]:
-        begun = time.perf_counter()
-        chosen = photos[begin : begin + settings.batch_photos]
-        contents = [_read_photo(photo) for photo in chosen]
+        started = time.perf_counter()
+        chunk = photos[begin : begin + settings.batch_photos]
+        contents = [_read_photo(photo) for photo in chunk]
         outcomes = iter(
             decoders.decode(
                 [content for content in contents if isinstance(content, bytes)], preprocessing
             )
         )
-        found: list[tuple[Path, DecodeOutcome]] = [
+        batch: list[tuple[Path, DecodeOutcome]] = [
             (photo, next(outcomes) if isinstance(content, bytes) else content)
-            for photo, content in zip(chosen, contents, strict=True)
+            for photo, content in zip(chunk, contents, strict=True)
         ]
-        seconds["decode"] += time.perf_counter() - begun
-        return found
+        seconds["decode"] += time.perf_counter() - started
+        return batch
 
     with contextlib.closing(decoders), ThreadPoolExecutor(1) as reader:
         begins = range(0, len(photos), settings.batch_photos)
-        ahead = reader.submit(read, 0)
+        prefetched = reader.submit(read, 0)
         for begin in begins[1:]:
-            batch, ahead = ahead.result(), reader.submit(read, begin)
+            batch, prefetched = prefetched.result(), reader.submit(read, begin)
             yield batch
-        yield ahead.result()
+        yield prefetched.result()
 
 
 def decode_pixels(
@@ -142,8 +147,10 @@ def decode_pixels(
     settings: Settings,
     refused: list[dict[str, str]],
 ) -> Iterator[list[Pixels]]:
-    """Batches of pixels (height, width, 3) in the order of the photos; of those that can't be had,
-    path and reason join `refused`."""
+    """Decode photos to batches of (height, width, 3) pixels, in the order of the photos.
+
+    Path and reason of each photo that can't be decoded are appended to `refused`.
+    """
     for batch in decode_batches(photos, preprocessing, settings, defaultdict(float)):
         pixels = []
         for path, outcome in batch:
@@ -159,21 +166,24 @@ def _read_photo(photo: Path) -> bytes | PlacewiseError:
     try:
         return photo.read_bytes()
     except OSError as error:
-        return InvalidRequest("photo_unreadable", f"It can't be read: {error.strerror}.")
+        return InvalidRequest("photo_unreadable", f"Can't read the file: {error.strerror}.")
 
 
-HLOC_DATASET = "global_descriptor"  # as hloc names it
+HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
 
 
 @contextlib.contextmanager
 def open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
 ) -> Iterator[Callable[[Any], None]]:
-    """What takes the next (b, D) rows, until all (n, D) of `shape` are there.
+    """Open a writer for descriptors; call it with successive (b, D) float32 batches.
 
-    Without names: an `.npy` array. With a name for each row: HDF5, a group of that name for each
-    photo with the row in its dataset `global_descriptor`, as hloc's extract_features writes it; a
-    `/` in a name is a group within a group.
+    Args:
+        file: Output file.
+        shape: (n, D) of all rows.
+        names: None for an `.npy` array. With one name per row, HDF5 is written as by hloc's
+            extract_features: a group per photo with the dataset `global_descriptor`; a `/` in a
+            name creates a nested group.
     """
     if names is None:
         np.lib.format.write_array_header_1_0(
@@ -181,14 +191,14 @@ def open_descriptor_writer(
         )
         yield lambda rows: _append_rows(file, rows)
         return
-    import h5py  # of the extra `trainer`: rows alone need it not
+    import h5py  # part of the extra `trainer`
 
-    left = iter(names)
+    remaining_names = iter(names)
     with h5py.File(file, "w") as features:
 
         def write(rows: Any) -> None:
             for row in rows:
-                group = features.create_group(next(left))
+                group = features.create_group(next(remaining_names))
                 group.create_dataset(HLOC_DATASET, data=np.asarray(row, np.float32))
 
         yield write
@@ -200,15 +210,13 @@ def _append_rows(file: BinaryIO, rows: Any) -> None:
 
 @dataclass(slots=True)
 class DescriptorFile:
-    """What was written, and how."""
+    """A written file of descriptors, with the extractor spec and timings."""
 
     out: Path
     spec: dict[str, Any]
     rows: int
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    """By stage. Photos are decoded while the batch before is described: the sum may be more than
-    `total`.
-    """
+    """Seconds per stage. Decoding overlaps with description: the sum may exceed `total`."""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -216,7 +224,7 @@ class DescriptorFile:
             "rows": self.rows,
             "dimension": self.spec["dimension"],
             "spec": self.spec,
-            "seconds": {stage: round(took, 3) for stage, took in self.seconds.items()},
+            "seconds": {stage: round(duration, 3) for stage, duration in self.seconds.items()},
         }
 
 
@@ -231,13 +239,22 @@ def describe_files(
     *,
     names: Sequence[str] | None = None,
 ) -> DescriptorFile:
-    """Write (photos, dimension) float32 to `out`, whole or not at all: an `.npy` of rows, or with
-    `names`, one for each photo, an `.h5` of hloc's global features.
+    """Describe photos and write (photos, dimension) float32 rows to a file atomically.
 
-    `advance` is told how many more photos are done. Raises Unprocessable:
-    `refused_photos_error`, which
-    names every photo that can't be described and why; `vocabulary_unfit`, `pca_unfit`;
-    Misconfigured: `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
+    Args:
+        photos: Photo files, in row order.
+        out: Output file: `.npy`, or with `names`, HDF5 in hloc's format.
+        recipe: The extractor.
+        vocabulary: VLAD vocabulary; None for the shipped one.
+        pca: PCA whitening to apply, or None.
+        settings: Device, precision, batch size and decoder limits.
+        advance: Called with the number of photos of each finished batch.
+        names: One name per photo, for HDF5.
+
+    Raises:
+        Unprocessable: `photos_refused`, which lists every photo that can't be described with the
+            reason; `vocabulary_unfit`; `pca_unfit`.
+        Misconfigured: `vocabulary_missing`, `out_unwritable`, and errors of loading the extractor.
     """
     started = time.perf_counter()
     own = load_own_vocabulary(recipe, vocabulary)
@@ -248,20 +265,20 @@ def describe_files(
     if whitening is not None:
         whitening.check_compatible(extractor.spec(centres))
         projection = PcaProjection(whitening.whitening, extractor.backbone.device)
-    described = DescriptorFile(out, extractor.spec(centres, projection), len(photos))
-    described.seconds["load"] = time.perf_counter() - started
+    result = DescriptorFile(out, extractor.spec(centres, projection), len(photos))
+    result.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
     with atomic_write(out) as file, open_descriptor_writer(file, shape, names) as write:
-        for batch in decode_batches(photos, extractor.preprocessing, settings, described.seconds):
+        for batch in decode_batches(photos, extractor.preprocessing, settings, result.seconds):
             pixels = []
             for photo, outcome in batch:
                 if isinstance(outcome, PlacewiseError):
                     refused.append((photo, outcome))
                 else:
                     pixels.append(outcome.pixels)
-            if not refused:  # after a refusal, the rest is read for what else can't be described
-                begun = time.perf_counter()
+            if not refused:  # after a failure, the rest is only decoded, to report all failures
+                batch_started = time.perf_counter()
                 try:
                     rows = extractor.describe(pixels, centres, projection)
                 except PhotoTooLargeForGpu as error:
@@ -271,23 +288,25 @@ def describe_files(
                         if not np.isfinite(row).all():
                             refused.append((photo, not_finite_error()))
                     write(rows)
-                described.seconds["describe"] += time.perf_counter() - begun
+                result.seconds["describe"] += time.perf_counter() - batch_started
             advance(len(batch))
         if refused:
             raise _refused_photos_error(refused, len(photos))
-    described.seconds["total"] = time.perf_counter() - started
-    return described
+    result.seconds["total"] = time.perf_counter() - started
+    return result
 
 
 def load_own_vocabulary(recipe: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:
-    """The file's; None where the recipe does without, or brings its own.
+    """Read the vocabulary file; None if the extractor needs none or ships one.
 
-    Raises Unprocessable (`vocabulary_unfit`) and Misconfigured (`vocabulary_missing`).
+    Raises:
+        Unprocessable: `vocabulary_unfit` if it does not match the extractor.
+        Misconfigured: `vocabulary_missing` if the extractor needs one and none is given.
     """
     if vocabulary is not None:
         if not recipe.needs_vocabulary:
             raise Unprocessable(
-                "vocabulary_unfit", f"The extractor {recipe.name} uses no vocabulary."
+                "vocabulary_unfit", f"The extractor {recipe.name} does not use a vocabulary."
             )
         own = read_vocabulary(vocabulary)
         check_vocabulary_width(own.centres, recipe, recipe.width)  # before the weights are loaded
@@ -295,29 +314,33 @@ def load_own_vocabulary(recipe: ExtractorConfig, vocabulary: Path | None) -> Voc
     if recipe.needs_vocabulary and recipe.shipped_vocabulary is None:
         raise Misconfigured(
             "vocabulary_missing",
-            f"The extractor {recipe.name} needs a vocabulary, and none comes with it: "
-            "--vocabulary FILE, or --aggregator gem, which does without.",
+            f"The extractor {recipe.name} requires a vocabulary and ships none. Pass --vocabulary "
+            "FILE, or use --aggregator gem, which needs none.",
         )
     return None
 
 
 def resolve_centres(extractor: Extractor, own: VocabularyFile | None) -> ClusterCentres | None:
-    """Those of the file, else the shipped ones; Unprocessable (`vocabulary_unfit`)."""
+    """The cluster centres of the file, or else the shipped ones; None if none are needed.
+
+    Raises:
+        Unprocessable: `vocabulary_unfit` if the file's vocabulary does not match the extractor.
+    """
     if own is not None:
         check_vocabulary_fits(own.provenance, own.centres, extractor)
         return own.centres
     if not extractor.recipe.needs_vocabulary:
         return None
     shipped = extractor.shipped_vocabulary()
-    assert shipped is not None, "asked of the recipe before"
+    assert shipped is not None, "load_own_vocabulary checked that one is shipped"
     return shipped[0]
 
 
 def _refused_photos_error(refused: list[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
-    named = "\n".join(f"{printable_path(photo)}: {error.detail}" for photo, error in refused)
+    listing = "\n".join(f"{printable_path(photo)}: {error.detail}" for photo, error in refused)
     return Unprocessable(
         "photos_refused",
-        f"{len(refused)} of {photos} photos can't be described, and nothing was written.\n{named}",
+        f"{len(refused)} of {photos} photos can't be described. No file was written.\n{listing}",
         refused=[
             {"photo": printable_path(photo), "code": error.code, "detail": error.detail}
             for photo, error in refused

@@ -1,10 +1,7 @@
-"""`placewise vocabulary fit DIR --out FILE.npz`: a vocabulary from a folder, without a server.
+"""Fits on local files without a server: VLAD vocabularies and PCA whitenings. Imports torch.
 
-Imports torch: only `vocabulary` imports this, when asked.
-
-`placewise pca fit ROWS.npy|DIR --out FILE.safetensors`: a whitening without a server.
-
-Imports torch: only `pca` imports this, when asked.
+Used by `placewise vocabulary fit DIR` and `placewise pca fit ROWS.npy|DIR`, which import this
+module only when they need it.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import InvalidRequest, Unprocessable
 from shared.extractor_config.configs import get_extractor_config
 
-DEFAULT_SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
+DEFAULT_SAMPLE_PHOTOS = 1000  # same default as for fits on a map
 
 
 def fit_vocabulary_on_folder(
@@ -47,11 +44,25 @@ def fit_vocabulary_on_folder(
     seed: int | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Learn a vocabulary from the photos below the folder and write it to `out`.
+    """Fit a VLAD vocabulary on the photos below a folder and write it to a file.
 
-    Returns what was written, and which photos could not be decoded. Raises InvalidRequest
-    (`no_photos`, `bad_out`), Unprocessable (`no_photos`, `vocabulary_unfit`), Misconfigured
-    (`out_unwritable`) and what loading the extractor raises.
+    Args:
+        folder: Searched recursively for photos.
+        out: Output file, `.npz`.
+        extractor: Extractor name; None for the default extractor.
+        clusters: Number of cluster centres; None for the extractor's.
+        sample: Maximum number of photos to fit on; None for DEFAULT_SAMPLE_PHOTOS.
+        seed: Seed of the sample and of k-means; None for 0.
+        progress: Shows both stages.
+
+    Returns:
+        The file, its clusters, dimension and provenance, and `refused`: photos that could not be
+        decoded.
+
+    Raises:
+        InvalidRequest: `no_photos`, `bad_out`.
+        Unprocessable: `no_photos`, `vocabulary_unfit`.
+        Misconfigured: `out_unwritable`, and errors of loading the extractor.
     """
     check_output_path(out, ".npz", "a vocabulary")
     settings = read_settings()
@@ -62,15 +73,15 @@ def fit_vocabulary_on_folder(
     if not recipe.needs_vocabulary:
         raise Unprocessable(
             "vocabulary_unfit",
-            f"The extractor {recipe.name} uses no vocabulary: there is nothing to fit.",
+            f"The extractor {recipe.name} does not use a vocabulary: there is nothing to fit.",
         )
-    there = list_photos(folder)
+    all_photos = list_photos(folder)
     loaded = load_extractor(recipe, settings)
     seed = seed or 0
     numbers = sample_photos(
-        len(there), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
+        len(all_photos), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
     )
-    photos = [there[number] for number in numbers]
+    photos = [all_photos[number] for number in numbers]
     refused: list[dict[str, str]] = []
     bars = {name: progress.add_task(name, total=None) for name in ("describing", "clustering")}
     fitted = fit_vocabulary(
@@ -79,8 +90,8 @@ def fit_vocabulary_on_folder(
         len(photos),
         clusters=clusters or recipe.clusters,
         seed=seed,
-        on_progress=lambda what, done, most: progress.update(
-            bars[what], completed=done, total=most
+        on_progress=lambda stage, done, total: progress.update(
+            bars[stage], completed=done, total=total
         ),
     )
     with atomic_write(out) as file:
@@ -94,9 +105,9 @@ def fit_vocabulary_on_folder(
     }
 
 
-READ_BLOCK_BYTES = 16_000_000  # of rows that are read together
-UNIT_NORM_TOLERANCE = 0.01  # of a row's length: half precision keeps three digits
-SEED = 0  # which rows are learnt from, where there are more than needed
+READ_BLOCK_BYTES = 16_000_000  # rows are read in blocks of this size
+UNIT_NORM_TOLERANCE = 0.01  # half precision has three significant digits
+SEED = 0  # of the sample, if there are more rows than needed
 
 
 def fit_pca_locally(
@@ -108,16 +119,32 @@ def fit_pca_locally(
     vocabulary: Path | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fit on the rows of a `.npy` file, or on the photos below a folder, and write it to `out`.
+    """Fit a PCA whitening on a `.npy` file of rows or on the photos below a folder.
 
-    Returns what was written, and which photos could not be described. Raises InvalidRequest
-    (`bad_out`, `bad_rows`, `no_photos`, `options_contradict`), Unprocessable (`pca_...`),
-    Misconfigured (`out_unwritable`), and for a folder what loading the extractor and its vocabulary
-    raises.
+    Args:
+        source: An (n, D) `.npy` file, or a folder of photos.
+        out: Output file, `.safetensors`.
+        components: Number of dimensions to keep.
+        extractor: For a folder: extractor name; None for the default extractor.
+        vocabulary: For a folder: VLAD vocabulary; None for the shipped one.
+        progress: Shows both stages.
+
+    Returns:
+        The file, its dimensions, the number of rows, the explained variance, its SHA-256, and
+        `refused`: photos that could not be described.
+
+    Raises:
+        InvalidRequest: `bad_out`, `bad_rows`, `no_photos`, `options_contradict`.
+        Unprocessable: `pca_...`.
+        Misconfigured: `out_unwritable`; for a folder, errors of loading the extractor and its
+            vocabulary.
     """
     check_output_path(out, ".safetensors", "a whitening")
     bars = {name: progress.add_task(name, total=None) for name in ("gathering", "reducing")}
-    told = lambda what, done, most: progress.update(bars[what], completed=done, total=most)  # noqa: E731
+
+    def on_progress(stage: str, done: int, total: int) -> None:
+        progress.update(bars[stage], completed=done, total=total)
+
     refused: list[dict[str, str]] = []
     spec = None
     batches: Iterator[Rows]
@@ -125,35 +152,36 @@ def fit_pca_locally(
         settings = read_settings()
         loaded, centres = _load_extractor(settings, extractor, vocabulary)
         spec = loaded.spec(centres)
-        there = list_photos(source)
+        all_photos = list_photos(source)
         dimension = loaded.dimension(centres)
-        check_pca_fittable(len(there), dimension, components)
-        chosen = sample_rows(len(there), sample_size(dimension, components), SEED)
-        photos = [there[number] for number in chosen]
+        check_pca_fittable(len(all_photos), dimension, components)
+        sampled = sample_rows(len(all_photos), sample_size(dimension, components), SEED)
+        photos = [all_photos[number] for number in sampled]
         pixels = decode_pixels(photos, loaded.preprocessing, settings, refused)
         batches = (loaded.describe(batch, centres) for batch in pixels)
     else:
         if extractor is not None or vocabulary is not None:
             raise InvalidRequest(
-                "options_contradict", "--extractor, --vocabulary: only for a fit on photos."
+                "options_contradict",
+                "--extractor and --vocabulary apply only to a fit on photos.",
             )
         rows = _open_row_file(source)
         dimension = rows.shape[1]
         check_pca_fittable(len(rows), dimension, components)
-        chosen = sample_rows(len(rows), sample_size(dimension, components), SEED)
-        batches = _read_rows(rows, chosen)
-    found = PcaWhiteningFile(
-        fit_pca_stream(batches, len(chosen), dimension, components, told), spec
+        sampled = sample_rows(len(rows), sample_size(dimension, components), SEED)
+        batches = _read_rows(rows, sampled)
+    fitted = PcaWhiteningFile(
+        fit_pca_stream(batches, len(sampled), dimension, components, on_progress), spec
     )
     with atomic_write(out) as file:
-        file.write(found.encode())
+        file.write(fitted.encode())
     return {
         "file": printable_path(out),
         "from_dimension": dimension,
         "dimension": components,
-        "rows": found.whitening.rows,
-        "explained": found.whitening.explained,
-        "sha256": found.whitening.sha256,
+        "rows": fitted.whitening.rows,
+        "explained": fitted.whitening.explained,
+        "sha256": fitted.whitening.sha256,
         "refused": refused,
     }
 
@@ -171,34 +199,33 @@ def _load_extractor(
 
 
 def _open_row_file(file: Path) -> Rows:
-    """(n, D) descriptors, mapped from the file."""
+    """Memory-map (n, D) descriptors."""
     try:
         rows: Rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InvalidRequest(
-            "bad_rows", f"{printable_path(file)} is no .npy file: {error}."
+            "bad_rows", f"{printable_path(file)} is not a valid .npy file: {error}."
         ) from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind != "f":
         raise InvalidRequest(
             "bad_rows",
-            f"{printable_path(file)} does not hold rows of floating point numbers, one for "
-            "each photo, as "
-            "`placewise describe` writes them.",
+            f"{printable_path(file)} must contain a two-dimensional array of floating point "
+            "numbers, one row per photo, as `placewise describe` writes it.",
         )
     return rows
 
 
-def _read_rows(rows: Rows, chosen: Any) -> Iterator[Rows]:
-    at_once = max(1, READ_BLOCK_BYTES // (4 * rows.shape[1]))
-    for begin in range(0, len(chosen), at_once):
-        batch = rows[chosen[begin : begin + at_once]].astype(np.float32)
-        lengths = np.linalg.norm(batch, axis=1)
-        wrong = (lengths > 0) & (np.abs(lengths - 1) > UNIT_NORM_TOLERANCE)
-        if wrong.any():
-            at = int(np.flatnonzero(wrong)[0])
+def _read_rows(rows: Rows, indices: Any) -> Iterator[Rows]:
+    block_rows = max(1, READ_BLOCK_BYTES // (4 * rows.shape[1]))
+    for begin in range(0, len(indices), block_rows):
+        batch = rows[indices[begin : begin + block_rows]].astype(np.float32)
+        norms = np.linalg.norm(batch, axis=1)
+        invalid = (norms > 0) & (np.abs(norms - 1) > UNIT_NORM_TOLERANCE)
+        if invalid.any():
+            at = int(np.flatnonzero(invalid)[0])
             raise Unprocessable(
                 "bad_rows",
-                f"Row {int(chosen[begin + at])} has the length {lengths[at]:.3g}; those of "
-                "descriptors are 1. Normalise the rows first.",
+                f"Row {int(indices[begin + at])} has the L2 norm {norms[at]:.3g} instead of 1. "
+                "Normalise the rows first.",
             )
         yield batch

@@ -1,9 +1,7 @@
-"""Which extractors have their weights on this machine, where they come from, and what they are.
+"""Availability, provenance and fingerprints of extractor weights on this machine.
 
-Fingerprints of weights that were computed before: gigabytes need not be read for each list.
-
-One JSON file in the user's cache folder (`$XDG_CACHE_HOME/placewise`, as other tools have theirs).
-It may be deleted at any time.
+Fingerprints are cached, because computing them reads gigabytes of weights. The cache is one JSON
+file in `$XDG_CACHE_HOME/placewise` and can be deleted at any time.
 """
 
 from __future__ import annotations
@@ -24,15 +22,15 @@ from shared.extractor_config.names import TorchHubEntry
 
 @dataclass(frozen=True, slots=True)
 class WeightsRecord:
-    """What reading or loading the weights has shown."""
+    """Cached facts about weights that were read or loaded."""
 
     fingerprint: str
-    """As `backbone_fingerprint` in an extractor spec."""
+    """The `backbone_fingerprint` of an extractor spec."""
     size_bytes: int
 
 
 def load_record(key: str) -> WeightsRecord | None:
-    """What `remember` was given for that key; None when it is not known any more."""
+    """Look up a record in the cache; None if it is missing."""
     try:
         return WeightsRecord(**_load_cache()[key])
     except (KeyError, TypeError):
@@ -40,28 +38,28 @@ def load_record(key: str) -> WeightsRecord | None:
 
 
 def save_record(key: str, record: WeightsRecord) -> None:
-    """Keep it for the next command."""
+    """Store a record in the cache."""
     path = _cache_path()
     path.parent.mkdir(parents=True, exist_ok=True)
-    everything = {**_load_cache(), key: asdict(record)}
-    # Another command may be reading.
+    records = {**_load_cache(), key: asdict(record)}
+    # Replaced atomically: another command may be reading.
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
-        json.dump(everything, file, indent=1)
+        json.dump(records, file, indent=1)
     Path(file.name).replace(path)
 
 
 def file_key(extractor: str, path: Path) -> str:
-    """A key that changes with the file."""
-    there = path.stat()
-    return f"{extractor} {path} {there.st_size} {there.st_mtime_ns}"
+    """Cache key of a weights file; it changes with the file's size and modification time."""
+    stat = path.stat()
+    return f"{extractor} {path} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def _load_cache() -> dict[str, Any]:
     try:
-        found = json.loads(_cache_path().read_text())
+        records = json.loads(_cache_path().read_text())
     except (FileNotFoundError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return records if isinstance(records, dict) else {}
 
 
 def _cache_path() -> Path:
@@ -78,18 +76,19 @@ class LocalWeights:
     here: bool
     """Whether the extractor can be loaded without the network."""
     note: str | None
-    """What is in the way when they are not here."""
+    """Why the weights are not available."""
     path: str | None
     size_bytes: int | None
     licence: str
-    """As their publisher or the folder of the code says it; `none found` is said plainly."""
+    """Licence stated by the publisher or in the folder of the code, or `none found`."""
     fingerprint: str | None
-    """As `backbone_fingerprint` in an extractor spec."""
+    """The `backbone_fingerprint` of an extractor spec."""
 
 
 def list_recipes(settings: Settings) -> Iterator[ExtractorConfig]:
-    """Every extractor by its own name, that of new maps, and the torch.hub entries that are
-    allowed; not those for tests, nor models that were added, which lie in the object store.
+    """List the built-in extractors, the default extractor and the allowed torch.hub entries.
+
+    Test extractors are left out, and so are added models, whose weights are in the object store.
     """
     names = dict.fromkeys(
         (*EXTRACTOR_CONFIGS, settings.new_map_extractor, *settings.allowed_hub_extractors)
@@ -103,9 +102,13 @@ def inspect_weights(
     settings: Settings,
     on_reading: Callable[[Path], object] = lambda _path: None,
 ) -> LocalWeights:
-    """What is here of the extractor; asks no network and loads no network.
+    """Inspect the local weights of an extractor, without network access or loading the model.
 
-    A fingerprint that is not known yet is computed, which reads the file: `on_reading` is told.
+    Args:
+        recipe: The extractor.
+        settings: Location of DINOv2 weights.
+        on_reading: Called with the path before a file is read to compute its fingerprint, which
+            happens if the fingerprint is not cached.
     """
     if recipe.hub is not None:
         return _torchhub_weights(recipe.hub)
@@ -115,7 +118,7 @@ def inspect_weights(
 
 
 def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
-    """Under which the weights of a torch.hub entry are remembered once they were loaded."""
+    """Cache key of the weights of a torch.hub entry."""
     return f"{hub.module} {code_fingerprint}"
 
 
@@ -129,13 +132,11 @@ def _packaged_weights(
     )
     from shared.descriptors.weight_files import file_sha256
 
-    source, find_licence = f"the package {PACKAGE}", EfficientNetLite0.licence
+    source, licence = f"the package {PACKAGE}", EfficientNetLite0.licence
     try:
         path = weights_path()
     except Misconfigured as error:
-        return LocalWeights(
-            recipe.name, source, False, error.detail, None, None, find_licence, None
-        )
+        return LocalWeights(recipe.name, source, False, error.detail, None, None, licence, None)
     known = _cached_record(recipe.backbone, path, file_sha256, on_reading)
     return LocalWeights(
         recipe.name,
@@ -144,7 +145,7 @@ def _packaged_weights(
         None,
         str(path),
         known.size_bytes,
-        find_licence,
+        licence,
         known.fingerprint,
     )
 
@@ -175,7 +176,7 @@ def _dinov2_weights(
     def fingerprint(file: Path) -> str:
         return dinov2_fingerprint(size, layer, facet, open_weights(file, size))
 
-    # The layer and the facet say which of the file's tensors are in use.
+    # The fingerprint covers only the tensors that this layer and facet use.
     known = _cached_record(f"{recipe.backbone} {layer} {facet}", path, fingerprint, on_reading)
     return LocalWeights(
         recipe.name,
@@ -190,7 +191,7 @@ def _dinov2_weights(
 
 
 def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
-    """Where its weights lie, only its code knows: they are here once it was loaded as it is now."""
+    """Weights of a torch.hub entry count as available once this version of its code was loaded."""
     from shared.descriptors.backbones.torchhub import (
         code_fingerprint,
         find_licence,
@@ -207,7 +208,9 @@ def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
         hub.name,
         source,
         known is not None,
-        None if known else "its code is here, but was never loaded: `placewise models fetch`",
+        None
+        if known
+        else "its code is here, but its weights were never loaded: run `placewise models fetch`",
         str(folder),
         known.size_bytes if known else None,
         find_licence(folder),

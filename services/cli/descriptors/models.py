@@ -1,6 +1,7 @@
-"""`placewise models list|fetch`; what is added stands in `services.cli.descriptors.models`.
+"""`placewise models`: extractor weights on this machine, and trained models added to a server.
 
-`placewise models add|added|remove`: models of `placewise train` that describe maps.
+`list` and `fetch` inspect and download weights locally; `add`, `added` and `remove` manage the
+models of `placewise train` on a server.
 """
 
 from __future__ import annotations
@@ -53,33 +54,45 @@ if TYPE_CHECKING:
     from shared.descriptors.weight_files import OnProgress
 
 
-AddedModelName = Annotated[str, typer.Argument(metavar="NAME", help="As `models added` says.")]
+AddedModelName = Annotated[
+    str, typer.Argument(metavar="NAME", help="Name of an added model; see `models added`.")
+]
 
 
 def add(
     checkpoint: Annotated[
         Path,
-        typer.Argument(metavar="CHECKPOINT", exists=True, dir_okay=False, help="A .ckpt file."),
+        typer.Argument(
+            metavar="CHECKPOINT",
+            exists=True,
+            dir_okay=False,
+            help="Checkpoint of `placewise train` (.ckpt).",
+        ),
     ],
     name: Annotated[
-        str, typer.Option("--name", metavar="NAME", help="Maps call it gsv:NAME, for good.")
+        str,
+        typer.Option(
+            "--name", metavar="NAME", help="Permanent name; maps refer to it as gsv:NAME."
+        ),
     ],
-    licence: Annotated[str | None, typer.Option("--licence", help="Of the weights.")] = None,
-    note: Annotated[str | None, typer.Option("--note", help="For people.")] = None,
+    licence: Annotated[
+        str | None, typer.Option("--licence", help="Licence of the weights.")
+    ] = None,
+    note: Annotated[str | None, typer.Option("--note", help="Free-text note.")] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a checkpoint of `placewise train` a model that maps can be described with.
+    """Upload a checkpoint of `placewise train` as an extractor for maps.
 
-    It is sent to the server, whose extractor checks it; what describes photos is kept, and nothing
-    else. `--map` only says whose job list shows it.
+    The server's extractor validates the checkpoint and stores only what is needed to describe
+    photos. `--map` only selects the map whose job list shows the job.
     """
     with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            client.models()  # a wrong address or key is said before the file is sent
-            sending = progress.add_task("sending (bytes)", total=checkpoint.stat().st_size)
+            client.models()  # fails before the upload if the URL or key is wrong
+            sending = progress.add_task("uploading (bytes)", total=checkpoint.stat().st_size)
             started = client.add_model(
                 checkpoint,
                 name,
@@ -91,11 +104,11 @@ def add(
         if as_json:
             print_json(job)
             return
-        list_added = job["result"]
+        model = job["result"]
         console.print(
-            f"{list_added['extractor']}: {list_added['dimension']} dimensions, "
-            f"{list_added['size_bytes'] / 1e6:.1f} MB, fingerprint {list_added['fingerprint'][:12]}"
-            f"{'; it was there already' if list_added['already_there'] else ''}.",
+            f"{model['extractor']}: {model['dimension']} dimensions, "
+            f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
+            f"{'; already stored' if model['already_there'] else ''}.",
             soft_wrap=True,
             markup=False,
         )
@@ -104,16 +117,16 @@ def add(
 def list_added(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
-    """The models that were added, with the maps that are described with them."""
+    """List added models and the maps that use them."""
     with report_errors(as_json):
         with connect(server, None, key) as client:
-            found = client.models()
+            models = client.models()
         if as_json:
-            print_json(found)
+            print_json(models)
             return
         name = Column("extractor", overflow="fold", min_width=12)
         table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
-        for model in found:
+        for model in models:
             table.add_row(
                 escape(model["extractor"]),
                 f"{model['config']['backbone_arch']} {model['config']['agg_arch']}",
@@ -133,7 +146,7 @@ def remove(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Remove a model that no map is described with. Its name never means other weights."""
+    """Remove a model that no map uses. Its name can't be reused for other weights."""
     with report_errors(as_json):
         with connect(server, None, key) as client:
             removed = client.remove_model(name)
@@ -143,9 +156,7 @@ def remove(
         console.print(removed["message"], soft_wrap=True, markup=False)
 
 
-app = typer.Typer(
-    help="Extractors' weights: what is on this machine, getting what is not, adding your own."
-)
+app = typer.Typer(help="Manage extractor weights and trained models.")
 app.command("add")(add)
 app.command("added")(list_added)
 app.command("remove")(remove)
@@ -153,23 +164,28 @@ app.command("remove")(remove)
 
 @app.command("list")
 def list_(as_json: JsonOption = False) -> None:
-    """Show each extractor with its weights. One that is seen for the first time is read whole."""
+    """List extractors and their weights on this machine.
+
+    The first listing reads each weights file to compute its fingerprint.
+    """
     with report_errors(as_json):
         settings = read_settings()
-        with err_console.status("Looking for weights") as status:
+        with err_console.status("Searching for weights") as status:
 
             def reading(path: Path) -> None:
-                status.update(f"Reading {path} for its fingerprint")
+                status.update(f"Computing the fingerprint of {path}")
 
-            found = [
+            all_weights = [
                 inspect_weights(recipe, settings, reading) for recipe in list_recipes(settings)
             ]
     if as_json:
-        print_json([asdict(weights) for weights in found])
+        print_json([asdict(weights) for weights in all_weights])
         return
     name = Column("extractor", overflow="fold", min_width=23)
-    table = Table(name, "here", "size", Column("from", overflow="fold"), "licence", "fingerprint")
-    for weights in found:
+    table = Table(
+        name, "available", "size", Column("source", overflow="fold"), "licence", "fingerprint"
+    )
+    for weights in all_weights:
         table.add_row(
             escape(weights.extractor),
             "yes" if weights.here else "no",
@@ -183,13 +199,13 @@ def list_(as_json: JsonOption = False) -> None:
 
 @app.command("fetch")
 def fetch(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="An extractor's name.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Extractor name.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Get an extractor's weights ahead of time; a download that broke off goes on.
+    """Download the weights of an extractor. An interrupted download resumes.
 
-    A torch.hub entry (torchhub:OWNER/NAME@COMMIT:ENTRY) is executed, which is how its weights come:
-    look at its code first.
+    Weights of a torch.hub entry (torchhub:OWNER/NAME@COMMIT:ENTRY) are downloaded by running its
+    code: review the code first.
     """
     with report_errors(as_json):
         settings = read_settings()
@@ -199,8 +215,8 @@ def fetch(
         if recipe.trained is not None:
             raise Misconfigured(
                 "no_weights",
-                f"The weights of {recipe.name} lie in the object store, where extractors take them "
-                "from: there is nothing to fetch.",
+                f"The weights of {recipe.name} are in the object store, from which extractors load "
+                "them. There is nothing to fetch.",
             )
         with _download_progress(recipe.name) as on_progress:
             dimension = recipe.dimension
@@ -208,16 +224,16 @@ def fetch(
                 dimension = _fetch_torchhub(recipe.hub, on_progress)
             elif recipe.depth is not None:
                 _fetch_dinov2(recipe.backbone, settings, on_progress)
-        found = inspect_weights(recipe, settings)
-        if not found.here:
-            raise Misconfigured("weights_unfit", found.note or "")
+        weights = inspect_weights(recipe, settings)
+        if not weights.here:
+            raise Misconfigured("weights_unfit", weights.note or "")
     if as_json:
-        print_json({**asdict(found), "dimension": dimension})
+        print_json({**asdict(weights), "dimension": dimension})
         return
-    _print_weights(found, dimension)
+    _print_weights(weights, dimension)
     if recipe.hub is not None and recipe.name not in settings.allowed_hub_extractors:
         console.print(
-            f"Maps may use it once it is allowed: TORCHHUB_ALLOWED={escape(recipe.name)}",
+            f"To allow maps to use it, set TORCHHUB_ALLOWED={escape(recipe.name)}",
             soft_wrap=True,
         )
 
@@ -229,17 +245,17 @@ def _fetch_dinov2(backbone: str, settings: Settings, on_progress: OnProgress) ->
 
 
 def _fetch_torchhub(hub: TorchHubEntry, on_progress: OnProgress) -> int:
-    """Load it once; returns the length of its descriptors."""
+    """Load a torch.hub entry, cache its fingerprint and return its descriptor dimension."""
     import torch
 
     from shared.descriptors.backbones.torchhub import TorchHubBackbone
 
-    made = TorchHubBackbone(hub, torch.device("cpu"), on_progress=on_progress)
+    backbone = TorchHubBackbone(hub, torch.device("cpu"), on_progress=on_progress)
     save_record(
-        torchhub_key(hub, made.code_fingerprint),
-        WeightsRecord(made.fingerprint, made.card["size_bytes"]),
+        torchhub_key(hub, backbone.code_fingerprint),
+        WeightsRecord(backbone.fingerprint, backbone.card["size_bytes"]),
     )
-    return made.width
+    return backbone.width
 
 
 def _print_weights(weights: LocalWeights, dimension: int | None) -> None:
@@ -248,15 +264,15 @@ def _print_weights(weights: LocalWeights, dimension: int | None) -> None:
             f"{weights.extractor}: {dimension} dimensions, "
             f"{_format_megabytes(weights.size_bytes)} of weights."
         ),
-        f"They are from {weights.source}, and lie at {weights.path}.",
+        f"Source: {weights.source}. Path: {weights.path}.",
         f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.",
     ):
         console.print(escape(line), soft_wrap=True)
 
 
 @contextlib.contextmanager
-def _download_progress(what: str) -> Iterator[OnProgress]:
-    """A bar for what comes from the network, as soon as something comes."""
+def _download_progress(label: str) -> Iterator[OnProgress]:
+    """A progress bar that appears when a download starts."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -265,7 +281,7 @@ def _download_progress(what: str) -> Iterator[OnProgress]:
         TimeRemainingColumn(),
         console=err_console,
     ) as progress:
-        bar = progress.add_task(escape(what), visible=False)
+        bar = progress.add_task(escape(label), visible=False)
 
         def show(done: int, total: int | None) -> None:
             progress.update(bar, completed=done, total=total, visible=True)

@@ -1,4 +1,4 @@
-"""`placewise pca fit|undo`."""
+"""`placewise pca`: reduce descriptors by PCA whitening, and undo it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shared.client import Json
 from shared.errors import Conflict, InvalidRequest
 from shared.extractor_config.configs import MAX_PCA_DIMENSION
 
-app = typer.Typer(help="PCA whitening: shorter descriptors, less memory, faster search.")
+app = typer.Typer(help="Reduce descriptors by PCA whitening: less memory, faster search.")
 
 
 @app.command("fit")
@@ -33,32 +33,34 @@ def fit(
         typer.Argument(
             metavar="[ROWS.npy|DIR]",
             exists=True,
-            help="Learn from rows of `describe`, or from the photos below a folder, instead of the "
-            "map's descriptors, without a server.",
+            help="Fit on rows written by `describe` or on photos below a folder, without a server. "
+            "Default: fit on the map's descriptors.",
         ),
     ] = None,
     dimension: Annotated[
         int,
-        typer.Option("--dimension", min=1, max=MAX_PCA_DIMENSION, help="Of the descriptors then."),
+        typer.Option(
+            "--dimension", min=1, max=MAX_PCA_DIMENSION, help="Number of dimensions to keep."
+        ),
     ] = 512,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.safetensors", help="With ROWS.npy or DIR: what to write."),
+        typer.Option(metavar="FILE.safetensors", help="With ROWS.npy or DIR: output file."),
     ] = None,
     extractor: Annotated[
-        str | None, typer.Option(help="With DIR: by name; default: the one of new maps.")
+        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
     ] = None,
     vocabulary: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="With DIR: of VLAD.")
+        Path | None, typer.Option(exists=True, dir_okay=False, help="With DIR: VLAD vocabulary.")
     ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Learn from the map's descriptors how to shorten them, shorten all, switch.
+    """Fit a PCA whitening on the map's descriptors, and switch the map to reduced descriptors.
 
-    With ROWS.npy or DIR: write a file that `describe --pca` takes.
+    With ROWS.npy or DIR, write the whitening to a file for `describe --pca`.
     """
     with report_errors(as_json):
         if source is not None:
@@ -67,7 +69,7 @@ def fit(
         if out is not None or extractor is not None or vocabulary is not None:
             raise InvalidRequest(
                 "options_contradict",
-                "--out, --extractor, --vocabulary: only for pca fit ROWS.npy and pca fit DIR.",
+                "--out, --extractor and --vocabulary require ROWS.npy or DIR.",
             )
         with connect(server, map_name, key) as client, progress_bar() as progress:
             started = client.start_generation(pca=dimension)
@@ -82,14 +84,14 @@ def undo(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Describe the map's photos anew without PCA, with the vocabulary that they had, switch."""
+    """Reindex the map without PCA, with its current vocabulary, and switch to the result."""
     with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             active = next((g for g in client.generations() if g["state"] == "active"), None)
             if active is None or active["pca_from"] is None:
-                raise Conflict("not_reduced", "The map's descriptors are whole: nothing to undo.")
+                raise Conflict("not_reduced", "The map's descriptors are not reduced by PCA.")
             started = client.start_generation(vocabulary_id=active["vocabulary_id"])
-            job = wait_for_job(client, started["job_id"], progress, "whole descriptors")
+            job = wait_for_job(client, started["job_id"], progress, "reindexing")
         _print_generation(job, as_json)
 
 
@@ -102,12 +104,12 @@ def _fit_file(
     map_name: str | None,
     as_json: bool,
 ) -> None:
-    # Not --server and --key: the environment may hold them for all commands.
+    # --server and --key are not rejected: the environment may set them for all commands.
     if map_name is not None:
-        raise InvalidRequest("options_contradict", "--map: only for a fit on a map's descriptors.")
+        raise InvalidRequest("options_contradict", "--map can't be combined with ROWS.npy or DIR.")
     if out is None:
-        raise InvalidRequest("bad_out", "Say where to write: --out FILE.safetensors")
-    from services.cli.descriptors.local_fit import fit_pca_locally  # torch takes seconds
+        raise InvalidRequest("bad_out", "Specify the output file: --out FILE.safetensors")
+    from services.cli.descriptors.local_fit import fit_pca_locally  # imports torch
 
     with progress_bar() as progress:
         fitted = fit_pca_locally(
@@ -125,10 +127,10 @@ def _print_generation(job: Json, as_json: bool) -> None:
         print_json(job)
         return
     result = job["result"]
-    about = f"{result['dimension']} dimensions"
+    size = _format_pca(result["pca"]) if result["pca"] else f"{result['dimension']} dimensions"
     console.print(
-        f"Generation {result['generation_id']} answers: {result['photos']} photos, "
-        f"{_format_pca(result['pca']) if result['pca'] else about}, {result['failed']} failed.",
+        f"Generation {result['generation_id']} is active: {result['photos']} photos, "
+        f"{size}, {result['failed']} failed.",
         soft_wrap=True,
     )
 

@@ -1,4 +1,4 @@
-"""`placewise vocabulary fit|import|export|list`."""
+"""`placewise vocabulary`: fit, import, export and list VLAD vocabularies."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from shared.client import Client, Json
 from shared.errors import InvalidRequest
 from shared.extractor_config.configs import MAX_CLUSTERS
 
-app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos, import, list.")
+app = typer.Typer(help="Manage VLAD vocabularies (cluster centres): fit, import, export, list.")
 
 
 @app.command("fit")
@@ -40,45 +40,47 @@ def fit(
             metavar="[DIR]",
             exists=True,
             file_okay=False,
-            help="Learn from the photos below it instead of the map's, without a server.",
+            help="Fit on photos below this folder, without a server. Default: the map's photos.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="With DIR: what to write.")
+        Path | None, typer.Option(metavar="FILE.npz", help="With DIR: output file.")
     ] = None,
     extractor: Annotated[
-        str | None, typer.Option(help="With DIR: by name; default: the one of new maps.")
+        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
     ] = None,
     clusters: Annotated[
         int | None,
-        typer.Option(min=1, max=MAX_CLUSTERS, help="Cluster centres; default: the extractor's."),
+        typer.Option(
+            min=1, max=MAX_CLUSTERS, help="Number of cluster centres. Default: the extractor's."
+        ),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=1, help="Photos to learn from at most; default 1000.")
+        int | None, typer.Option(min=1, help="Maximum number of photos to fit on. Default: 1000.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1)] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Random seed.")] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Learn a vocabulary from the map's photos, describe all of them anew, switch.
+    """Fit a vocabulary on the map's photos, reindex them, and switch to the result.
 
-    With DIR: learn it from a folder, and write it to a file that `import` takes.
+    With DIR, fit on a folder and write the vocabulary to a file for `import`.
     """
     with report_errors(as_json):
         if folder is not None:
-            # Not --server and --key: the environment may hold them for all commands.
+            # --server and --key are not rejected: the environment may set them for all commands.
             _reject_options("a map", {"--map": map_name})
             if out is None:
-                raise InvalidRequest("bad_out", "Say where to write: --out FILE.npz")
+                raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
             _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
             return
         _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
-        wanted = {"clusters": clusters, "sample": sample, "seed": seed}
-        given = {name: value for name, value in wanted.items() if value is not None}
+        options = {"clusters": clusters, "sample": sample, "seed": seed}
+        parameters = {name: value for name, value in options.items() if value is not None}
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            job = fit_and_wait(client, given, progress)
+            job = fit_and_wait(client, parameters, progress)
         _print_generation(job, as_json)
 
 
@@ -97,35 +99,37 @@ def import_(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring a vocabulary, describe all photos with it, switch."""
-    from shared.descriptors.vocabulary_file import read_vocabulary  # torch takes seconds
+    """Import a vocabulary, reindex the map with it, and switch to the result."""
+    from shared.descriptors.vocabulary_file import read_vocabulary  # imports torch
 
     with report_errors(as_json):
-        brought = read_vocabulary(file)
+        vocabulary = read_vocabulary(file)
         with (
             tempfile.TemporaryDirectory() as folder,
             connect(server, map_name, key) as client,
             progress_bar() as progress,
         ):
-            checked = Path(folder, f"{file.stem}{brought.suffix}")
-            checked.write_bytes(brought.encode())
-            started = client.import_vocabulary(checked)
+            normalised_file = Path(folder, f"{file.stem}{vocabulary.suffix}")
+            normalised_file.write_bytes(vocabulary.encode())
+            started = client.import_vocabulary(normalised_file)
             job = wait_for_job(client, started["job_id"], progress, "vocabulary")
         _print_generation(job, as_json)
 
 
 @app.command("export")
 def export(
-    vocabulary_id: Annotated[str, typer.Argument(metavar="ID", help="As `vocabulary list` says.")],
+    vocabulary_id: Annotated[
+        str, typer.Argument(metavar="ID", help="Vocabulary ID; see `vocabulary list`.")
+    ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.npz", help="What to write: `import` takes it.")
+        Path, typer.Option("--out", metavar="FILE.npz", help="Output file, accepted by `import`.")
     ],
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one of the map's vocabularies to a file: .npz, or .npy where its origin is unknown."""
+    """Write a vocabulary of the map to a file: .npz, or .npy if its provenance is unknown."""
     with report_errors(as_json):
         _validate_id(vocabulary_id)
         with connect(server, map_name, key) as client:
@@ -133,7 +137,8 @@ def export(
         suffix = ".npz" if data.startswith(b"PK") else ".npy"
         if out.suffix != suffix:
             raise InvalidRequest(
-                "bad_out", f"{printable_path(out)}: this vocabulary's file ends in {suffix}."
+                "bad_out",
+                f"{printable_path(out)}: the file name of this vocabulary must end in {suffix}.",
             )
         with atomic_write(out) as file:
             file.write(data)
@@ -152,25 +157,25 @@ def list_(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The map's vocabularies, newest first; the one that answers is marked."""
+    """List the map's vocabularies, newest first. The active one is marked."""
     with report_errors(as_json):
         with connect(server, map_name, key) as client:
-            found = client.vocabularies()
-            answering = {
+            vocabularies = client.vocabularies()
+            active_generations = {
                 g["vocabulary_id"]: g for g in client.generations() if g["state"] == "active"
             }
-        active = answering.keys()
+        active = active_generations.keys()
         if as_json:
-            print_json([{**v, "active": v["vocabulary_id"] in active} for v in found])
+            print_json([{**v, "active": v["vocabulary_id"] in active} for v in vocabularies])
             return
-        # Ids are folded, never cut: they are there to be copied.
+        # IDs are folded, not truncated, so that they can be copied.
         name = Column("vocabulary", overflow="fold", min_width=36)
-        table = Table("", name, "origin", "clusters", "dimension", "photos", "made")
-        for v in found:
+        table = Table("", name, "origin", "clusters", "dimension", "photos", "created")
+        for v in vocabularies:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
                 f"{v['vocabulary_id']}\n{_format_provenance(v['provenance'])}\nsha256 "
-                f"{v['sha256'][:12]}" + _format_pca(answering.get(v["vocabulary_id"])),
+                f"{v['sha256'][:12]}" + _format_pca(active_generations.get(v["vocabulary_id"])),
                 v["origin"],
                 str(v["clusters"]),
                 str(v["dimension"]),
@@ -181,20 +186,26 @@ def list_(
 
 
 def _validate_id(vocabulary_id: str) -> None:
-    """InvalidRequest (`bad_id`): what is no id would be another path."""
+    """Reject anything but a UUID: the value becomes part of the URL's path."""
     try:
         UUID(vocabulary_id)
     except ValueError:
         raise InvalidRequest(
-            "bad_id", f"{vocabulary_id!r} is no vocabulary's id; `vocabulary list` shows them."
+            "bad_id",
+            f"Invalid vocabulary ID {vocabulary_id!r}. List IDs: placewise vocabulary list.",
         ) from None
 
 
 def _format_provenance(provenance: Json) -> str:
     if "backbone" not in provenance:
         return "of unknown origin"
-    pixels = provenance["preprocessing"]
-    parts = (provenance["backbone"], provenance["layer"], provenance["facet"], pixels["name"])
+    preprocessing = provenance["preprocessing"]
+    parts = (
+        provenance["backbone"],
+        provenance["layer"],
+        provenance["facet"],
+        preprocessing["name"],
+    )
     return " ".join(str(part) for part in parts if part is not None)
 
 
@@ -205,10 +216,10 @@ def _format_pca(generation: Json | None) -> str:
 
 
 def _reject_options(source: str, options: dict[str, object]) -> None:
-    """InvalidRequest (`options_contradict`) where one is given."""
-    if wrong := [name for name, value in options.items() if value is not None]:
+    """Raise InvalidRequest (`options_contradict`) if one of the options is given."""
+    if invalid := [name for name, value in options.items() if value is not None]:
         raise InvalidRequest(
-            "options_contradict", f"{', '.join(wrong)}: only for a fit on {source}."
+            "options_contradict", f"{', '.join(invalid)} requires a fit on {source}."
         )
 
 
@@ -221,7 +232,7 @@ def _fit_folder(
     seed: int | None,
     as_json: bool,
 ) -> None:
-    from services.cli.descriptors.local_fit import fit_vocabulary_on_folder  # torch takes seconds
+    from services.cli.descriptors.local_fit import fit_vocabulary_on_folder  # imports torch
 
     with progress_bar() as progress:
         fitted = fit_vocabulary_on_folder(
@@ -237,17 +248,17 @@ def _fit_folder(
         print_json(fitted)
         return
     print_failures(fitted, "refused")
-    about = fitted["provenance"]
+    provenance = fitted["provenance"]
     console.print(
         f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
-        f"{about['photos']} photos, mean cosine {about['mean_cosine']:.4f}.",
+        f"{provenance['photos']} photos, mean cosine {provenance['mean_cosine']:.4f}.",
         soft_wrap=True,
         markup=False,
     )
 
 
 def fit_and_wait(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
-    """Fit on the map's photos and wait until the new generation answers."""
+    """Fit a vocabulary on the map's photos and wait until its generation is active."""
     return wait_for_job(
         client, client.fit_vocabulary(**parameters)["job_id"], progress, "vocabulary"
     )
@@ -259,7 +270,7 @@ def _print_generation(job: Json, as_json: bool) -> None:
         return
     result = job["result"]
     console.print(
-        f"Generation {result['generation_id']} answers: {result['photos']} photos, "
+        f"Generation {result['generation_id']} is active: {result['photos']} photos, "
         f"{result['clusters']} clusters, {result['failed']} failed.",
         soft_wrap=True,
     )

@@ -1,6 +1,8 @@
-"""`placewise evaluate`: how often the right place comes first, in a live map or on a data set.
+"""`placewise evaluate` and `placewise compare`.
 
-`placewise compare DIR --extractors a,b,c`: recall, time and size of several descriptors.
+`evaluate` measures retrieval recall in a live map or on a data set. `compare` measures recall, time
+and size of several extractors on one data set. This module parses options; the modules that do the
+work import torch and are imported when they are needed.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ SIZE_PATTERN = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
 
 @dataclass(frozen=True, slots=True)
 class ReportOptions:
-    """Where results go and what they show."""
+    """Output options of an evaluation."""
 
     out: Path | None
     against: Path | None
@@ -42,102 +44,122 @@ def evaluate(
         typer.Option(
             exists=True,
             file_okay=False,
-            help="Evaluate a data set instead of a live map: a folder that `datasets check` knows. "
-            "With --predictions: where the photos of the lists lie.",
+            help="Evaluate on a data set (see `datasets check`) instead of a live map. "
+            "With --predictions: root folder of the listed photos.",
         ),
     ] = None,
     sets: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Of --data; may be repeated. Left out: all of them."),
+        typer.Option("--set", help="Set of --data. Can be repeated. Default: all sets."),
     ] = None,
     protocol: Annotated[
-        str | None, typer.Option(help="How the set is put together: msls-official, vme, ...")
+        str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
     ] = None,
     rule: Annotated[
         str | None,
-        typer.Option(help="Who is right: `radius 25`, `heading 25 40`, `frames 5`, `place-label`."),
+        typer.Option(
+            help="Positive-match criterion: `radius 25`, `heading 25 40`, `frames 5`, "
+            "`place-label`."
+        ),
     ] = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="Of `placewise train`: F.ckpt."),
+        typer.Option(
+            exists=True, dir_okay=False, help="Checkpoint of `placewise train` to evaluate (.ckpt)."
+        ),
     ] = None,
     image_size: Annotated[
         str,
         typer.Option(
-            help="Of --checkpoint: `same` as in training, `native`, or HEIGHTxWIDTH in pixels."
+            help="With --checkpoint: `same` as in training, `native`, or HEIGHTxWIDTH in pixels."
         ),
     ] = "same",
     extractor: Annotated[
-        str | None, typer.Option(help="By name, with options as in EXTRACTOR.")
+        str | None,
+        typer.Option(help="Extractor to evaluate, with options as in EXTRACTOR."),
     ] = None,
     vocabulary: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="Of VLAD: .npz, .npy or c_centers.pt."),
+        typer.Option(
+            exists=True, dir_okay=False, help="VLAD vocabulary: .npz, .npy or c_centers.pt."
+        ),
     ] = None,
     fit_vocabulary: Annotated[
         bool,
         typer.Option(
             "--fit-vocabulary",
-            help="Of VLAD: learn one from the database's own photos, as where none is shipped.",
+            help="Fit the VLAD vocabulary on the database photos. Default if none is shipped.",
         ),
     ] = False,
     predictions: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="(queries, k) database indices, .npy: what was found."
+            exists=True,
+            dir_okay=False,
+            help="Evaluate predictions: (queries, k) database indices, .npy.",
         ),
     ] = None,
     ground_truth: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="With --predictions: what is right, .npy."),
+        typer.Option(exists=True, dir_okay=False, help="With --predictions: ground truth, .npy."),
     ] = None,
     database: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="With --predictions: the photos' names, .npy or text."
+            exists=True,
+            dir_okay=False,
+            help="With --predictions: names of database photos, .npy or text.",
         ),
     ] = None,
     queries: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="With --predictions: the queries' names."),
+        typer.Option(exists=True, dir_okay=False, help="With --predictions: names of queries."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for predictions, metrics.json and report.html."),
+        typer.Option(help="Output folder for predictions, metrics.json and report.html."),
     ] = None,
     against: Annotated[
         Path | None,
         typer.Option(
-            exists=True, file_okay=False, help="--out of another run: what was won and lost."
+            exists=True,
+            file_okay=False,
+            help="Compare with another run, given by its --out folder.",
         ),
     ] = None,
     pairs: Annotated[
         Path | None,
-        typer.Option(dir_okay=False, help="File for the pairs found, as hloc reads them."),
+        typer.Option(dir_okay=False, help="Output file of retrieval pairs in hloc's format."),
     ] = None,
     depth: Annotated[
-        int, typer.Option(min=1, max=1000, help="Database photos ranked for each query.")
+        int, typer.Option(min=1, max=1000, help="Number of database photos ranked per query.")
     ] = 20,
     grids: Annotated[
-        int, typer.Option(min=0, max=500, help="Queries of a kind that the report shows.")
+        int,
+        typer.Option(
+            min=0, max=500, help="Maximum number of example queries per category in the report."
+        ),
     ] = 12,
     only_wrong: Annotated[
-        bool, typer.Option("--only-wrong", help="The report shows no query that was right.")
+        bool, typer.Option("--only-wrong", help="Show only failed queries in the report.")
     ] = False,
     faiss_gpu: Annotated[
-        bool, typer.Option("--faiss-gpu", "--faiss_gpu", help="Search on the GPU.")
+        bool,
+        typer.Option(
+            "--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."
+        ),
     ] = False,
     sample: Annotated[
         int | None,
-        typer.Option(min=1, help="Of a live map: photos to ask with; default 1000."),
+        typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of a live map.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Live map: random seed.")] = None,
     word_weights: Annotated[
         bool,
         typer.Option(
             "--word-weights",
-            help="Of a live map: first learn which words of the vocabulary tell the map's places "
-            "apart, and keep their weights where recall rises.",
+            help="Live map: first fit weights of visual words on the map's places, and keep them "
+            "if recall improves.",
         ),
     ] = False,
     map_name: MapOption = None,
@@ -145,72 +167,80 @@ def evaluate(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask a live map about its own photos; or with --data, evaluate on a data set.
+    """Measure retrieval recall in a live map or on a data set.
 
-    Without --data and --predictions: the map is asked about its own photos, each left out in turn,
-    and about its labelled queries. With --data: a --checkpoint, an --extractor or a --server is
-    asked about a data set.
+    Without --data and --predictions, evaluate the map with its own photos (leave-one-out) and its
+    labelled queries. With --data, evaluate a --checkpoint, an --extractor or a --server on a data
+    set. With --predictions, evaluate a file of predictions.
     """
-    wanted = ReportOptions(out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json)
-    of_a_map: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
-    of_photos: OptionValues = {
+    report_options = ReportOptions(
+        out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json
+    )
+    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
     }  # fmt: skip
-    of_a_file: OptionValues = {
+    file_options: OptionValues = {
         "--ground-truth": ground_truth,
         "--database": database,
         "--queries": queries,
     }
-    of_results: OptionValues = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
+    output_options: OptionValues = {
+        "--out": out, "--against": against, "--pairs": pairs, "--set": sets
+    }  # fmt: skip
     with report_errors(as_json):
-        # Read when torch is loaded, which is below; see services/cli/__init__.py.
+        # Must be set before torch is loaded below; see services/cli/__init__.py.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         if predictions is not None:
-            _reject_options("with --predictions", of_a_map | of_photos)
+            _reject_options("with --predictions", map_options | model_options)
             if ground_truth is None:
-                raise InvalidRequest("no_ground_truth", "Say what is right: --ground-truth GT.npy")
+                raise InvalidRequest(
+                    "no_ground_truth", "--predictions requires --ground-truth GT.npy."
+                )
             require_packages()
             from services.cli.evaluation.results import evaluate_predictions
 
-            evaluate_predictions(predictions, ground_truth, database, queries, data, sets, wanted)
+            evaluate_predictions(
+                predictions, ground_truth, database, queries, data, sets, report_options
+            )
             return
         if data is not None:
-            _reject_options("with --data", of_a_map | of_a_file)
+            _reject_options("with --data", map_options | file_options)
             require_packages()
             from services.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
 
             size = _parse_image_size(image_size, checkpoint)
-            asking = EvaluationTarget(
+            target = EvaluationTarget(
                 checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
             )
-            evaluate_sets(data, sets, protocol, rule, asking, wanted)
+            evaluate_sets(data, sets, protocol, rule, target, report_options)
             return
-        _reject_options("without --data", of_photos | of_a_file | of_results)
+        _reject_options("without --data", model_options | file_options | output_options)
         from services.cli.evaluation.live_map import evaluate_map
 
         evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
 def _reject_options(context: str, options: OptionValues) -> None:
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise InvalidRequest("options_contradict", f"{', '.join(given)}: not {context}.")
+    invalid = [name for name, value in options.items() if value]
+    if invalid:
+        raise InvalidRequest("options_contradict", f"{', '.join(invalid)} can't be used {context}.")
 
 
 def _parse_image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
-    """`same`, `native` or (height, width) of `320x320`."""
+    """Parse `same`, `native`, or HEIGHTxWIDTH such as `320x320` to (height, width)."""
     if checkpoint is None and text != "same":
         raise InvalidRequest(
             "options_contradict",
-            "--image-size: only with --checkpoint; an extractor has its own preprocessing.",
+            "--image-size requires --checkpoint. Extractors have their own preprocessing.",
         )
     if text in ("same", "native"):
         return text
     match = SIZE_PATTERN.fullmatch(text)
     if match is None:
         raise InvalidRequest(
-            "bad_image_size", f"--image-size {text}: same, native or HEIGHTxWIDTH is needed."
+            "bad_image_size", f"--image-size must be same, native or HEIGHTxWIDTH, not {text}."
         )
     return int(match[1]), int(match[2])
 
@@ -219,39 +249,48 @@ def compare(
     data: Annotated[
         Path,
         typer.Argument(
-            metavar="DIR", exists=True, file_okay=False, help="A data set: database and queries."
+            metavar="DIR",
+            exists=True,
+            file_okay=False,
+            help="Data set with a database and queries.",
         ),
     ],
     extractors: Annotated[
         str,
         typer.Option(
-            help="Separated by commas: names with options as in EXTRACTOR, or checkpoints (.ckpt); "
-            "`+fit` learns VLAD's vocabulary from the database's own photos, `+pca512` shortens "
-            "rows to 512 dimensions.",
+            help="Comma-separated extractor names with options as in EXTRACTOR, or checkpoints "
+            "(.ckpt). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` reduces "
+            "descriptors to 512 dimensions by PCA whitening.",
         ),
     ],
     set_name: Annotated[
-        str | None, typer.Option("--set", help="Which set of DIR, where it has several.")
+        str | None, typer.Option("--set", help="Set of DIR. Required if there are several.")
     ] = None,
-    protocol: Annotated[str | None, typer.Option(help="How the set is put together.")] = None,
+    protocol: Annotated[str | None, typer.Option(help="Evaluation protocol.")] = None,
     rule: Annotated[
         str | None,
-        typer.Option(help="Who is right: `radius 25`, `heading 25 40`, `frames 5`, `place-label`."),
+        typer.Option(
+            help="Positive-match criterion: `radius 25`, `heading 25 40`, `frames 5`, "
+            "`place-label`."
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for comparison.json and report.html.")
+        Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
     ] = None,
     faiss_gpu: Annotated[
-        bool, typer.Option("--faiss-gpu", "--faiss_gpu", help="Search on the GPU.")
+        bool,
+        typer.Option(
+            "--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Describe one data set with each extractor, and print what each finds and takes.
+    """Compare recall, speed and size of several extractors on one data set.
 
-    Rows are kept below PLACEWISE_HOME/descriptors: after an interruption, or with one extractor
-    more, only what is missing is described.
+    Descriptors are cached in PLACEWISE_HOME/descriptors: a repeated run describes only what is
+    missing.
     """
-    # Read when torch is loaded, which is below; see services/cli/__init__.py.
+    # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with report_errors(as_json):
         require_packages()

@@ -1,6 +1,6 @@
-"""Several descriptors on one data set: what each finds, takes and weighs. Imports torch.
+"""Comparison of several extractors on one data set: recall, time and size. Imports torch.
 
-Rows of a data set shortened by PCA whitening, learnt from its database rows alone.
+An entry may reduce its descriptors by PCA whitening, which is fitted on the database rows only.
 """
 
 from __future__ import annotations
@@ -42,11 +42,13 @@ SEED = 0
 
 @dataclass(frozen=True, slots=True)
 class WhitenedSet:
+    """Descriptors of a data set after PCA whitening."""
+
     database: Rows
     queries: Rows
     whitening: PcaWhitening
     milliseconds_a_photo: float
-    """what shortening one row takes"""
+    """Time to project one row."""
 
 
 def whiten_set(
@@ -54,38 +56,49 @@ def whiten_set(
     queries: Rows,
     components: int,
     device: torch.device,
-    on_progress: Callable[[str, int, int], None] = lambda what, done, most: None,
+    on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> WhitenedSet:
-    """(m, D) and (n, D) rows -> (m, kept) and (n, kept).
+    """Fit a PCA whitening on the database rows and project the rows of a data set.
 
-    Raises Unprocessable (`pca_too_few_rows`, `pca_too_many_dimensions`).
+    Args:
+        database: (m, D) rows.
+        queries: (n, D) rows.
+        components: Number of dimensions to keep.
+        device: Device of the projection.
+        on_progress: Called with stage, done and total.
+
+    Returns:
+        (m, components) and (n, components) rows.
+
+    Raises:
+        Unprocessable: `pca_too_few_rows`, `pca_too_many_dimensions`.
     """
     dimension = database.shape[1]
     check_pca_fittable(len(database), dimension, components)
-    chosen = sample_rows(len(database), sample_size(dimension, components), SEED)
-    at_once = max(1, BLOCK_BYTES // (4 * dimension))
-    batches = (database[chosen[b : b + at_once]] for b in range(0, len(chosen), at_once))
-    whitening = fit_pca_stream(batches, len(chosen), dimension, components, on_progress)
+    sampled = sample_rows(len(database), sample_size(dimension, components), SEED)
+    block_rows = max(1, BLOCK_BYTES // (4 * dimension))
+    batches = (database[sampled[b : b + block_rows]] for b in range(0, len(sampled), block_rows))
+    whitening = fit_pca_stream(batches, len(sampled), dimension, components, on_progress)
     projection = PcaProjection(whitening, device)
-    begun = time.perf_counter()
-    short = [_project(rows, projection, at_once, device) for rows in (database, queries)]
-    took = time.perf_counter() - begun
+    started = time.perf_counter()
+    reduced = [_project(rows, projection, block_rows, device) for rows in (database, queries)]
+    seconds = time.perf_counter() - started
     return WhitenedSet(
-        short[0], short[1], whitening, 1000 * took / max(1, len(database) + len(queries))
+        reduced[0], reduced[1], whitening, 1000 * seconds / max(1, len(database) + len(queries))
     )
 
 
-def _project(rows: Rows, projection: PcaProjection, at_once: int, device: torch.device) -> Rows:
-    short = np.empty((len(rows), projection.kept), np.float32)
-    for begin, block in _blocks(rows, at_once):
+def _project(rows: Rows, projection: PcaProjection, block_rows: int, device: torch.device) -> Rows:
+    reduced = np.empty((len(rows), projection.kept), np.float32)
+    for begin, block in _blocks(rows, block_rows):
         projected = projection(torch.from_numpy(block).to(device)).cpu().numpy()
-        short[begin : begin + len(block)] = projected
-    return short
+        reduced[begin : begin + len(block)] = projected
+    return reduced
 
 
-def _blocks(rows: Rows, at_once: int) -> Iterator[tuple[int, Rows]]:
-    for begin in range(0, len(rows), at_once):
-        yield begin, np.array(rows[begin : begin + at_once])
+def _blocks(rows: Rows, block_rows: int) -> Iterator[tuple[int, Rows]]:
+    for begin in range(0, len(rows), block_rows):
+        yield begin, np.array(rows[begin : begin + block_rows])
 
 
 FLOAT32_BYTES = 4
@@ -94,17 +107,21 @@ PCA_SUFFIX = re.compile(r"pca([1-9][0-9]{0,4})")
 
 @dataclass(frozen=True, slots=True)
 class ComparisonEntry:
-    """One descriptor of a comparison."""
+    """One extractor of a comparison."""
 
     spec_text: str
     name: str
-    """an extractor's name with its options, or a checkpoint's path"""
+    """An extractor name with options, or the path of a checkpoint."""
     fit: bool = False
     pca: int | None = None
 
 
 def parse_entries(text: str) -> list[ComparisonEntry]:
-    """`a,b:layer=9,facet=key+pca512,run.ckpt` -> three; InvalidRequest (`bad_extractors`)."""
+    """Parse `--extractors`: `a,b:layer=9,facet=key+pca512,run.ckpt` gives three entries.
+
+    Raises:
+        InvalidRequest: `bad_extractors`.
+    """
     parts: list[str] = []
     for part in text.split(","):
         # A comma also separates the options of one extractor.
@@ -127,12 +144,13 @@ def _parse_entry(spec_text: str) -> ComparisonEntry:
         else:
             raise InvalidRequest(
                 "bad_extractors",
-                f"{spec_text}: +{addition} is not known. There are +fit, and +pcaN to N "
-                "dimensions, "
+                f"{spec_text}: unknown suffix +{addition}. Use +fit, or +pcaN for N dimensions, "
                 f"up to {MAX_PCA_DIMENSION}.",
             )
     if not name:
-        raise InvalidRequest("bad_extractors", f"--extractors: {spec_text!r} names no extractor.")
+        raise InvalidRequest(
+            "bad_extractors", f"--extractors: {spec_text!r} has no extractor name."
+        )
     return ComparisonEntry(spec_text, name, fit, pca)
 
 
@@ -147,33 +165,41 @@ def compare_extractors(
     faiss_gpu: bool,
     as_json: bool,
 ) -> None:
-    """Raises as reading the set, loading the extractors and describing does."""
+    """Evaluate each extractor on a data set, then print and write the comparison.
+
+    Raises:
+        InvalidRequest: `bad_extractors`, and errors of opening the data set.
+        Misconfigured: `out_unwritable`, and errors of loading the extractors.
+        Unprocessable: A photo can't be described.
+    """
     entries = parse_entries(extractors)
     settings = read_settings()
     _validate_entries(entries, settings, out)
-    asked = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
-    clusters = cluster_queries(asked.queries)
-    found: list[tuple[ComparedExtractor, RetrievalMetrics]] = []
+    evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
+    clusters = cluster_queries(evaluation_set.queries)
+    results: list[tuple[ComparedExtractor, RetrievalMetrics]] = []
     with progress_bar() as progress:
         for entry in entries:
-            about, measured = _evaluate_entry(entry, asked, settings, faiss_gpu, progress)
-            first = found[0][1] if found else None
+            properties, measured = _evaluate_entry(
+                entry, evaluation_set, settings, faiss_gpu, progress
+            )
+            first = results[0][1] if results else None
             difference: PairedDifference | None = None
             if first is not None:
                 (difference,) = paired_differences(
                     measured.within[:, :1], first.within[:, :1], clusters.labels
                 )
-            found.append(
-                (ComparedExtractor(entry.spec_text, measured, difference, **about), measured)
+            results.append(
+                (ComparedExtractor(entry.spec_text, measured, difference, **properties), measured)
             )
-    compared = [one for one, _ in found]
-    report = _comparison_as_json(asked, compared)
+    compared = [result for result, _ in results]
+    report = _comparison_as_json(evaluation_set, compared)
     if out is not None:
-        _write_report(out, report, render_comparison(asked, compared))
+        _write_report(out, report, render_comparison(evaluation_set, compared))
     if as_json:
         print_json(report)
         return
-    _print_comparison(asked, compared)
+    _print_comparison(evaluation_set, compared)
     if out is not None:
         console.print(printable_path(out / "report.html"), soft_wrap=True, markup=False)
 
@@ -181,14 +207,14 @@ def compare_extractors(
 def _validate_entries(
     entries: Sequence[ComparisonEntry], settings: Settings, out: Path | None
 ) -> None:
-    """All names, before the first of them takes its hours."""
+    """Check all entries before the first evaluation, which may take hours."""
     for entry in entries:
         if entry.name.endswith(".ckpt"):
             if not Path(entry.name).is_file():
-                raise InvalidRequest("bad_extractors", f"There is no checkpoint {entry.name}.")
+                raise InvalidRequest("bad_extractors", f"Checkpoint {entry.name} does not exist.")
             if entry.fit:
                 raise InvalidRequest(
-                    "bad_extractors", f"{entry.spec_text}: a checkpoint has no vocabulary to fit."
+                    "bad_extractors", f"{entry.spec_text}: a checkpoint uses no vocabulary."
                 )
             continue
         recipe = get_extractor_config(
@@ -196,14 +222,14 @@ def _validate_entries(
         )
         if entry.fit and not recipe.needs_vocabulary:
             raise InvalidRequest(
-                "bad_extractors", f"{entry.spec_text}: {recipe.name} uses no vocabulary to fit."
+                "bad_extractors", f"{entry.spec_text}: {recipe.name} uses no vocabulary."
             )
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise Misconfigured(
-                "out_unwritable", f"{out} can't be written: {error.strerror}."
+                "out_unwritable", f"Can't write to {out}: {error.strerror}."
             ) from error
 
 
@@ -215,23 +241,28 @@ def _evaluate_entry(
     progress: Progress,
 ) -> tuple[dict[str, Any], RetrievalMetrics]:
     describer = _make_describer(entry, evaluation_set, settings, progress)
-    told = progress_bars(progress, entry.spec_text)
-    describer.describe.on_lookup = lambda done, most: told("known photos", done, most)
-    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=told) as (
+    on_progress = progress_bars(progress, entry.spec_text)
+    describer.describe.on_lookup = lambda done, total: on_progress(
+        "cached descriptors", done, total
+    )
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
         database,
         queries,
     ):
-        took = describer.describe.milliseconds_a_photo()
+        milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            short = whiten_set(database, queries, entry.pca, choose_device(settings.device), told)
-            database, queries = short.database, short.queries
-            took = None if took is None else took + short.milliseconds_a_photo
+            whitened = whiten_set(
+                database, queries, entry.pca, choose_device(settings.device), on_progress
+            )
+            database, queries = whitened.database, whitened.queries
+            if milliseconds is not None:
+                milliseconds += whitened.milliseconds_a_photo
         ranked = exact_knn(
             queries,
             database,
             max(DEFAULT_KS),
             faiss_gpu=faiss_gpu,
-            on_progress=lambda done, most: told("search", done, most),
+            on_progress=lambda done, total: on_progress("search", done, total),
         )
         dimension = database.shape[1]
     measured = compute_metrics(
@@ -243,7 +274,7 @@ def _evaluate_entry(
     return {
         "dimension": dimension,
         "bytes_a_photo": FLOAT32_BYTES * dimension,
-        "milliseconds_a_photo": took,
+        "milliseconds_a_photo": milliseconds,
         "fingerprint": describer.fingerprint,
         "device": str(describer.about.get("device", "")),
     }, measured
@@ -255,16 +286,16 @@ def _make_describer(
     if entry.name.endswith(".ckpt"):
         return checkpoint_describer(Path(entry.name), "same", settings)
     recipe = get_extractor_config(entry.name, allow_test_extractors=settings.allow_test_extractors)
-    database = [shot.path for shot in evaluation_set.database]
+    database = [photo.path for photo in evaluation_set.database]
     return extractor_describer(recipe, None, database, settings, progress, fit=entry.fit)
 
 
 def _comparison_as_json(
     evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]
 ) -> dict[str, Any]:
-    recalls = [one.recall_at_1 for one in compared]
-    by_size = pareto_front([one.bytes_a_photo for one in compared], recalls)
-    by_time = pareto_front([one.milliseconds for one in compared], recalls)
+    recalls = [result.recall_at_1 for result in compared]
+    by_size = pareto_front([result.bytes_a_photo for result in compared], recalls)
+    by_time = pareto_front([result.milliseconds for result in compared], recalls)
     return {
         "set": evaluation_set.name,
         "protocol": evaluation_set.protocol,
@@ -272,8 +303,8 @@ def _comparison_as_json(
         "fingerprint": evaluation_set.fingerprint,
         "versions": package_versions(),
         "extractors": [
-            {**one.as_json(), "pareto_by_size": size, "pareto_by_time": duration}
-            for one, size, duration in zip(compared, by_size, by_time, strict=True)
+            {**result.as_json(), "pareto_by_size": size, "pareto_by_time": duration}
+            for result, size, duration in zip(compared, by_size, by_time, strict=True)
         ],
     }
 
@@ -284,34 +315,32 @@ def _write_report(out: Path, report: dict[str, Any], page: str) -> None:
         (out / "comparison.json").write_text(text, encoding="utf-8")
         (out / "report.html").write_text(page, encoding="utf-8")
     except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"{out} can't be written: {error.strerror}."
-        ) from error
+        raise Misconfigured("out_unwritable", f"Can't write to {out}: {error.strerror}.") from error
 
 
 def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:
     ks = list(compared[0].measured.recalls.recall_all)
-    columns = (*(f"R@{k}" for k in ks), "95 % of R@1", "ms", "bytes", "against the first")
+    columns = (*(f"R@{k}" for k in ks), "R@1 95 % CI", "ms", "bytes", "vs. first")
     table = Table(
         evaluation_set.name, *(Column(name, justify="right", no_wrap=True) for name in columns)
     )
-    for one in compared:
-        interval = one.measured.recall_intervals
+    for result in compared:
+        interval = result.measured.recall_intervals
         table.add_row(
-            one.name,
-            *(f"{100 * share:.1f}" for share in one.measured.recalls.recall_all.values()),
+            result.name,
+            *(f"{100 * share:.1f}" for share in result.measured.recalls.recall_all.values()),
             f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-",
-            "-" if one.milliseconds_a_photo is None else f"{one.milliseconds_a_photo:.1f}",
-            f"{one.bytes_a_photo:,}",
-            one.against_first(),
+            "-" if result.milliseconds_a_photo is None else f"{result.milliseconds_a_photo:.1f}",
+            f"{result.bytes_a_photo:,}",
+            result.against_first(),
         )
     console.print(table)
     clusters = compared[0].measured.clusters
     console.print(
-        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; fingerprint "
-        f"{evaluation_set.fingerprint[:16]}; "
-        f"intervals over {clusters.count} {clusters.kind}. ms: network and aggregation of one "
-        "photo, measured when its row was made. bytes: float32.",
+        f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
+        f"fingerprint {evaluation_set.fingerprint[:16]}; confidence intervals over "
+        f"{clusters.count} {clusters.kind}. ms: inference and aggregation per photo, measured when "
+        "its descriptor was computed. bytes: float32 descriptor size.",
         soft_wrap=True,
         markup=False,
     )

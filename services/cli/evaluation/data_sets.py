@@ -1,8 +1,7 @@
-"""`placewise evaluate --data DIR`: a checkpoint, an extractor or a server asked about data sets.
+"""`placewise evaluate --data DIR`: evaluate a checkpoint, an extractor or a server on data sets.
 
-Imports torch.
-
-A data set asked of a running service: its database becomes a map, its queries are uploaded.
+A server is evaluated over HTTP: the set's database photos are uploaded to a map, and its queries
+are sent as unstored query photos. Imports torch.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from shared.evaluation.ranking import (
 from shared.evaluation.results import EvaluationResult, EvaluationRun
 from shared.extractor_config.configs import get_extractor_config
 
-Done = TypeVar("Done")
+Result = TypeVar("Result")
 
 
 def evaluate_server(
@@ -54,38 +53,57 @@ def evaluate_server(
     depth: int,
     progress: Progress,
 ) -> tuple[Rankings, EvaluationRun, dict[str, Any]]:
-    """Rank the database for each query, over HTTP.
+    """Rank the database photos for each query through a server's HTTP API.
 
-    The photos go into the map `map_name`, or else into one named after the set; one that is not
-    there is made. It may hold nothing else (Conflict, `map_holds_others`), and asking again uploads
-    the same photos again and describes none twice. Only pixels are sent, no position: what is found
-    is found by looks.
+    Uploads are idempotent: a repeated evaluation describes no photo twice. No positions are sent,
+    so that results depend on image content only.
+
+    Args:
+        evaluation_set: The data set.
+        server: URL of the server; None for the server on PLACEWISE_HOME or an embedded one.
+        map_name: Map for the database photos; None for one named after the set. It is created if
+            it does not exist and must not contain other photos.
+        key: API key.
+        depth: Number of database photos ranked per query.
+        progress: Shows uploads and queries.
+
+    Returns:
+        The rankings, the description of the run, and the descriptor dimension with the median
+        latency of a query in milliseconds.
+
+    Raises:
+        Conflict: `map_holds_others`.
+        Unavailable: `answer_short` if the server returns fewer results than requested.
     """
     name = (
         map_name or f"evaluate-{re.sub(r'[^a-z0-9]+', '-', evaluation_set.name.lower()).strip('-')}"
     )
-    with connect(server, None, key) as anywhere:
-        if name not in {there["name"] for there in anywhere.maps()}:
-            anywhere.create_map(name)
+    with connect(server, None, key) as client:
+        if name not in {map_["name"] for map_ in client.maps()}:
+            client.create_map(name)
     with connect(server, name, key) as client:
-        patient = client.patient(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
-        of_file = _upload_database(patient, evaluation_set, name, progress)
-        bar = progress.add_task(f"{evaluation_set.name}: asking", total=len(evaluation_set.queries))
+        retrying_client = client.patient(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
+        indices_by_file = _upload_database(retrying_client, evaluation_set, name, progress)
+        bar = progress.add_task(
+            f"{evaluation_set.name}: querying", total=len(evaluation_set.queries)
+        )
 
-        def ask(photo: Path) -> tuple[Json, float]:
-            begun = time.perf_counter()
-            answer = patient.similar_to_file(photo, top_k=min(depth, len(of_file)))
+        def query(photo: Path) -> tuple[Json, float]:
+            started = time.perf_counter()
+            response = retrying_client.similar_to_file(
+                photo, top_k=min(depth, len(indices_by_file))
+            )
             progress.advance(bar)
-            return answer, time.perf_counter() - begun
+            return response, time.perf_counter() - started
 
-        answers = _map_concurrently(ask, [shot.path for shot in evaluation_set.queries])
+        responses = _map_concurrently(query, [photo.path for photo in evaluation_set.queries])
         generation = next((g for g in client.generations() if g["state"] == "active"), {})
     k = min(depth, len(evaluation_set.database))
     ranked = Rankings(
-        np.empty((len(answers), k), np.int64), np.empty((len(answers), k), np.float32)
+        np.empty((len(responses), k), np.int64), np.empty((len(responses), k), np.float32)
     )
-    for query, (answer, _) in enumerate(answers):
-        _fill_ranking(ranked, query, answer, of_file, evaluation_set.queries[query].name)
+    for row, (response, _) in enumerate(responses):
+        _fill_ranking(ranked, row, response, indices_by_file, evaluation_set.queries[row].name)
     run = EvaluationRun(
         f"map {name}",
         None,
@@ -95,7 +113,7 @@ def evaluate_server(
             "generation": generation.get("generation_id"),
         },
     )
-    seconds = [took for _, took in answers]
+    seconds = [duration for _, duration in responses]
     return (
         ranked,
         run,
@@ -109,70 +127,73 @@ def evaluate_server(
 def _upload_database(
     client: Client, evaluation_set: EvaluationSet, name: str, progress: Progress
 ) -> dict[str, list[int]]:
-    """The database in the map: the indices of the photos of each file id. Photos of the same bytes
-    are one file."""
+    """Upload the database photos; returns the database indices by file ID.
+
+    Photos with equal bytes share a file ID.
+    """
     bar = progress.add_task(f"{evaluation_set.name}: uploading", total=len(evaluation_set.database))
 
-    def upload(number: int) -> Json:
-        shot = evaluation_set.database[number]
-        answer = client.upload(shot.path, filename=Path(shot.name).name)
+    def upload(index: int) -> Json:
+        photo = evaluation_set.database[index]
+        response = client.upload(photo.path, filename=Path(photo.name).name)
         progress.advance(bar)
-        return answer
+        return response
 
     uploaded = _map_concurrently(upload, range(len(evaluation_set.database)))
-    of_file: dict[str, list[int]] = {}
-    for number, answer in enumerate(uploaded):
-        of_file.setdefault(answer["file_id"], []).append(number)
+    indices_by_file: dict[str, list[int]] = {}
+    for index, response in enumerate(uploaded):
+        indices_by_file.setdefault(response["file_id"], []).append(index)
     stats, _ = fit_vocabulary_if_needed(client, client.stats(), progress)
-    if stats["total_images"] != len(of_file):
+    if stats["total_images"] != len(indices_by_file):
         raise Conflict(
             "map_holds_others",
-            f"The map {name} holds {stats['total_images']} photos, {evaluation_set.name} has "
-            f"{len(of_file)}: they would be found, too. Take another --map, or delete this one.",
+            f"Map {name} contains {stats['total_images']} photos instead of the "
+            f"{len(indices_by_file)} of {evaluation_set.name}. Other photos would change the "
+            "results. Use another --map, or delete this one.",
         )
-    bar = progress.add_task(f"{evaluation_set.name}: describing", total=len(of_file))
+    bar = progress.add_task(f"{evaluation_set.name}: describing", total=len(indices_by_file))
     failed = []
-    for number, answer in enumerate(uploaded):
-        if answer.get("job_id") is None or of_file[answer["file_id"]][0] != number:
+    for index, response in enumerate(uploaded):
+        if response.get("job_id") is None or indices_by_file[response["file_id"]][0] != index:
             continue
-        job = client.wait_for(answer["job_id"])
+        job = client.wait_for(response["job_id"])
         progress.advance(bar)
         if job["state"] != "succeeded":
             reason = Unprocessable("not_described", str((job["error"] or {}).get("detail")))
-            failed.append((evaluation_set.database[number].path, reason))
+            failed.append((evaluation_set.database[index].path, reason))
     if failed:
         raise refused_photos_error(failed, len(evaluation_set.database))
-    return of_file
+    return indices_by_file
 
 
-def _map_concurrently(do: Callable[[Any], Done], things: Sequence[Any]) -> list[Done]:
-    """What `do` returns of each thing, in their order; the first error ends it."""
+def _map_concurrently(function: Callable[[Any], Result], items: Sequence[Any]) -> list[Result]:
+    """Apply a function to each item in parallel threads; results are in the order of the items."""
     with ThreadPoolExecutor(UPLOAD_CONCURRENCY) as pool:
-        return list(pool.map(do, things))
+        return list(pool.map(function, items))
 
 
 def _fill_ranking(
-    ranked: Rankings, query: int, answer: Json, of_file: dict[str, list[int]], name: str
+    ranked: Rankings, row: int, response: Json, indices_by_file: dict[str, list[int]], name: str
 ) -> None:
     k = ranked.indices.shape[1]
-    found = [
-        (number, image["similarity_score"])
-        for image in answer["similar_images"]
-        for number in of_file[image["image_id"]]
+    matches = [
+        (index, image["similarity_score"])
+        for image in response["similar_images"]
+        for index in indices_by_file[image["image_id"]]
     ][:k]
-    if len(found) < k:
+    if len(matches) < k:
         raise Unavailable(
             "answer_short",
-            f"The server found {len(found)} of {k} photos for {name}. Is a shard of its search "
-            "away? Ask again.",
+            f"The server returned {len(matches)} of {k} photos for {name}. Check that all search "
+            "shards are available, and try again.",
         )
-    ranked.indices[query] = [number for number, _ in found]
-    ranked.scores[query] = [score for _, score in found]
+    ranked.indices[row] = [index for index, _ in matches]
+    ranked.scores[row] = [score for _, score in matches]
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationTarget:
-    """Who is asked."""
+    """The model or server to evaluate."""
 
     checkpoint: Path | None
     image_size: str | tuple[int, int]
@@ -184,20 +205,27 @@ class EvaluationTarget:
     key: str | None
 
     def check(self) -> None:
-        """Exactly one; InvalidRequest (`options_contradict`, `no_model`)."""
+        """Check that exactly one target is given.
+
+        Raises:
+            InvalidRequest: `options_contradict`, `no_model`.
+        """
         if self.checkpoint is not None and self.extractor is not None:
-            raise InvalidRequest("options_contradict", "--checkpoint and --extractor: give one.")
+            raise InvalidRequest(
+                "options_contradict", "--checkpoint and --extractor exclude each other."
+            )
         if self.extractor is None and (self.vocabulary is not None or self.fit_vocabulary):
             raise InvalidRequest(
-                "options_contradict", "--vocabulary, --fit-vocabulary: only with --extractor."
+                "options_contradict", "--vocabulary and --fit-vocabulary require --extractor."
             )
         if self.vocabulary is not None and self.fit_vocabulary:
-            raise InvalidRequest("options_contradict", "--vocabulary and --fit-vocabulary: one.")
+            raise InvalidRequest(
+                "options_contradict", "--vocabulary and --fit-vocabulary exclude each other."
+            )
         if self.checkpoint is None and self.extractor is None and self.server is None:
             raise InvalidRequest(
                 "no_model",
-                "Say what is to be evaluated: --checkpoint F.ckpt, --extractor NAME or "
-                "--server URL.",
+                "Specify what to evaluate: --checkpoint F.ckpt, --extractor NAME or --server URL.",
             )
 
 
@@ -209,26 +237,34 @@ def evaluate_sets(
     target: EvaluationTarget,
     options: ReportOptions,
 ) -> None:
-    """Evaluate the named sets below `data`, or all of them. Raises as what it calls does."""
+    """Evaluate a target on the named sets below `data`, or on all of them.
+
+    Raises:
+        NotFound: `no_evaluation_set`.
+        InvalidRequest: `options_contradict`, `no_model`, and errors of opening the sets.
+        Misconfigured: `out_unwritable`, and errors of loading the model.
+    """
     target.check()
     check_output_folders(options)
     settings = read_settings()
-    chosen = names or evaluation_set_names(data)
-    if not chosen:
-        raise NotFound("no_evaluation_set", f"{data} holds no set to evaluate on.")
-    asked = [open_evaluation_set(data, n, protocol=protocol, rule=rule) for n in chosen]
+    set_names = names or evaluation_set_names(data)
+    if not set_names:
+        raise NotFound("no_evaluation_set", f"{data} contains no evaluation set.")
+    evaluation_sets = [
+        open_evaluation_set(data, name, protocol=protocol, rule=rule) for name in set_names
+    ]
     results: list[EvaluationResult] = []
     run: EvaluationRun | None = None
     with progress_bar() as progress:
-        for one in asked:
+        for evaluation_set in evaluation_sets:
             if target.checkpoint is None and target.extractor is None:
-                result, run = _evaluate_on_server(one, target, options, progress)
+                result, run = _evaluate_on_server(evaluation_set, target, options, progress)
             else:
-                describer = _make_describer(one, target, settings, progress)
-                result = _evaluate_describer(one, describer, options, progress)
+                describer = _make_describer(evaluation_set, target, settings, progress)
+                result = _evaluate_describer(evaluation_set, describer, options, progress)
                 run = EvaluationRun(describer.name, describer.fingerprint, describer.about)
             results.append(result)
-    assert run is not None, "there is a set"
+    assert run is not None, "at least one set was evaluated"
     output_results(run, results, options)
 
 
@@ -244,7 +280,7 @@ def _make_describer(
     return extractor_describer(
         recipe,
         target.vocabulary,
-        [shot.path for shot in evaluation_set.database],
+        [photo.path for photo in evaluation_set.database],
         settings,
         progress,
         fit=target.fit_vocabulary,
@@ -254,21 +290,23 @@ def _make_describer(
 def _evaluate_describer(
     evaluation_set: EvaluationSet, describer: Describer, options: ReportOptions, progress: Progress
 ) -> EvaluationResult:
-    told = progress_bars(progress, evaluation_set.name)
-    describer.describe.on_lookup = lambda done, most: told("known photos", done, most)
-    found = evaluate_recall(
+    on_progress = progress_bars(progress, evaluation_set.name)
+    describer.describe.on_lookup = lambda done, total: on_progress(
+        "cached descriptors", done, total
+    )
+    result = evaluate_recall(
         describer.describe,
         evaluation_set,
         ks=[*(k for k in DEFAULT_KS if k <= options.depth), options.depth],
         faiss_gpu=options.faiss_gpu,
-        on_progress=told,
+        on_progress=on_progress,
     )
-    about: dict[str, Any] = {
-        "dimension": found.dimension,
-        "bytes_a_photo": 4 * found.dimension,
+    figures: dict[str, Any] = {
+        "dimension": result.dimension,
+        "bytes_a_photo": 4 * result.dimension,
         "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
     }
-    return evaluate_rankings(evaluation_set, found.ranked, options, has_scores=True, about=about)
+    return evaluate_rankings(evaluation_set, result.ranked, options, has_scores=True, about=figures)
 
 
 def _evaluate_on_server(
@@ -277,19 +315,19 @@ def _evaluate_on_server(
     options: ReportOptions,
     progress: Progress,
 ) -> tuple[EvaluationResult, EvaluationRun]:
-    ranked, run, about = evaluate_server(
+    ranked, run, figures = evaluate_server(
         evaluation_set, target.server, target.map_name, target.key, options.depth, progress
     )
-    return evaluate_rankings(evaluation_set, ranked, options, has_scores=True, about=about), run
+    return evaluate_rankings(evaluation_set, ranked, options, has_scores=True, about=figures), run
 
 
 def progress_bars(progress: Progress, name: str) -> ProgressCallback:
-    """Bars for each thing that is done about a set."""
+    """Create a progress callback that shows one bar per stage."""
     bars: dict[str, Any] = {}
 
-    def told(what: str, done: int, most: int) -> None:
-        if what not in bars:
-            bars[what] = progress.add_task(f"{name}: {what}", total=most)
-        progress.update(bars[what], completed=done, total=most)
+    def on_progress(stage: str, done: int, total: int) -> None:
+        if stage not in bars:
+            bars[stage] = progress.add_task(f"{name}: {stage}", total=total)
+        progress.update(bars[stage], completed=done, total=total)
 
-    return told
+    return on_progress

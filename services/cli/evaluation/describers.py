@@ -1,4 +1,4 @@
-"""What describes the photos of a data set: an extractor by name, or a checkpoint. Imports torch."""
+"""Describers of data sets: an extractor or a checkpoint, with a descriptor cache. Imports torch."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.decode import DECODER
 
 CACHE_FOLDER = "descriptors"
-FIT_SAMPLE_PHOTOS = 1000  # as a map's fit learns from
+FIT_SAMPLE_PHOTOS = 1000  # same default as for fits on a map
 SEED = 0
 
 
 @dataclass(slots=True)
 class Describer:
-    """Photos to rows, with what a result says of it."""
+    """Computes descriptors of photos; carries the metadata that results report."""
 
     name: str
     describe: CachedDescriber
     spec: dict[str, Any]
-    """everything that decides a row's value"""
+    """Everything that determines a descriptor's value."""
     about: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -52,7 +52,7 @@ class Describer:
 
 
 class ExtractorDescriber:
-    """An extractor's rows, by the decoding children of every upload."""
+    """Describes photos with an extractor, decoding them in child processes as for uploads."""
 
     def __init__(
         self, extractor: Extractor, centres: ClusterCentres | None, settings: Settings
@@ -61,10 +61,15 @@ class ExtractorDescriber:
         self._centres = centres
         self._settings = settings
         self.seconds = 0.0
-        """spent in the network, of `photos`; they are read and decoded meanwhile"""
+        """Inference time of `photos`, without decoding, which overlaps."""
         self.photos = 0
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
+        """Yield (b, D) batches in the order of the photos.
+
+        Raises:
+            Unprocessable: `photos_refused`, which lists every photo that can't be described.
+        """
         refused: list[tuple[Path, PlacewiseError]] = []
         batches = decode_batches(
             photos, self._extractor.preprocessing, self._settings, defaultdict(float)
@@ -76,15 +81,15 @@ class ExtractorDescriber:
                     refused.append((photo, outcome))
                 else:
                     pixels.append(outcome.pixels)
-            if refused or not pixels:  # after a refusal, the rest is read for what else is wrong
+            if refused or not pixels:  # after a failure, only collect further failures
                 continue
-            begun = time.perf_counter()
+            started = time.perf_counter()
             try:
                 rows = self._extractor.describe(pixels, self._centres)
             except PhotoTooLargeForGpu as error:
                 refused.append((batch[error.place][0], error))
                 continue
-            self.seconds += time.perf_counter() - begun
+            self.seconds += time.perf_counter() - started
             self.photos += len(rows)
             yield rows
         if refused:
@@ -94,7 +99,13 @@ class ExtractorDescriber:
 def checkpoint_describer(
     checkpoint: Path, image_size: str | tuple[int, int], settings: Settings
 ) -> Describer:
-    """`image_size`: `same` as the model was built for, `native`, or (height, width)."""
+    """Create a describer from a checkpoint.
+
+    Args:
+        checkpoint: Checkpoint of `placewise train`.
+        image_size: `same` (the model's own), `native`, or (height, width) in pixels.
+        settings: Device, batch size, pixel limit and cache.
+    """
     loaded = load_checkpoint(checkpoint)
     size = None if image_size == "native" else loaded.config.image_size
     if not isinstance(image_size, str):
@@ -131,17 +142,26 @@ def extractor_describer(
     *,
     fit: bool = False,
 ) -> Describer:
-    """VLAD takes the vocabulary of the file; with `fit`, or where none is given or shipped, one
-    that is learnt from the database's own photos, never from the queries."""
+    """Create a describer from an extractor.
+
+    Args:
+        recipe: The extractor.
+        vocabulary: VLAD vocabulary file, or None.
+        database: Database photos of the set.
+        settings: Device, batch size and cache.
+        progress: Shows a vocabulary fit.
+        fit: Fit the vocabulary on the database photos, never on queries. This is also done if no
+            vocabulary is given or shipped.
+    """
     about: dict[str, Any] = {}
     extractor = load_extractor(recipe, settings)
     if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
         centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
-        about["vocabulary"] = "fitted on the database's photos"
+        about["vocabulary"] = "fitted on the database photos"
     else:
         centres = resolve_centres(extractor, load_own_vocabulary(recipe, vocabulary))
         if centres is not None:
-            about["vocabulary"] = vocabulary.name if vocabulary else "the shipped one"
+            about["vocabulary"] = vocabulary.name if vocabulary else "shipped"
     spec = extractor.spec(centres)
     describe = ExtractorDescriber(extractor, centres, settings)
     about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
@@ -151,8 +171,8 @@ def extractor_describer(
 def _fit_vocabulary(
     extractor: Extractor, database: Sequence[Path], settings: Settings, progress: Progress
 ) -> ClusterCentres:
-    chosen = sample_photos(len(database), FIT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
-    photos = [database[number] for number in chosen]
+    sampled = sample_photos(len(database), FIT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
+    photos = [database[index] for index in sampled]
     bars = {name: progress.add_task(name, total=None) for name in ("vocabulary", "clustering")}
     names = {"describing": "vocabulary", "clustering": "clustering"}
     refused: list[dict[str, str]] = []
@@ -162,8 +182,8 @@ def _fit_vocabulary(
         len(photos),
         clusters=extractor.recipe.clusters,
         seed=SEED,
-        on_progress=lambda what, done, most: progress.update(
-            bars[names[what]], completed=done, total=most
+        on_progress=lambda stage, done, total: progress.update(
+            bars[names[stage]], completed=done, total=total
         ),
     )
     return fitted.centres

@@ -1,4 +1,4 @@
-"""`placewise evaluate` of a live map: how often the right place comes first."""
+"""`placewise evaluate` on a live map: recall of its own photos and of its labelled queries."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shared.client import Client, Json
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
-MAX_EVALUATIONS_SHOWN = 6  # evaluations that were asked for, this one and those before
+MAX_EVALUATIONS_SHOWN = 6  # the current evaluation and earlier ones
 EVALUATIONS_FETCHED = 100
 
 
@@ -24,37 +24,38 @@ def evaluate_map(
     key: str | None,
     as_json: bool,
 ) -> None:
-    """Ask the map about its own photos (each left out in turn) and its labelled queries."""
-    wanted = {"sample": sample, "seed": seed}
-    given = {name: value for name, value in wanted.items() if value is not None}
-    learnt: Json | None = None
+    """Evaluate a map with its own photos (leave-one-out) and its labelled queries."""
+    options = {"sample": sample, "seed": seed}
+    parameters = {name: value for name, value in options.items() if value is not None}
+    fitted_weights: Json | None = None
     with connect(server, map_name, key) as client, progress_bar() as progress:
         if word_weights:
-            learnt = _fit_word_weights(client, given, progress)
-        job = wait_for_job(client, client.evaluate(**given)["job_id"], progress, "asking")
-        asked_for = [e for e in client.evaluations(EVALUATIONS_FETCHED) if not e["automatic"]][
+            fitted_weights = _fit_word_weights(client, parameters, progress)
+        job = wait_for_job(client, client.evaluate(**parameters)["job_id"], progress, "evaluating")
+        requested = [e for e in client.evaluations(EVALUATIONS_FETCHED) if not e["automatic"]][
             :MAX_EVALUATIONS_SHOWN
         ]
         vocabularies = _vocabulary_origins(client)
     if as_json:
-        print_json({**job["result"], "word_weights": learnt} if learnt else job["result"])
+        result = job["result"]
+        print_json({**result, "word_weights": fitted_weights} if fitted_weights else result)
         return
-    _print_evaluations(asked_for, vocabularies)
-    if learnt:
+    _print_evaluations(requested, vocabularies)
+    if fitted_weights:
         console.print(
-            f"Word weights: {learnt['outcome']}. {learnt['reason']}",
+            f"Word weights: {fitted_weights['outcome']}. {fitted_weights['reason']}",
             soft_wrap=True,
             markup=False,
         )
 
 
 def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
-    """Learn the active generation's word weights; what came of it."""
+    """Fit word weights of the active generation; returns the job's result."""
     active = [g["generation_id"] for g in client.generations() if g["state"] == "active"]
     if not active:
         raise Conflict(
             "nothing_to_evaluate",
-            "The map has no described photo yet. Upload some: placewise index.",
+            "The map has no photos with descriptors yet. Upload photos: placewise index.",
         )
     started = client.learn_word_weights(active[0], **parameters)
     result: Json = wait_for_job(client, started["job_id"], progress, "word weights")["result"]
@@ -62,7 +63,7 @@ def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Prog
 
 
 def _vocabulary_origins(client: Client) -> dict[str, str]:
-    """The origin of each generation's vocabulary, by generation."""
+    """Origin of the vocabulary by generation ID."""
     origins = {v["vocabulary_id"]: v["origin"] for v in client.vocabularies()}
     return {
         g["generation_id"]: origins.get(g["vocabulary_id"], "none") for g in client.generations()
@@ -74,21 +75,21 @@ def _print_evaluations(evaluations: list[Json], vocabularies: dict[str, str]) ->
         Column("evaluated", no_wrap=True),
         "vocabulary",
         "photos",
-        "asked with",
+        "queries",
         *(Column(f"R@{k}", justify="right", no_wrap=True) for k in (1, 5, 10)),
     )
-    for found in evaluations:
-        figures = found["figures"]
+    for evaluation in evaluations:
+        figures = evaluation["figures"]
         rows = _recall_rows(figures)
-        # Evaluations of earlier releases don't speak of weights.
+        # Evaluations of earlier releases have no `with_word_weights`.
         if weighted := figures.get("with_word_weights"):
-            rows += [(f"{what}, word weights", recall) for what, recall in _recall_rows(weighted)]
-        for what, recall in rows:
+            rows += [(f"{kind}, word weights", recall) for kind, recall in _recall_rows(weighted)]
+        for kind, recall in rows:
             table.add_row(
-                found["evaluated_at"][5:19].replace("T", " "),
-                vocabularies.get(found["generation_id"], ""),
-                str(found["searchable"]),
-                f"{recall['queries']} {what}",
+                evaluation["evaluated_at"][5:19].replace("T", " "),
+                vocabularies.get(evaluation["generation_id"], ""),
+                str(evaluation["searchable"]),
+                f"{recall['queries']} {kind}",
                 *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     console.print(table)
@@ -106,31 +107,30 @@ def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
 
 def _estimate_lines(figures: Json) -> list[str]:
     labelled, estimate = figures["labelled_queries"], figures["estimate"]
-    lines = [f"Right means within {figures['radius_m']:g} m, or the same label."]
+    lines = [f"Positive match: within {figures['radius_m']:g} m, or the same place label."]
     if labelled is None:
         lines.append(
-            "Confidence is uncalibrated: upload photos of another day, with coordinates, as "
-            "labelled queries (placewise index DIR --role query)."
+            "Confidence is uncalibrated. To calibrate it, upload photos taken on another day, with "
+            "coordinates, as labelled queries (placewise index DIR --role query)."
         )
         return lines
     if estimate["calibration"] == "uncalibrated":
-        teaching = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
+        usable = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
         lines.append(
-            f"Confidence is uncalibrated: {teaching} labelled queries of another session are "
-            f"there, at least {MIN_LABELLED_QUERIES} are needed, with "
-            f"{MIN_QUERIES_PER_CLASS} whose answer is "
-            f"right and {MIN_QUERIES_PER_CLASS} whose answer is wrong."
+            f"Confidence is uncalibrated: the map has {usable} labelled queries of another "
+            f"session. At least {MIN_LABELLED_QUERIES} are required, including "
+            f"{MIN_QUERIES_PER_CLASS} with a correct and {MIN_QUERIES_PER_CLASS} with an incorrect "
+            "first match."
         )
     lines.append(
-        f"Of {labelled['queries']} queries in the map "
-        f"{_format_percent(labelled['accepted_in_map'])} are "
-        f"accepted; of {labelled['out_of_map']} out of it "
-        f"{_format_percent(labelled['false_accepts'])}; "
-        f"of all accepted {_format_percent(labelled['right_of_accepted'])} are right."
+        f"{_format_percent(labelled['accepted_in_map'])} of the {labelled['queries']} queries in "
+        f"the map and {_format_percent(labelled['false_accepts'])} of the "
+        f"{labelled['out_of_map']} queries outside it are accepted. "
+        f"{_format_percent(labelled['right_of_accepted'])} of the accepted queries are correct."
     )
     if labelled["auroc"] is not None:
         lines.append(
-            f"Confidence ({estimate['calibration']}, cross-validated): calibration error "
+            f"Confidence ({estimate['calibration']}, cross-validated): expected calibration error "
             f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
             f"precision {_format_percent(labelled['recall_at_99_precision'])}."
         )

@@ -1,6 +1,7 @@
-"""What `placewise evaluate` writes and prints of its results.
+"""Output of `placewise evaluate`: metrics, reports and tables.
 
-`placewise evaluate --predictions P.npy --ground-truth GT.npy`: what was found before, judged.
+Also implements `placewise evaluate --predictions P.npy --ground-truth GT.npy`, which evaluates
+rankings that were computed elsewhere.
 """
 
 from __future__ import annotations
@@ -38,8 +39,11 @@ from shared.evaluation.retrieval_metrics import compute_metrics, match_distances
 
 
 def check_output_folders(options: ReportOptions) -> None:
-    """Before the minutes that describing takes: whether results can be written where they are
-    wanted; Misconfigured (`out_unwritable`)."""
+    """Create the output folders before the long computation of results.
+
+    Raises:
+        Misconfigured: `out_unwritable`.
+    """
     try:
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
@@ -57,7 +61,15 @@ def evaluate_rankings(
     has_scores: bool,
     about: dict[str, object],
 ) -> EvaluationResult:
-    """All figures of one set, and those against an earlier run."""
+    """Compute all metrics of one set, and the comparison with an earlier run, if requested.
+
+    Args:
+        evaluation_set: The set; its database may be empty if only numbers are known.
+        ranked: Database indices and scores per query, best first.
+        options: Output options.
+        has_scores: Whether the scores of `ranked` are meaningful.
+        about: Further figures to report, such as the descriptor dimension.
+    """
     measured = compute_metrics(
         ranked.indices,
         evaluation_set.positives,
@@ -104,7 +116,11 @@ def evaluate_rankings(
 def output_results(
     run: EvaluationRun, results: Sequence[EvaluationResult], options: ReportOptions
 ) -> None:
-    """Write what is wanted, print the figures."""
+    """Write the requested files and print the metrics.
+
+    Raises:
+        Misconfigured: `out_unwritable`.
+    """
     try:
         if options.out is not None:
             write_run_files(options.out, run, results)
@@ -117,10 +133,10 @@ def output_results(
     except OSError as error:
         raise _unwritable_error(options.out or options.pairs, error) from error
     if options.as_json:
-        found = build_metrics(run, results)
-        if len(results) == 1:  # a program that asks about one set need not know its name
-            found |= found["sets"][results[0].evaluation_set.name]
-        print_json(found)
+        metrics = build_metrics(run, results)
+        if len(results) == 1:  # also at the top level, so that scripts need not know the name
+            metrics |= metrics["sets"][results[0].evaluation_set.name]
+        print_json(metrics)
         return
     for result in results:
         _print_result(result)
@@ -144,30 +160,34 @@ def _print_result(result: EvaluationResult) -> None:
             _format_share(share, measured.recall_intervals, at),
             _format_share(recalls.recall_findable[k], measured.findable_intervals, at),
         )
-    mean, within = measured.mean_average_precision, measured.map_interval
-    table.add_row(f"mAP@{measured.depth}", "", _format_share(mean, [within] if within else None, 0))
+    mean, interval = measured.mean_average_precision, measured.map_interval
+    table.add_row(
+        f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
+    )
     console.print(table)
     console.print(
-        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
+        f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; "
         + (
-            f"95 % intervals over {measured.clusters.count} {measured.clusters.kind}."
+            f"95 % confidence intervals over {measured.clusters.count} {measured.clusters.kind}."
             if measured.recall_intervals
-            else f"{measured.clusters.count} {measured.clusters.kind} are too few for intervals."
+            else f"{measured.clusters.count} {measured.clusters.kind} are too few for confidence "
+            "intervals."
         ),
         soft_wrap=True,
         markup=False,
     )
     if result.against is not None:
-        for k, found in result.against.differences.items():
-            interval = (
-                f" ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
-                if found.low is not None and found.high is not None
+        for k, difference in result.against.differences.items():
+            bounds = (
+                f" ({100 * difference.low:+.1f} to {100 * difference.high:+.1f})"
+                if difference.low is not None and difference.high is not None
                 else ""
             )
             console.print(
-                f"R@{k} {100 * found.mean:+.1f} points{interval} against {result.against.other}: "
-                f"{found.won} won, {found.lost} lost.",
+                f"R@{k} {100 * difference.mean:+.1f} points{bounds} compared with "
+                f"{result.against.other}: {difference.won} queries gained, "
+                f"{difference.lost} lost.",
                 soft_wrap=True,
                 markup=False,
             )
@@ -176,7 +196,7 @@ def _print_result(result: EvaluationResult) -> None:
 def _format_share(
     share: float, intervals: Sequence[ConfidenceInterval] | None, position: int
 ) -> str:
-    if math.isnan(share):  # no query to take it of
+    if math.isnan(share):  # no query to average over
         return "-"
     if intervals is None:
         return f"{100 * share:.1f} %"
@@ -187,7 +207,7 @@ def _format_share(
 
 
 def _unwritable_error(path: Path | None, error: OSError) -> Misconfigured:
-    return Misconfigured("out_unwritable", f"{path} can't be written: {error.strerror}.")
+    return Misconfigured("out_unwritable", f"Can't write to {path}: {error.strerror}.")
 
 
 PREDICTIONS_PROTOCOL = "predictions file"
@@ -202,43 +222,56 @@ def evaluate_predictions(
     sets: Sequence[str] | None,
     options: ReportOptions,
 ) -> None:
-    """`photos` is the folder in which the lists' names are looked for; left out: that of the lists.
+    """Evaluate a file of predictions against a ground truth file.
 
-    Raises InvalidRequest: `one_list`, `which_set`, and what reading the files raises.
+    Args:
+        predictions: (queries, k) database indices, best first, `.npy`.
+        ground_truth: The positives of each query, `.npy`.
+        database: List of the database photos' names, or None.
+        queries: List of the queries' names, or None.
+        photos: Root folder of the names; None for the folder of each list.
+        sets: At most one name, for the report.
+        options: Output options.
+
+    Raises:
+        InvalidRequest: `one_list`, `which_set`, and errors of reading the files.
+        Misconfigured: `out_unwritable`.
     """
     if (database is None) != (queries is None):
-        raise InvalidRequest("one_list", "Give both lists, --database and --queries, or none.")
+        raise InvalidRequest("one_list", "--database and --queries must be given together.")
     if sets and len(sets) > 1:
-        raise InvalidRequest("which_set", "A predictions file is of one set: give --set once.")
+        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
     check_output_folders(options)
     ranked = read_predictions(predictions)
     name = sets[0] if sets else ground_truth.stem
     rule = None
-    shots: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
+    photo_lists: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
     if database is not None and queries is not None:
-        shots = read_photo_list(database, photos), read_photo_list(queries, photos)
-        there, asked_for = ([shot.name for shot in role] for role in shots)
-        positives, rule = read_ground_truth(ground_truth, database=there, queries=asked_for)
-        check_predictions(predictions, ranked, positives, len(there))
+        photo_lists = read_photo_list(database, photos), read_photo_list(queries, photos)
+        database_names, query_names = ([photo.name for photo in role] for role in photo_lists)
+        positives, rule = read_ground_truth(
+            ground_truth, database=database_names, queries=query_names
+        )
+        check_predictions(predictions, ranked, positives, len(database_names))
     else:
         positives = read_integer_lists(ground_truth)
         check_predictions(predictions, ranked, positives, None)
-        # Nothing is known of them but their numbers.
+        # Without lists, queries are identified by their numbers.
         numbered = tuple(
             DatasetPhoto(Path(f"query {q}"), f"query {q}") for q in range(len(positives))
         )
-        shots = (), numbered
-    asked = EvaluationSet(
+        photo_lists = (), numbered
+    evaluation_set = EvaluationSet(
         name=name,
         root=photos or predictions.parent,
-        database=shots[0],
-        queries=shots[1],
+        database=photo_lists[0],
+        queries=photo_lists[1],
         positives=tuple(positives),
         rule=rule or f"given by {ground_truth.name}",
         protocol=PREDICTIONS_PROTOCOL,
     )
-    kept = ranked[:, : options.depth]
-    found = Rankings(kept, np.zeros(kept.shape, np.float32))
-    result = evaluate_rankings(asked, found, options, has_scores=False, about={})
+    truncated = ranked[:, : options.depth]
+    rankings = Rankings(truncated, np.zeros(truncated.shape, np.float32))
+    result = evaluate_rankings(evaluation_set, rankings, options, has_scores=False, about={})
     run = EvaluationRun(predictions.stem, None, {"predictions": predictions.name})
     output_results(run, [result], options)

@@ -1,13 +1,12 @@
-"""The predecessor's folder: its rows and its photos brought together.
+"""Reader for the folder of an AnyLoc similarity service: its SQLite database and its photos.
 
-A row's `image_path` is one of another machine or container, and the file's name is not the row's
-id: what joins them is the path's last part, below a folder called `uploads`.
+The table `images` of `similarity.db` has one row per photo: `image_id`, `image_path` (on the
+machine or in the container where the service ran), `original_filename`, `upload_time` (SQLite's
+CURRENT_TIMESTAMP: UTC without an offset), `metadata_json`, `tags`. The other columns describe the
+service's own feature files and are not read.
 
-Reading the predecessor's catalog: `similarity.db` of the AnyLoc similarity service.
-
-Its table `images` has a row per photo: `image_id`, `image_path` (of the machine that it ran on),
-`original_filename`, `upload_time` (SQLite's CURRENT_TIMESTAMP: UTC without saying so),
-`metadata_json`, `tags`; the other columns are about its own feature files.
+Since `image_path` belongs to another machine and file names are not row ids, rows and files are
+matched by the last part of the path, below a folder named `uploads`.
 """
 
 from __future__ import annotations
@@ -34,33 +33,36 @@ from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 
 DATABASE_NAME = "similarity.db"
-SQLITE_SUFFIXES = ("", "-wal", "-journal")  # rows may still lie in its write-ahead log
+SQLITE_SUFFIXES = ("", "-wal", "-journal")  # the write-ahead log may contain rows
 
 
 @dataclass(frozen=True, slots=True)
 class AnylocRow:
-    """One photo as the predecessor knew it."""
+    """A row of the table `images`."""
 
     image_path: str
     name: str
-    """What its user called it; "" where that was not kept."""
+    """The original file name; "" if the row has none."""
     tags: list[str]
     metadata: dict[str, Any]
-    """The user's, with `anyloc_image_id` and `anyloc_upload_time` (ISO 8601, UTC)."""
+    """The user's metadata, with `anyloc_image_id` and `anyloc_upload_time` (ISO 8601, UTC)."""
 
 
 def read_anyloc_rows(database: Path) -> list[AnylocRow]:
-    """Every row of the table, in the order of the uploads; whatever is in a row can be read.
+    """Read all rows in upload order. Malformed values in a row never fail the import.
 
-    Nothing is written beside the database: even to read, SQLite would make files for its
-    write-ahead log there, so a copy is opened. Raises InvalidRequest (`bad_anyloc_database`).
+    A temporary copy of the database is opened, because SQLite may create write-ahead log files next
+    to a database even for reading.
+
+    Raises:
+        InvalidRequest: `bad_anyloc_database`.
     """
     try:
         with tempfile.TemporaryDirectory() as folder:
-            for ending in SQLITE_SUFFIXES:
-                source = database.with_name(database.name + ending)
+            for suffix in SQLITE_SUFFIXES:
+                source = database.with_name(database.name + suffix)
                 if source.exists():
-                    shutil.copyfile(source, Path(folder, DATABASE_NAME + ending))
+                    shutil.copyfile(source, Path(folder, DATABASE_NAME + suffix))
             with contextlib.closing(sqlite3.connect(Path(folder, DATABASE_NAME))) as connection:
                 return _read_images_table(connection, database)
     except (sqlite3.Error, OSError) as error:
@@ -68,12 +70,12 @@ def read_anyloc_rows(database: Path) -> list[AnylocRow]:
 
 
 def _read_images_table(connection: sqlite3.Connection, database: Path) -> list[AnylocRow]:
-    # It lets any bytes into a text column, and one bad name must not cost the other photos.
+    # SQLite accepts any bytes in a text column: one invalid name must not fail the import.
     connection.text_factory = lambda data: data.decode("utf-8", "replace")
     connection.row_factory = sqlite3.Row
-    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-    if found != "ok":
-        raise _database_error(database, f"it is damaged: {found}")
+    check_result = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if check_result != "ok":
+        raise _database_error(database, f"the database is corrupt: {check_result}")
     return [
         _parse_row(dict(row)) for row in connection.execute("SELECT * FROM images ORDER BY rowid")
     ]
@@ -94,14 +96,14 @@ def _parse_row(row: dict[str, Any]) -> AnylocRow:
 
 
 def _clean_text(value: object) -> str:
-    """SQLite's columns take values of any type; a NUL can't be stored again."""
+    """A value of any SQLite type as stripped text, without NULs, which the server rejects."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     return "" if value is None else str(value).replace("\0", "").strip()
 
 
 def _to_utc(text: str) -> str:
-    """As it stands where it is no time: better odd than lost."""
+    """Convert to ISO 8601 in UTC; text that is not a time is kept unchanged."""
     try:
         time = datetime.fromisoformat(text)
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
@@ -110,7 +112,7 @@ def _to_utc(text: str) -> str:
 
 
 def _parse_tags(text: str) -> list[str]:
-    """A JSON list, or words separated by commas; the upload form separates tags by commas."""
+    """Parse a JSON list or comma-separated tags; commas within a tag become spaces."""
     tags: list[Any] = text.split(",")
     if text[:1] in ("[", '"') or text == "null":
         with contextlib.suppress(ValueError, RecursionError):
@@ -121,7 +123,7 @@ def _parse_tags(text: str) -> list[str]:
 
 
 def _parse_metadata(text: str) -> dict[str, Any]:
-    """The JSON object; what is none is kept as it stands, as `anyloc_metadata`."""
+    """Parse a JSON object; any other text is kept under the key `anyloc_metadata`."""
     if not text:
         return {}
     with contextlib.suppress(ValueError, RecursionError):
@@ -132,14 +134,14 @@ def _parse_metadata(text: str) -> dict[str, Any]:
 
 
 def _reject_constant(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON, though Python writes it")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def _database_error(database: Path, reason: str) -> PlacewiseError:
     return InvalidRequest(
         "bad_anyloc_database",
-        f"Can't read {database} as the predecessor's database: {reason}. If the predecessor still "
-        "runs, stop it first. Photos without a database: placewise index DIR.",
+        f"Can't read {database} as an AnyLoc database: {reason}. If the AnyLoc service is still "
+        "running, stop it first. To import photos without a database: placewise index DIR.",
     )
 
 
@@ -149,13 +151,15 @@ VOCABULARY_FILE = "c_centers.pt"
 
 @dataclass(slots=True)
 class AnylocPhoto:
+    """A photo file with the metadata of its row, if any."""
+
     path: Path
     name: str
     tags: list[str] = field(default_factory=list)
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def to_local_photo(self) -> LocalPhoto:
-        """As the upload form says it."""
+        """Convert to the form fields of `POST /upload`."""
         fields = {"tags": ",".join(self.tags), "metadata": json.dumps(self.metadata)}
         return LocalPhoto(
             self.path, {k: v for k, v in fields.items() if v not in ("", "{}")}, self.name
@@ -164,87 +168,97 @@ class AnylocPhoto:
 
 @dataclass(slots=True)
 class AnylocFolder:
-    """What there is to import, and what is not imported."""
+    """The photos to import, and the rows and files that are not imported."""
 
     database: Path
     rows: int
     photos: list[LocalPhoto]
     unlisted: int
-    """How many of the photos no row names."""
+    """Number of photos without a row."""
     missing: list[Json]
-    """Rows without a file."""
+    """Rows whose file was not found: path, filename, reason."""
     duplicates: list[Json]
-    """Photos whose bytes are those of another one, which is imported."""
+    """Photos with the same bytes as an imported one: path, filename, reason."""
     vocabularies: list[Path]
+    """Vocabulary files found, which are not imported."""
 
 
 def read_anyloc_folder(folder: Path, database: Path | None, uploads: Path | None) -> AnylocFolder:
-    """Look through the folder; `database` and `uploads` say where those lie if not below it.
+    """Read the database and match its rows with the photo files.
 
-    Raises InvalidRequest: `no_anyloc_database`, `several_anyloc_databases`, `no_anyloc_uploads`,
-    `bad_anyloc_database`.
+    Args:
+        folder: Folder of the AnyLoc service, or a parent of it.
+        database: Path of `similarity.db`; by default searched below `folder`.
+        uploads: Folder of the photos; by default searched below `folder`.
+
+    Raises:
+        InvalidRequest: `no_anyloc_database`, `several_anyloc_databases`, `no_anyloc_uploads`,
+            `bad_anyloc_database`.
     """
-    below = list(_list_files(folder))
-    database = database or _find_database(folder, below)
-    files = _uploaded_files(folder, below, uploads)
+    all_files = list(_list_files(folder))
+    database = database or _find_database(folder, all_files)
+    files = _uploaded_files(folder, all_files, uploads)
     rows = read_anyloc_rows(database)
     listed, missing = _match_rows_to_files(rows, files)
-    named = {photo.path for photo in listed}
+    listed_paths = {photo.path for photo in listed}
     unlisted = [
         AnylocPhoto(path, printable_path(Path(path.name)))
-        for path in sorted(set().union(*files.values()) - named)
+        for path in sorted(set().union(*files.values()) - listed_paths)
         if path.suffix.lower() in PHOTO_SUFFIXES
     ]
-    kept, duplicates = _drop_duplicates(listed + unlisted)
+    unique, duplicates = _drop_duplicates(listed + unlisted)
     return AnylocFolder(
         database=database,
         rows=len(rows),
-        photos=[photo.to_local_photo() for photo in kept],
+        photos=[photo.to_local_photo() for photo in unique],
         unlisted=len(unlisted),
         missing=missing,
         duplicates=duplicates,
-        vocabularies=sorted(path for path in below if path.name == VOCABULARY_FILE),
+        vocabularies=sorted(path for path in all_files if path.name == VOCABULARY_FILE),
     )
 
 
 def _list_files(folder: Path) -> Iterator[Path]:
-    """Every file below the folder, but for hidden ones (`.git`, `.venv`, `.gitkeep`)."""
+    """Every file below the folder, except hidden ones (`.git`, `.venv`, `.gitkeep`)."""
     for directory, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         yield from (Path(directory, name) for name in names if not name.startswith("."))
 
 
-def _find_database(folder: Path, below: list[Path]) -> Path:
-    found = sorted(path for path in below if path.name == DATABASE_NAME)
+def _find_database(folder: Path, all_files: list[Path]) -> Path:
+    found = sorted(path for path in all_files if path.name == DATABASE_NAME)
     if not found:
         raise InvalidRequest(
             "no_anyloc_database",
-            f"There is no {DATABASE_NAME} below {folder}. Name it: --database FILE; or, for photos "
-            "without a database: placewise index DIR.",
+            f"No {DATABASE_NAME} found below {folder}. Specify it with --database FILE, or use "
+            "placewise index DIR to import photos without a database.",
         )
     if len(found) > 1:
         raise InvalidRequest(
             "several_anyloc_databases",
-            f"There are several databases: {', '.join(map(str, found))}. Say which one is meant: "
+            f"Several databases found: {', '.join(map(str, found))}. Specify one with "
             "--database FILE.",
         )
     return found[0]
 
 
-def _uploaded_files(folder: Path, below: list[Path], uploads: Path | None) -> dict[str, set[Path]]:
-    """The files below the folders called `uploads`, by name."""
+def _uploaded_files(
+    folder: Path, all_files: list[Path], uploads: Path | None
+) -> dict[str, set[Path]]:
+    """The files in folders named `uploads`, by file name."""
     if uploads is not None:
         paths = list(_list_files(uploads))
     elif folder.resolve().name == UPLOADS_FOLDER:
-        paths = below
+        paths = all_files
     else:
-        paths = [path for path in below if UPLOADS_FOLDER in path.relative_to(folder).parts[:-1]]
+        paths = [
+            path for path in all_files if UPLOADS_FOLDER in path.relative_to(folder).parts[:-1]
+        ]
     if not paths:
         raise InvalidRequest(
             "no_anyloc_uploads",
-            f"No photo lies in a folder called {UPLOADS_FOLDER} below {folder}. If they lie "
-            "elsewhere: "
-            "--uploads FOLDER.",
+            f"No photos found in a folder named {UPLOADS_FOLDER} below {folder}. Specify their "
+            "folder with --uploads FOLDER.",
         )
     files: dict[str, set[Path]] = defaultdict(set)
     for path in paths:
@@ -258,56 +272,56 @@ def _match_rows_to_files(
     listed: list[AnylocPhoto] = []
     missing: list[Json] = []
     for row in rows:
-        path = PureWindowsPath(row.image_path)  # takes both kinds of slashes
-        # Of several with this name, one whose folders are called most like the row's.
-        there = sorted(
+        path = PureWindowsPath(row.image_path)  # accepts / and \ as separators
+        # Of several files with this name, take the one that shares most parent folders.
+        candidates = sorted(
             files.get(path.name, ()), key=lambda file: (-_common_suffix_length(file, path), file)
         )
-        if there:
-            listed.append(AnylocPhoto(there[0], row.name or path.name, row.tags, row.metadata))
+        if candidates:
+            listed.append(AnylocPhoto(candidates[0], row.name or path.name, row.tags, row.metadata))
         else:
             missing.append(
                 {
                     "path": row.image_path,
                     "filename": row.name,
-                    "reason": "the file is not there; its row says only what it was called",
+                    "reason": "the database has a row for this file, but the file was not found",
                 }
             )
     return listed, missing
 
 
 def _common_suffix_length(file: Path, path: PureWindowsPath) -> int:
-    """How many parts the two paths have in common, from the end."""
+    """Number of path parts that are equal, counted from the end."""
     pairs = zip(reversed(file.parts), reversed(path.parts), strict=False)
     return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
 
 
 def _drop_duplicates(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list[Json]]:
-    """A map keeps the same bytes once: the first one stays and remembers the others."""
+    """Keep one photo per content; it takes over the tags and metadata of its duplicates."""
     first: dict[object, AnylocPhoto] = {}
     duplicates: list[Json] = []
     for key, photo in zip(_content_keys(photos), photos, strict=True):
-        kept = first.setdefault(key, photo)
-        if kept is photo:
+        original = first.setdefault(key, photo)
+        if original is photo:
             continue
-        kept.tags = list(dict.fromkeys(kept.tags + photo.tags))
-        other = {"filename": photo.name, **photo.metadata}
-        kept.metadata.setdefault("anyloc_same_photo", []).append(other)
+        original.tags = list(dict.fromkeys(original.tags + photo.tags))
+        duplicate = {"filename": photo.name, **photo.metadata}
+        original.metadata.setdefault("anyloc_same_photo", []).append(duplicate)
         duplicates.append(
             {
                 "path": printable_path(photo.path),
                 "filename": photo.name,
-                "reason": f"the same photo as {kept.name}",
+                "reason": f"the same photo as {original.name}",
             }
         )
     return list(first.values()), duplicates
 
 
 def _content_keys(photos: list[AnylocPhoto]) -> Iterator[object]:
-    """For each photo a value that it shares with those of the same bytes.
+    """A key per photo that is equal for photos with equal bytes.
 
-    Only files of the same size are read. One that can't be read shares its value with none: the
-    upload says why it is refused.
+    Only files of equal size are hashed. An unreadable file gets a key of its own; its upload fails
+    with the reason.
     """
     sizes: dict[int, set[Path]] = defaultdict(set)
     for photo in photos:

@@ -1,6 +1,6 @@
-"""Where the photos of a folder were taken: from a CSV, or from `@UTM@` file names.
+"""Local photos with their metadata: from a CSV table, a JSONL manifest or `@UTM@` file names.
 
-EXIF is read by the server, and fills what is not said here.
+The server reads EXIF itself and uses it for every field that is not given here.
 """
 
 from __future__ import annotations
@@ -21,58 +21,75 @@ from shared.ingest.photo_metadata import (
 
 @dataclass(frozen=True, slots=True)
 class LocalPhoto:
+    """A photo file with the metadata that is uploaded with it."""
+
     path: Path
     fields: dict[str, str]
-    """What is said of it, in the upload form's names."""
+    """Form fields of `POST /upload`."""
     name: str | None = None
-    """What it is called, where that is not its file's name."""
+    """Name to store; None for the file's own name."""
 
 
 def find_photos(
     folder: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
 ) -> list[LocalPhoto]:
-    """Every photo below the folder, in the order of the paths, with what is said of it.
+    """Find the photos below a folder, sorted by path, with their metadata.
 
-    With `places_by_folder`, the name of the folder that a photo lies in is its place, unless the
-    table says another; photos directly in `folder` have none.
+    Args:
+        folder: Searched recursively.
+        table: CSV file with metadata; it takes precedence over names of files and folders.
+        utm_zone: Zone for `@UTM@` file names that don't contain it, such as `32T`.
+        places_by_folder: Use the name of a photo's parent folder as its place label. Photos
+            directly in `folder` get none.
 
-    Raises InvalidRequest for a table that names a photo that is not there, and for coordinates
-    that can't be read.
+    Raises:
+        InvalidRequest: The table refers to a photo that does not exist, or contains coordinates
+            that can't be parsed; `no_photos` if the folder contains none.
     """
     paths = list_photos(folder)
-    said = _read_csv_fields(folder, table, set(paths)) if table else {}
-    found = []
+    table_fields = _read_csv_fields(folder, table, set(paths)) if table else {}
+    photos = []
     for path in paths:
         fields = upload_fields_of_file_name(path.name, utm_zone)
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
-        found.append(LocalPhoto(path, {**fields, **said.get(path, {})}))
-    return found
+        photos.append(LocalPhoto(path, {**fields, **table_fields.get(path, {})}))
+    return photos
 
 
 def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
-    """The photos that the lines of a JSONL manifest name, relative to where it lies.
+    """Read the photos listed in a JSONL manifest.
 
-    Raises InvalidRequest (`bad_manifest`), also for a photo that is not there.
+    Args:
+        manifest: Path of the manifest; file names in it are relative to its folder.
+        data: Content of the manifest.
+
+    Raises:
+        InvalidRequest: `bad_manifest` for invalid lines and for photos that don't exist;
+            `no_photos` for an empty manifest.
     """
-    found = []
+    photos = []
     missing = []
     for line in read_jsonl_manifest(data, str(manifest)):
         path = manifest.parent / line.name
         if not path.is_file():
-            missing.append((line.line, f"there is no photo {path}"))
-        found.append(
+            missing.append((line.line, f"photo {path} does not exist"))
+        photos.append(
             LocalPhoto(path, {**upload_fields_of_file_name(path.name, None), **line.fields})
         )
     if missing:
         raise bad_lines_error("bad_manifest", str(manifest), missing[:MAX_REPORTED_LINES])
-    if not found:
-        raise InvalidRequest("no_photos", f"{manifest} has no line.")
-    return found
+    if not photos:
+        raise InvalidRequest("no_photos", f"The manifest {manifest} is empty.")
+    return photos
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Every photo below the folder, in order; InvalidRequest (`no_photos`) where there is none."""
+    """List the photos below a folder, sorted; hidden files are left out.
+
+    Raises:
+        InvalidRequest: `no_photos` if there is none.
+    """
     paths = sorted(
         path
         for path in folder.rglob("*")
@@ -83,7 +100,7 @@ def list_photos(folder: Path) -> list[Path]:
     if not paths:
         raise InvalidRequest(
             "no_photos",
-            f"There is no photo ({', '.join(sorted(PHOTO_SUFFIXES))}) below {folder}.",
+            f"No photos ({', '.join(sorted(PHOTO_SUFFIXES))}) found below {folder}.",
         )
     return paths
 
@@ -93,12 +110,12 @@ def _read_csv_fields(folder: Path, table: Path, paths: set[Path]) -> dict[Path, 
         data = table.read_bytes()
     except OSError as error:
         raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error
-    said = {}
+    fields = {}
     for row in read_csv_manifest(data, str(table)):
         path = folder / row.name
         if path not in paths:
             raise bad_lines_error(
-                "bad_table", str(table), [(row.line, f"there is no photo {path}")]
+                "bad_table", str(table), [(row.line, f"photo {path} does not exist")]
             )
-        said[path] = row.fields
-    return said
+        fields[path] = row.fields
+    return fields

@@ -1,4 +1,4 @@
-"""`placewise import-anyloc DIR`: the predecessor's photos, with all that it knew of them."""
+"""`placewise import-anyloc DIR`: import photos from an AnyLoc similarity service."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from services.cli.output import (
 from shared.client import Json
 
 DESCRIPTORS_NOTE = (
-    "Descriptors are made anew: those under features/ belong to another vocabulary and another "
-    "preprocessing, and can't be compared with this map's."
+    "Descriptors are computed again: those in features/ use another vocabulary and another "
+    "preprocessing and can't be compared with this map's."
 )
 
 
@@ -38,19 +38,19 @@ def import_anyloc(
             metavar="DIR",
             exists=True,
             file_okay=False,
-            help="The folder of an AnyLoc similarity service, or one above it.",
+            help="Folder of an AnyLoc similarity service, or a parent of it.",
         ),
     ],
     database: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="Its similarity.db; left out: the one below DIR."
+            exists=True, dir_okay=False, help="Path of similarity.db. Default: the one below DIR."
         ),
     ] = None,
     uploads: Annotated[
         Path | None,
         typer.Option(
-            exists=True, file_okay=False, help="Its photos; left out: uploads/ below DIR."
+            exists=True, file_okay=False, help="Folder of the photos. Default: uploads/ below DIR."
         ),
     ] = None,
     update: UpdateOption = False,
@@ -62,13 +62,13 @@ def import_anyloc(
 ) -> None:
     """Upload the photos of an AnyLoc similarity service with their names, tags and metadata.
 
-    Its folder is only read. Run it again after an interruption: nothing is stored twice.
+    DIR is only read. The command is idempotent: run it again after an interruption.
     """
     with report_errors(as_json):
-        found = read_anyloc_folder(folder, database, uploads)
+        source = read_anyloc_folder(folder, database, uploads)
         with connect(server, map_name, key) as client, progress_bar() as progress:
             report = _build_report(
-                found, upload_photos(client, found.photos, fit, progress, update=update)
+                source, upload_photos(client, source.photos, fit, progress, update=update)
             )
         if as_json:
             print_json(report)
@@ -78,34 +78,34 @@ def import_anyloc(
             raise typer.Exit(1)
 
 
-def _build_report(found: AnylocFolder, uploaded: Json) -> Json:
+def _build_report(source: AnylocFolder, uploaded: Json) -> Json:
     return {
-        "database": str(found.database),
-        "rows": found.rows,
+        "database": str(source.database),
+        "rows": source.rows,
         "photos": uploaded["photos"],
-        "unlisted": found.unlisted,
+        "unlisted": source.unlisted,
         "imported": uploaded["uploaded"],
         "already_there": uploaded["already_there"],
-        "missing": found.missing,
-        "duplicates": found.duplicates,
+        "missing": source.missing,
+        "duplicates": source.duplicates,
         "refused": uploaded["refused"],
         "failed": uploaded["failed"],
         "searchable": uploaded["searchable"],
         "vocabulary": uploaded["vocabulary"],
         "fitted": uploaded["fitted"],
-        "notes": [DESCRIPTORS_NOTE, *_vocabulary_note(found)],
+        "notes": [DESCRIPTORS_NOTE, *_vocabulary_note(source)],
     }
 
 
-def _vocabulary_note(found: AnylocFolder) -> list[str]:
-    if not found.vocabularies:
+def _vocabulary_note(source: AnylocFolder) -> list[str]:
+    if not source.vocabularies:
         return []
-    where = ", ".join(map(str, found.vocabularies))
+    files = ", ".join(map(str, source.vocabularies))
     return [
         (
-            f"Its vocabulary is not taken ({where}): the predecessor may have filled it with "
-            "random numbers or spoilt it at a start. One that you trust: "
-            "placewise vocabulary import FILE."
+            f"The vocabulary was not imported ({files}): the AnyLoc service may have initialised "
+            "it with random numbers or corrupted it at startup. To import a vocabulary that you "
+            "trust: placewise vocabulary import FILE."
         )
     ]
 
@@ -114,15 +114,15 @@ def _print_report(report: Json) -> None:
     for note in report["notes"]:
         err_console.print(escape(note), soft_wrap=True)
     err_console.print(
-        f"{report['rows']} rows: {report['imported']} photos imported, {report['already_there']} "
-        f"were there already, {len(report['duplicates'])} the same as another, "
+        f"{report['rows']} database rows: {report['imported']} photos imported, "
+        f"{report['already_there']} already stored, {len(report['duplicates'])} duplicates, "
         f"{len(report['missing'])} missing, {len(report['refused'])} refused. "
-        f"{report['unlisted']} of the photos were in no row.",
+        f"{report['unlisted']} photos had no database row.",
         soft_wrap=True,
     )
     err_console.print(
-        f"{report['searchable']} photos are searchable in the map "
+        f"The map now has {report['searchable']} searchable photos "
         f"(vocabulary: {report['vocabulary']})."
     )
     print_failures(report, "missing", "duplicates", "refused", "failed")
-    err_console.print(f"Ask: {sys.argv[0]} query PHOTO")
+    err_console.print(f"Next: {sys.argv[0]} query PHOTO")

@@ -1,4 +1,4 @@
-"""`placewise index`: many photos into the map, from a folder, an archive, a list or a bucket."""
+"""`placewise index`: upload photos from a folder, an archive, a manifest or a bucket prefix."""
 
 from __future__ import annotations
 
@@ -49,46 +49,46 @@ def index(
         str,
         typer.Argument(
             metavar="DIR|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
-            help="A folder, which is searched recursively; a zip, tar or gzipped tar; a list of "
-            "photos, one JSON object a line; or a prefix of the server's own bucket.",
+            help="A folder (searched recursively); a zip, tar or gzipped tar archive; a JSONL "
+            "manifest with one photo per line; or a prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
         Path | None,
         typer.Option(
             "--csv",
-            help="Columns: filename (below DIR), and any of latitude, longitude, heading, "
-            "captured_at, place, tags.",
+            help="CSV table with the column filename (relative to DIR) and any of latitude, "
+            "longitude, heading, captured_at, place, tags.",
         ),
     ] = None,
     utm_zone: Annotated[
         str | None,
-        typer.Option(help="Zone of @UTM@ names that don't say it, such as 32T."),
+        typer.Option(help="UTM zone of @UTM@ file names that don't contain it, such as 32T."),
     ] = None,
     places: Annotated[
         bool,
         typer.Option(
             "--places-by-folder",
-            help="The name of a photo's folder is its place label: for rooms, shelves, trails.",
+            help="Use the name of a photo's folder as its place label (rooms, shelves, trails).",
         ),
     ] = False,
     role: Annotated[
         PhotoRole,
-        typer.Option(help="`query`: labelled queries, which `placewise evaluate` asks with."),
+        typer.Option(help="`query` uploads labelled queries for `placewise evaluate`."),
     ] = PhotoRole.DATABASE,
     update: UpdateOption = False,
     journal: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write down what the server has taken; a run that finds the file sends only the "
-            "rest. For DIR and lists of files.",
+            help="Record uploaded photos in FILE; a later run with the same FILE skips them. Only "
+            "for DIR and manifests of local files.",
         ),
     ] = None,
     failures: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.jsonl", help="Write the refused and failed photos with their reasons."
+            metavar="FILE.jsonl", help="Write refused and failed photos with their reasons."
         ),
     ] = None,
     fit: FitOption = True,
@@ -97,40 +97,41 @@ def index(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload every photo of a folder, an archive, a list or a bucket's prefix and wait until all
-    are searchable.
+    """Upload photos and wait until they are searchable.
 
-    Coordinates come from the CSV or the list, from @UTM@ file names, or from EXIF. Run it again
-    after an interruption: what is there already is not described twice. An archive brings its own
-    table: photos.csv or manifest.jsonl.
+    Coordinates are read from the CSV table or manifest, from @UTM@ file names, or from EXIF. An
+    archive may contain its own table: photos.csv or manifest.jsonl. The command is idempotent: run
+    it again after an interruption.
     """
-    only_folder = {
+    folder_options = {
         "--csv": table,
         "--utm-zone": utm_zone,
         "--places-by-folder": places,
         "--role": role != PhotoRole.DATABASE,
     }
-    of_server = {**only_folder, "--update": update, "--journal": journal}
+    local_file_options = {**folder_options, "--update": update, "--journal": journal}
     with report_errors(as_json):
         if failures is not None:
             check_output_path(failures, ".jsonl", "a list of failures")
         path = Path(source)
         if source.startswith("s3://"):
-            _reject_options("a bucket's prefix", of_server)
+            _reject_options("a bucket prefix", local_file_options)
             with connect(server, map_name, key) as client, progress_bar() as progress:
                 report = import_prefix(client, source, fit, progress)
         elif path.is_dir():
             photos = find_photos(path, table, utm_zone, places_by_folder=places)
             if role != PhotoRole.DATABASE:
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-            # Labelled queries teach no vocabulary: they must not start a fit either.
-            learns = fit and role == PhotoRole.DATABASE
-            report = _upload_photos(photos, learns, update, journal, server, map_name, key)
+            # Vocabularies are fitted on database photos only.
+            fit_after_upload = fit and role == PhotoRole.DATABASE
+            report = _upload_photos(
+                photos, fit_after_upload, update, journal, server, map_name, key
+            )
         elif path.suffix == ".jsonl":
-            _reject_options("a list", only_folder)
+            _reject_options("a manifest", folder_options)
             data = _read_manifest(path)
             if manifest_has_keys(data):
-                _reject_options("a list of keys", of_server)
+                _reject_options("a manifest of object keys", local_file_options)
                 with connect(server, map_name, key) as client, progress_bar() as progress:
                     report = import_keys(client, data, fit, progress)
             else:
@@ -138,7 +139,7 @@ def index(
                 report = _upload_photos(photos, fit, update, journal, server, map_name, key)
         else:
             check_archive(path)
-            _reject_options("an archive", of_server)
+            _reject_options("an archive", local_file_options)
             with connect(server, map_name, key) as client, progress_bar() as progress:
                 report = upload_archive(client, path, fit, progress)
         if failures is not None:
@@ -158,12 +159,12 @@ def _upload_photos(
     with (
         connect(server, map_name, key) as client,
         progress_bar() as progress,
-        contextlib.ExitStack() as opened,
+        contextlib.ExitStack() as stack,
     ):
-        # A server that a command starts for itself has another port each time.
+        # An embedded server has another port each time: PLACEWISE_HOME identifies it instead.
         url = server or str(read_settings().placewise_home.resolve())
-        written = opened.enter_context(UploadJournal(journal, url, map_name)) if journal else None
-        return upload_photos(client, photos, fit, progress, update=update, journal=written)
+        opened = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
+        return upload_photos(client, photos, fit, progress, update=update, journal=opened)
 
 
 def _read_manifest(manifest: Path) -> bytes:
@@ -175,18 +176,18 @@ def _read_manifest(manifest: Path) -> bytes:
         ) from error
 
 
-def _reject_options(what: str, given: Mapping[str, object]) -> None:
-    """InvalidRequest (`not_for_archives`): what the server reads itself takes no options."""
-    if wrong := [name for name, value in given.items() if value]:
+def _reject_options(source: str, options: Mapping[str, object]) -> None:
+    """Raise InvalidRequest (`not_for_archives`) if an option does not apply to this source."""
+    if invalid := [name for name, value in options.items() if value]:
         raise InvalidRequest(
             "not_for_archives",
-            f"{', '.join(wrong)}: not for {what}. Put what is to be said into its table or its "
-            "lines; or index a folder.",
+            f"{', '.join(invalid)}: not supported for {source}. Put the metadata into its table or "
+            "manifest, or index a folder.",
         )
 
 
 def _write_failures(out: Path, report: Json) -> None:
-    """One JSON object a line: `outcome`, `path`, `reason`; an empty file where there is none."""
+    """Write a JSON object per photo: `outcome`, `path`, `reason`; an empty file if none failed."""
     with atomic_write(out) as file:
         for outcome in ("refused", "failed"):
             for item in report[outcome]:
@@ -204,12 +205,12 @@ def _finish_command(report: Json, map_name: str | None, role: PhotoRole, as_json
 
 def _print_report(report: Json, map_name: str | None, role: PhotoRole) -> None:
     err_console.print(
-        f"{report['photos']} photos looked at, {report['already_there']} were there already, "
-        f"{report['searchable']} searchable in the map (vocabulary: {report['vocabulary']}).",
+        f"{report['photos']} photos processed, {report['already_there']} already stored. "
+        f"The map now has {report['searchable']} searchable photos "
+        f"(vocabulary: {report['vocabulary']}).",
         soft_wrap=True,
     )
     print_failures(report, "refused", "failed")
-    named = f" --map {map_name}" if map_name else ""
-    what = "Ask" if role == PhotoRole.DATABASE else "Evaluate"
-    does = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    err_console.print(f"{what}: {sys.argv[0]} {does}{named}", soft_wrap=True)
+    map_option = f" --map {map_name}" if map_name else ""
+    command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
+    err_console.print(f"Next: {sys.argv[0]} {command}{map_option}", soft_wrap=True)

@@ -1,9 +1,8 @@
-"""Many photos into a map: uploaded in parallel, then waited for until all are searchable.
+"""Bulk uploads into a map: parallel uploads of local photos, archives and server-side imports.
 
-A batch into a map, brought in by the server and waited for: an archive that is sent as it is, or
-objects of the server's own store.
-
-What an interrupted `placewise index` has done already: `--journal FILE`.
+Each function waits until the photos are described and fits a vocabulary if the map has none of its
+own. `UploadJournal` (`placewise index --journal FILE`) records acknowledged uploads, so that an
+interrupted run can be resumed.
 """
 
 from __future__ import annotations
@@ -46,35 +45,39 @@ JOURNAL_FORMAT = 1
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """A photo that the server has taken."""
+    """A photo whose upload the server has acknowledged."""
 
     file_id: str
     job_id: str | None
 
 
 class UploadJournal:
-    """One line for each photo that was taken, written when the server has said so.
+    """A JSONL file with one line per photo, appended when the server acknowledges the upload.
 
-    A photo counts as done if its file has the size and the time of last change that it had then,
-    and the same is said of it. A last line that a kill has cut off is passed over. It belongs to
-    one server and one map: InvalidRequest (`bad_journal`) for another one's, or what is no journal.
+    A photo counts as uploaded while its file's size and modification time and its metadata are
+    unchanged. An incomplete last line, left by a killed process, is ignored. A journal belongs to
+    one server and one map.
+
+    Raises:
+        InvalidRequest: `bad_journal` if the file is not a journal of this server and map.
+        Misconfigured: `out_unwritable` if the file can't be read or written.
     """
 
     def __init__(self, path: Path, url: str, map_name: str | None) -> None:
         self._path = path
         self._done: dict[str, dict[str, Any]] = {}
-        about = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
+        header = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
         try:
             text = path.read_text() if path.exists() else ""
-            self._read(text, about)
+            self._read(text, header)
             self._file = path.open("a")
             if not text:
-                self._write(about)
+                self._write(header)
             elif not text.endswith("\n"):
-                self._file.write("\n")  # after a line that was cut off
+                self._file.write("\n")  # ends an incomplete last line
         except (OSError, UnicodeDecodeError) as error:
             raise Misconfigured(
-                "out_unwritable", f"The journal {printable_path(path)} can't be used: {error}."
+                "out_unwritable", f"Can't use the journal {printable_path(path)}: {error}."
             ) from error
 
     def __enter__(self) -> Self:
@@ -89,19 +92,20 @@ class UploadJournal:
         self._file.close()
 
     def done(self, photo: LocalPhoto) -> JournalEntry | None:
-        """What the server has answered, if the photo was taken as it is now."""
+        """The recorded upload of the photo, or None if it is new or has changed."""
         line = self._done.get(printable_path(photo.path))
         if line is None or line["state"] != _file_state(photo):
-            return None  # a file that is gone says so when it is sent
+            return None  # a missing file is reported by the upload itself
         return JournalEntry(line["file_id"], line["job_id"])
 
-    def add(self, photo: LocalPhoto, acknowledged: JournalEntry) -> None:
+    def add(self, photo: LocalPhoto, entry: JournalEntry) -> None:
+        """Record an acknowledged upload."""
         self._write(
             {
                 "path": printable_path(photo.path),
                 "state": _file_state(photo),
-                "file_id": acknowledged.file_id,
-                "job_id": acknowledged.job_id,
+                "file_id": entry.file_id,
+                "job_id": entry.job_id,
             }
         )
 
@@ -109,57 +113,54 @@ class UploadJournal:
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
-    def _read(self, text: str, about: dict[str, Any]) -> None:
+    def _read(self, text: str, header: dict[str, Any]) -> None:
         lines = []
         for line in text.splitlines():
             try:
                 lines.append(json.loads(line))
             except ValueError:
-                continue  # cut off by a kill
+                continue  # incomplete: the process was killed while writing it
         if not text:
             return
-        if not lines or lines[0] != about:
+        if not lines or lines[0] != header:
             raise InvalidRequest(
                 "bad_journal",
-                f"{printable_path(self._path)} is no journal of this server and map. Name "
+                f"{printable_path(self._path)} is not a journal of this server and map. Use "
                 "another file.",
             )
         self._done = {line["path"]: line for line in lines[1:]}
 
 
 def _file_state(photo: LocalPhoto) -> list[Any]:
-    """What makes the photo another one, as JSON."""
+    """The file attributes and metadata whose change requires a new upload, as JSON."""
     try:
-        about = photo.path.stat()
+        stat = photo.path.stat()
     except OSError:
         return []
-    return [about.st_size, about.st_mtime_ns, photo.name, dict(sorted(photo.fields.items()))]
+    return [stat.st_size, stat.st_mtime_ns, photo.name, dict(sorted(photo.fields.items()))]
 
 
 MIN_PHOTOS_TO_FIT = 50
 UPLOAD_CONCURRENCY = 4
-RETRY_PERIOD_SECONDS = (
-    60.0  # for which a server that is away is waited for; a busy one as long as it says
-)
-POLL_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
+# How long calls are retried while the server is unavailable. A busy server (429) is retried for as
+# long as its Retry-After says.
+RETRY_PERIOD_SECONDS = 60.0
+POLL_SECONDS = 1.0  # short: a long poll does not return when a job starts to wait for a vocabulary
 
 FitOption = Annotated[
     bool,
     typer.Option(
         "--fit/--no-fit",
-        help=f"Fit a vocabulary at the end, from {MIN_PHOTOS_TO_FIT} photos up, if the map "
-        "has none "
-        "of its own.",
+        help="Fit a vocabulary afterwards if the map has none of its own and at least "
+        f"{MIN_PHOTOS_TO_FIT} photos.",
     ),
 ]
 UpdateOption = Annotated[
     bool,
-    typer.Option(
-        "--update", help="Change what is said otherwise now of photos that are there already."
-    ),
+    typer.Option("--update", help="Update the metadata of photos that are already stored."),
 ]
 PendingJobs = list[tuple[LocalPhoto, str]]
-"""Photos with the ids of the jobs that describe them."""
+"""Photos with the IDs of the jobs that describe them."""
 
 
 def upload_photos(
@@ -171,15 +172,24 @@ def upload_photos(
     update: bool = False,
     journal: UploadJournal | None = None,
 ) -> Json:
-    """Upload, describe, and fit a vocabulary where the map needs one. Running it again uploads
-    the same bytes again and describes nothing twice; what the journal has is not even sent. With
-    `update`, what is now said otherwise of a photo that is there already is changed, else such a
-    photo is refused.
+    """Upload photos, wait until they are described, and fit a vocabulary if the map needs one.
 
-    Returns counts (`photos`, `uploaded`, `already_there`, `searchable` in the whole map), what is
-    `refused` and `failed` with the reasons, and the map's `vocabulary`.
+    The operation is idempotent: a photo that is already stored is not described again.
+
+    Args:
+        client: Client of the map.
+        photos: Photos to upload.
+        fit: Fit a vocabulary if the map has none of its own and enough photos.
+        progress: Shows uploads and jobs.
+        update: Change the metadata of stored photos that differ; otherwise such photos are refused.
+        journal: Skips the uploads recorded in it and records new ones.
+
+    Returns:
+        Counts (`photos`, `uploaded`, `already_there`, and `searchable` in the whole map), the
+        `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`, and the
+        vocabulary that was `fitted`, if any.
     """
-    client.stats()  # a wrong address, key or map is said once and now, not after each photo
+    client.stats()  # fails early, and once, for a wrong URL, key or map
     counts: Counter[str] = Counter()
     refused: list[Json] = []
     failed: list[Json] = []
@@ -187,20 +197,22 @@ def upload_photos(
     uploading = progress.add_task("uploading", total=len(photos))
 
     def show_wait(error: PlacewiseError, seconds: float) -> None:
-        progress.update(uploading, description=f"uploading (waits {seconds:.0f} s: {error.code})")
-        if error.code not in waited_for:
-            waited_for.add(error.code)
-            err_console.print(f"Waiting, then going on: {escape(error.detail)}", soft_wrap=True)
+        progress.update(
+            uploading, description=f"uploading (retry in {seconds:.0f} s: {error.code})"
+        )
+        if error.code not in reported_codes:
+            reported_codes.add(error.code)
+            err_console.print(f"Retrying: {escape(error.detail)}", soft_wrap=True)
 
-    waited_for: set[str] = set()
-    patient = client.patient(RETRY_PERIOD_SECONDS, show_wait)
-    left = photos
+    reported_codes: set[str] = set()
+    retrying_client = client.patient(RETRY_PERIOD_SECONDS, show_wait)
+    remaining = photos
     if journal is not None:
-        left, taken = _split_by_journal(photos, journal)
-        pending += taken
-        counts["already_there"] += len(photos) - len(left)
-        progress.update(uploading, completed=len(photos) - len(left))
-    for photo, outcome in _upload_concurrently(patient, left, update):
+        remaining, recorded_jobs = _split_by_journal(photos, journal)
+        pending += recorded_jobs
+        counts["already_there"] += len(photos) - len(remaining)
+        progress.update(uploading, completed=len(photos) - len(remaining))
+    for photo, outcome in _upload_concurrently(retrying_client, remaining, update):
         progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
             refused.append(_photo_failure(photo, outcome.detail))
@@ -232,23 +244,31 @@ def upload_photos(
 def _split_by_journal(
     photos: list[LocalPhoto], journal: UploadJournal
 ) -> tuple[list[LocalPhoto], PendingJobs]:
-    """The photos that the journal does not have, and the jobs of those that it has."""
-    left: list[LocalPhoto] = []
-    taken: PendingJobs = []
+    """The photos that the journal does not contain, and the jobs of those that it contains."""
+    remaining: list[LocalPhoto] = []
+    recorded_jobs: PendingJobs = []
     for photo in photos:
         done = journal.done(photo)
         if done is None:
-            left.append(photo)
+            remaining.append(photo)
         elif done.job_id is not None:
-            taken.append((photo, done.job_id))
-    return left, taken
+            recorded_jobs.append((photo, done.job_id))
+    return remaining, recorded_jobs
 
 
 def fit_vocabulary_if_needed(
     client: Client, stats: Json, progress: Progress
 ) -> tuple[Json, Json | None]:
-    """Fit a vocabulary where the map has none of its own and photos enough; the map's figures after
-    that, and the vocabulary if one was fitted."""
+    """Fit a vocabulary if the map has none of its own and enough photos.
+
+    Args:
+        client: Client of the map.
+        stats: The map's current statistics.
+        progress: Shows the job.
+
+    Returns:
+        The map's statistics afterwards, and the job of the fit or None.
+    """
     if stats["vocabulary"] not in ("foreign", None) or stats["total_images"] < MIN_PHOTOS_TO_FIT:
         return stats, None
     vocabulary = fit_and_wait(client, {}, progress)
@@ -280,7 +300,7 @@ def _upload_concurrently(
 
 
 def _patch_fields(fields: dict[str, str]) -> Json:
-    """The upload form's text fields as a PATCH takes them."""
+    """Convert the text fields of an upload form to the JSON fields of a PATCH."""
     typed: Json = dict(fields)
     for name in ("latitude", "longitude", "heading"):
         if name in typed:
@@ -295,14 +315,14 @@ def _patch_fields(fields: dict[str, str]) -> Json:
 def _wait_for_jobs(
     client: Client, pending: PendingJobs, failed: list[Json], progress: Progress, bar: TaskID
 ) -> PendingJobs:
-    """Wait for the jobs; returns those that wait for a vocabulary and can't end before it."""
+    """Wait until jobs end; returns those that can't end before the map has a vocabulary."""
     waiting: PendingJobs = []
     for photo, job_id in pending:
         wait_seconds = 0.0
         while True:
             try:
                 job = client.job(job_id, wait_seconds)
-            except NotFound:  # a journal's photo, deleted since: that was meant
+            except NotFound:  # recorded in the journal and deleted since
                 progress.advance(bar)
                 break
             wait_seconds = POLL_SECONDS
@@ -319,33 +339,41 @@ def _wait_for_jobs(
 
 
 def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
-    named = {"filename": photo.name} if photo.name else {}
-    return {"path": printable_path(photo.path), **named, "reason": reason}
+    filename = {"filename": photo.name} if photo.name else {}
+    return {"path": printable_path(photo.path), **filename, "reason": reason}
 
 
-WAITING_LOOK_SECONDS = 2.0
+BLOCKED_POLL_SECONDS = 2.0
 
 
 def check_archive(path: Path) -> None:
-    """InvalidRequest (`not_an_archive`) for a file that the server would refuse."""
+    """Check the signature of an archive before it is uploaded.
+
+    Raises:
+        InvalidRequest: `not_an_archive`, `unreadable_file`.
+    """
     try:
         with path.open("rb") as file:
-            begin = file.read(ARCHIVE_SIGNATURE_BYTES)
+            signature = file.read(ARCHIVE_SIGNATURE_BYTES)
     except OSError as error:
         raise InvalidRequest("unreadable_file", f"Can't read {path}: {error.strerror}") from error
-    if detect_archive_format(begin) is None:
+    if detect_archive_format(signature) is None:
         raise InvalidRequest(
             "not_an_archive",
-            f"{path} is no folder, and by its content not {ACCEPTED_ARCHIVES}.",
+            f"{path} is neither a folder nor {ACCEPTED_ARCHIVES}.",
         )
 
 
 def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress) -> Json:
-    """Upload, describe, and fit a vocabulary where the map needs one.
+    """Upload an archive as a batch, wait until it ends, and fit a vocabulary if needed.
 
-    Returns what `upload_photos` does. Raises the reason of a batch that has failed as a whole.
+    Returns:
+        The same report as `upload_photos`, with `ignored`: the number of other archive members.
+
+    Raises:
+        Unprocessable: The batch as a whole failed or was cancelled.
     """
-    client.stats()  # a wrong address, key or map is said before gigabytes are sent
+    client.stats()  # fails before gigabytes are sent if the URL, key or map is wrong
     sending = progress.add_task("uploading (bytes)", total=archive.stat().st_size)
     started = client.upload_archive(
         archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
@@ -354,21 +382,21 @@ def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress)
 
 
 def import_prefix(client: Client, prefix: str, fit: bool, progress: Progress) -> Json:
-    """As `upload_archive`, with every photo of the server's store below the prefix."""
+    """Import every photo of the server's store below a prefix; see `upload_archive`."""
     return _wait_and_report(client, client.import_prefix(prefix), fit, progress)
 
 
 def manifest_has_keys(manifest: bytes) -> bool:
-    """Does the first line of a JSONL manifest name an object by its key, not a file?"""
+    """Whether the first line of a JSONL manifest refers to an object key instead of a file."""
     first = next((line for line in manifest.splitlines() if line.strip()), b"")
     try:
         return KEY_FIELD in json.loads(first)
     except (ValueError, TypeError, RecursionError):
-        return False  # whoever reads it whole says what is wrong
+        return False  # the parser of the whole manifest reports the error
 
 
 def import_keys(client: Client, manifest: bytes, fit: bool, progress: Progress) -> Json:
-    """As `upload_archive`, with the objects that the lines of the manifest name by `key`."""
+    """Import the objects listed by `key` in a JSONL manifest; see `upload_archive`."""
     return _wait_and_report(client, client.import_manifest(manifest), fit, progress)
 
 
@@ -385,16 +413,18 @@ def _wait_and_report(client: Client, started: Json, fit: bool, progress: Progres
         raise Unprocessable(
             error.get("code", "job_ended"), error.get("detail", f"The batch was {job['state']}.")
         )
-    bad = list(client.batch_items(started["job_id"], "failed", "cancelled"))
+    failed_items = list(client.batch_items(started["job_id"], "failed", "cancelled"))
     counts: Json = job["result"] or {}
-    there = counts.get("already_there", 0)
+    already_stored = counts.get("already_there", 0)
     return {
         "photos": job["progress"]["total"],
-        "uploaded": job["progress"]["total"] - there - sum(not item["file_id"] for item in bad),
-        "already_there": there,
+        "uploaded": job["progress"]["total"]
+        - already_stored
+        - sum(not item["file_id"] for item in failed_items),
+        "already_there": already_stored,
         "searchable": client.stats()["searchable_images"],
-        "refused": [_item_failure(item) for item in bad if not item["file_id"]],
-        "failed": [_item_failure(item) for item in bad if item["file_id"]],
+        "refused": [_item_failure(item) for item in failed_items if not item["file_id"]],
+        "failed": [_item_failure(item) for item in failed_items if item["file_id"]],
         "vocabulary": stats["vocabulary"],
         "fitted": fitted,
         "ignored": counts.get("ignored", 0),
@@ -402,23 +432,26 @@ def _wait_and_report(client: Client, started: Json, fit: bool, progress: Progres
 
 
 def _wait_until_finished(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
-    """The job once it has ended, or waits for a vocabulary."""
-    wait_seconds, told = 0.0, False
+    """Poll a job until it ends or waits for a vocabulary."""
+    wait_seconds, reported = 0.0, False
     while True:
         job = client.job(job_id, wait_seconds)
         wait_seconds = POLL_SECONDS
-        done: Json = job["progress"]
-        progress.update(bar, completed=done["done"] + done["failed"], total=done["total"] or None)
+        counts: Json = job["progress"]
+        progress.update(
+            bar, completed=counts["done"] + counts["failed"], total=counts["total"] or None
+        )
         if job["state"] in FINISHED or job["waiting_for"] == "vocabulary":
             return job
         if job["waiting_for"]:
-            if not told:
-                what = job["waiting_for"].replace("_", " ")
+            if not reported:
+                reason = job["waiting_for"].replace("_", " ")
                 err_console.print(
-                    f"The batch waits for {what} on the server, and goes on by itself."
+                    f"The batch is waiting for {reason} on the server; it continues automatically."
                 )
-            told = True
-            time.sleep(WAITING_LOOK_SECONDS)  # a server answers at once for a job that waits
+            reported = True
+            # Long polls return at once for a job that waits for something.
+            time.sleep(BLOCKED_POLL_SECONDS)
 
 
 def _item_failure(item: Json) -> Json:

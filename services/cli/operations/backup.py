@@ -1,8 +1,8 @@
-"""`placewise backup` and `placewise restore`: a whole Placewise into a folder, and back.
+"""`placewise backup`, `restore` and `rebuild-catalog`.
 
-The catalog and the store of the settings, for commands that look at what is there.
-
-`placewise rebuild-catalog`: a lost catalog from its object store.
+A backup is a folder with the catalog's rows and the objects that they refer to. `rebuild-catalog`
+recovers a lost catalog from the object store alone. `open_storage` gives other maintenance commands
+access to the catalog and the store.
 """
 
 from __future__ import annotations
@@ -49,16 +49,22 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
-    """Both, while the service runs or not.
+    """Open the catalog and the object store, whether or not services are running.
 
-    Raises Misconfigured: `nothing_stored` for a folder without a catalog, those of `check_schema`
-    and of `open_installation_store`; Unavailable while one of them is away.
+    Args:
+        settings: Settings that locate both.
+        command: Name of the command, shown as the database connection's application name.
+
+    Raises:
+        Misconfigured: `nothing_stored` if PLACEWISE_HOME contains no catalog, and the errors of
+            `check_schema` and `open_installation_store`.
+        Unavailable: The database or the object store can't be reached.
     """
     if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
         raise Misconfigured(
             "nothing_stored",
-            f"There is no catalog in {settings.placewise_home}: give the PLACEWISE_HOME that is "
-            "served, or DATABASE_URL.",
+            f"No catalog found in {settings.placewise_home}. Set PLACEWISE_HOME to the folder of "
+            "the installation, or set DATABASE_URL.",
         )
     catalog = open_catalog(settings, command, NO_TIMEOUTS)
     try:
@@ -78,34 +84,42 @@ MAX_KEYS_SHOWN = 10
 
 
 def backup(
-    out: Annotated[Path, typer.Argument(help="Folder of the backup; only changes are copied.")],
+    out: Annotated[
+        Path, typer.Argument(help="Folder of the backup. Later runs copy only changes.")
+    ],
     as_json: JsonOption = False,
 ) -> None:
-    """Copy catalog and objects into a folder, while the service runs. Exit code 1 when something
-    that the catalog names is missing or damaged; all the rest is there then."""
+    """Back up the catalog and the object store to a folder while services run.
+
+    The exit code is 1 if an object that the catalog refers to is missing or damaged. The backup
+    then contains everything else.
+    """
     with report_errors(as_json), progress_reporter() as progress:
         settings = read_settings()
         with open_storage(settings, "backup") as (catalog, store):
             with catalog.write() as session:
                 installation_id = get_or_create_installation(session).id
-            about = create_backup(
+            manifest = create_backup(
                 catalog, store, installation_id, out, settings.import_prefix, progress
             )
     if as_json:
-        print_json(asdict(about))
+        print_json(asdict(manifest))
     else:
         console.print(
-            f"{sum(about.rows.values())} rows and {about.objects} objects "
-            f"({about.object_bytes / 1e6:.1f} MB) are in {escape(str(out))}, as of {about.made_at}",
+            f"Backed up {sum(manifest.rows.values())} rows and {manifest.objects} objects "
+            f"({manifest.object_bytes / 1e6:.1f} MB) to {escape(str(out))} as of "
+            f"{manifest.made_at}",
             soft_wrap=True,
         )
-        for what, keys in (("missing", about.missing), ("damaged", about.damaged)):
+        for state, keys in (("missing", manifest.missing), ("damaged", manifest.damaged)):
             for key in keys[:MAX_KEYS_SHOWN]:
-                err_console.print(f"[red]{what}[/red] {escape(key)}", soft_wrap=True)
+                err_console.print(f"[red]{state}[/red] {escape(key)}", soft_wrap=True)
             if len(keys) > MAX_KEYS_SHOWN:
-                err_console.print(f"{len(keys)} are {what}: backup.json names them all")
-    if about.missing or about.damaged:
-        err_console.print("`placewise verify` says more of what is wrong, and what to do.")
+                err_console.print(
+                    f"{len(keys)} objects are {state}. backup.json lists all of them."
+                )
+    if manifest.missing or manifest.damaged:
+        err_console.print("Run `placewise verify` for details and remedies.")
         raise typer.Exit(1)
 
 
@@ -113,24 +127,26 @@ def restore(
     source: Annotated[Path, typer.Argument(metavar="FROM", help="Folder of a backup.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Make the empty Placewise of the settings what the backup holds; stop its services first. What
-    was interrupted goes on where it was."""
-    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as held:
+    """Restore a backup into an empty installation. Stop its services first.
+
+    An interrupted restore resumes when the command is run again.
+    """
+    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as stack:
         settings = read_settings()
-        folder, about = open_backup(source)
+        folder, manifest = open_backup(source)
         if settings.database_url is None:
-            held.enter_context(lock_home(settings.placewise_home))
-        if os.access(source, os.W_OK):  # else nobody can be writing there
-            held.enter_context(folder.exclusive_lock())
+            stack.enter_context(lock_home(settings.placewise_home))
+        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
+            stack.enter_context(folder.exclusive_lock())
         catalog = open_catalog(settings, "restore")
-        held.callback(catalog.close)
+        stack.callback(catalog.close)
         migrate(catalog)
-        alone = settings.database_url is None
+        exclusive = settings.database_url is None
         restored = restore_backup(
             folder,
-            about,
+            manifest,
             catalog,
-            lambda: open_installation_store(catalog, settings, exclusive=alone),
+            lambda: open_installation_store(catalog, settings, exclusive=exclusive),
             settings.import_prefix,
             progress,
             store_owner=read_owner(open_store(settings, exclusive=False)),
@@ -139,15 +155,15 @@ def restore(
         print_json(asdict(restored))
         return
     console.print(
-        f"{restored.rows} rows and {restored.objects} objects of {about.made_at} are back"
-        + (f"; {restored.cancelled_jobs} jobs were cancelled" if restored.cancelled_jobs else ""),
+        f"Restored {restored.rows} rows and {restored.objects} objects as of {manifest.made_at}"
+        + (f"; cancelled {restored.cancelled_jobs} jobs" if restored.cancelled_jobs else ""),
         soft_wrap=True,
     )
 
 
 @contextlib.contextmanager
 def progress_reporter() -> Iterator[BackupProgress]:
-    """A bar for each thing that is being done, one after the other."""
+    """Show a progress bar per stage."""
     with progress_bar() as bars:
         yield _make_reporter(bars.add_task, bars.update)
 
@@ -155,39 +171,41 @@ def progress_reporter() -> Iterator[BackupProgress]:
 def _make_reporter(
     add_task: Callable[..., object], update: Callable[..., object]
 ) -> BackupProgress:
-    known: dict[str, object] = {}
+    tasks: dict[str, object] = {}
 
-    def tell(what: str, done: int, total: int) -> None:
-        if what not in known:
-            known[what] = add_task(what, total=total)
-        update(known[what], completed=done, total=total)
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = add_task(stage, total=total)
+        update(tasks[stage], completed=done, total=total)
 
-    return tell
+    return report
 
 
-SHOWN = 10
-NEVER_IN_THE_JOURNAL = (
-    "API keys, webhooks, jobs, the search history and evaluations' reports are not in the object "
-    "store: make keys and webhooks anew."
+NOT_RECOVERED_NOTE = (
+    "API keys, webhooks, jobs, the search history and evaluation reports are not stored in the "
+    "object store. Create keys and webhooks again."
 )
 
 
 def rebuild_catalog(as_json: JsonOption = False) -> None:
-    """Rebuild a lost catalog from the object store: photos with all that was said of them, maps,
-    generations, vocabularies. Stop the services first. Interrupted, it goes on when run again."""
-    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as held:
-        # Imported only here: it reads photos, which not every image can.
+    """Rebuild a lost catalog from the object store. Stop all services first.
+
+    Recovers photos with their metadata, maps, generations and vocabularies. An interrupted rebuild
+    resumes when the command is run again.
+    """
+    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as stack:
+        # Imported here: it decodes photos, whose libraries not every image contains.
         from shared.rebuild.recover import begin_rebuild, recover_catalog
 
         settings = read_settings()
-        alone = settings.database_url is None
-        if alone:
-            held.enter_context(lock_home(settings.placewise_home))
+        exclusive = settings.database_url is None
+        if exclusive:
+            stack.enter_context(lock_home(settings.placewise_home))
         catalog = open_catalog(settings, "rebuild-catalog", NO_TIMEOUTS)
-        held.callback(catalog.close)
+        stack.callback(catalog.close)
         migrate(catalog)
-        begin_rebuild(catalog, open_store(settings, exclusive=alone))
-        store = open_installation_store(catalog, settings, exclusive=alone)
+        begin_rebuild(catalog, open_store(settings, exclusive=exclusive))
+        store = open_installation_store(catalog, settings, exclusive=exclusive)
         taken = recover_catalog(
             catalog, store, settings, unnamed_age_seconds=0.0, progress=progress
         )
@@ -195,54 +213,55 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
         print_json(asdict(taken))
         return
     print_taken_in(taken)
-    err_console.print(NEVER_IN_THE_JOURNAL, soft_wrap=True)
+    err_console.print(NOT_RECOVERED_NOTE, soft_wrap=True)
 
 
 def print_taken_in(taken: RecoveryReport) -> None:
-    """What came back, and what did not."""
+    """Print what was recovered into the catalog and what was not."""
     console.print(
-        f"{taken.photos + taken.unnamed_photos} photos of {taken.maps} new maps came in, with "
+        f"Recovered {taken.photos + taken.unnamed_photos} photos in {taken.maps} new maps, with "
         f"{taken.descriptors} descriptors in {taken.chunks} chunks, {taken.generations} "
-        f"generations and {taken.vocabularies} vocabularies; {taken.queued_photos} photos are "
-        "queued to be described",
+        f"generations and {taken.vocabularies} vocabularies. {taken.queued_photos} photos are "
+        "queued for description.",
         soft_wrap=True,
     )
     if taken.changed_photos or taken.deleted_photos:
         console.print(
-            f"{taken.changed_photos} photos were changed and {taken.deleted_photos} deleted, as "
-            "the journal says"
+            f"The journal's changes were applied: {taken.changed_photos} photos updated, "
+            f"{taken.deleted_photos} deleted."
         )
     for old, new in taken.renamed_maps.items():
         err_console.print(
-            f"Another map has the name {escape(old)}: the one of the journal is {new}."
+            f"Another map is named {escape(old)}. The journal's map was renamed to {new}."
         )
     if taken.unnamed_photos:
         err_console.print(
-            f"The journal does not name {taken.unnamed_photos} photos: they are in the map "
-            "default, with coordinates, heading and time as EXIF has them. Lost are their file "
-            "names, place labels, tags, metadata, roles and maps, and what was said instead of "
-            "EXIF.",
+            f"{taken.unnamed_photos} photos are not in the journal. They were added to the map "
+            "default with coordinates, heading and time from EXIF. Their file names, place labels, "
+            "tags, metadata, roles and maps, and values that overrode EXIF, are lost.",
             soft_wrap=True,
         )
     if taken.unnamed_descriptors:
         err_console.print(
-            f"{taken.unnamed_descriptors} descriptors belong to generations that the journal does "
-            "not name: they can't be assigned to photos.",
+            f"{taken.unnamed_descriptors} descriptors belong to generations that are not in the "
+            "journal and can't be assigned to photos.",
             soft_wrap=True,
         )
     if taken.lost_originals:
         err_console.print(
-            f"{taken.lost_originals} photos of the journal have no original in the store and stay "
-            "out: they were deleted a moment before the catalog was lost, or their files are gone.",
+            f"{taken.lost_originals} photos of the journal have no original in the store and were "
+            "not recovered: they were deleted just before the catalog was lost, or their files are "
+            "missing.",
             soft_wrap=True,
         )
     if taken.doubled_photos:
-        err_console.print(f"{taken.doubled_photos} photos are there already, under another id.")
-    for what, keys in (
-        ("journal segments can't be read; restore them from a backup", taken.damaged_segments),
-        ("chunks are damaged; their photos are described again", taken.damaged_chunks),
-        ("originals can't be read as photos and stay out", taken.unreadable_originals),
+        err_console.print(f"{taken.doubled_photos} photos are already stored under another ID.")
+    for problem, keys in (
+        ("journal segments can't be read. Restore them from a backup", taken.damaged_segments),
+        ("chunks are damaged. Their photos will be described again", taken.damaged_chunks),
+        ("originals can't be decoded and were not recovered", taken.unreadable_originals),
     ):
         if keys:
-            named = ", ".join(keys[:SHOWN]) + (" ..." if len(keys) > SHOWN else "")
-            err_console.print(f"{len(keys)} {what}: {escape(named)}", soft_wrap=True)
+            listed = ", ".join(keys[:MAX_KEYS_SHOWN])
+            listed += " ..." if len(keys) > MAX_KEYS_SHOWN else ""
+            err_console.print(f"{len(keys)} {problem}: {escape(listed)}", soft_wrap=True)

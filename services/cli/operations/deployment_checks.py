@@ -1,6 +1,8 @@
-"""The doctor's look at separate services: who lives, and what each says of itself.
+"""Checks of `placewise doctor` for a deployment of separate services.
 
-The doctor's look at the servers that separate services stand on: PostgreSQL, Redis, S3.
+The first part checks the services themselves (search workers, gateways, extractors, stewards), the
+second part the servers that they depend on: PostgreSQL, Redis and S3. Each check returns a summary
+and raises a PlacewiseError whose `detail` says what to do.
 """
 
 from __future__ import annotations
@@ -25,84 +27,105 @@ from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.ids import new_id
 from shared.search_api.workers import WorkerUnavailable, fetch_status
 
-OVERDUE_LEASE_SECONDS = (
-    30.0  # for which an expired lease may lie there: the steward looks every second
-)
+# How long a lease may be expired before it counts as overdue. The steward checks every second.
+OVERDUE_LEASE_SECONDS = 30.0
 SEARCH_TIMEOUT_SECONDS = 5.0
 MAX_LAG_SECONDS = 30.0
 MAX_NAMED_CHUNKS = 10
 
 
 def check_search(settings: Settings) -> str:
-    """Each worker of SEARCH_URLS, and whether every shard is answered for."""
+    """Check every worker of SEARCH_URLS and that each shard has a worker.
+
+    Raises:
+        Misconfigured: `search_missing` if SEARCH_URLS is not set.
+        Unavailable: `search_ill` for missing shards and for workers that lag behind, can't read
+            chunks, lost a device or use another number of shards.
+    """
     if not settings.search_worker_urls:
         raise Misconfigured(
             "search_missing",
-            "SEARCH_URLS is not set: name every search worker, for example "
+            "SEARCH_URLS is not set. List the URL of every search worker, for example "
             "http://search-0:8000,http://search-1:8000.",
         )
     shards: dict[str, int] = {}
-    away, ill, rows = [], [], 0
+    unreachable, problems, rows = [], [], 0
     with httpx2.Client() as http:
         for url in settings.search_worker_urls:
             try:
                 status = fetch_status(http, url, SEARCH_TIMEOUT_SECONDS)
             except (WorkerUnavailable, PlacewiseError) as error:
-                away.append(str(error))
+                unreachable.append(str(error))
                 continue
             shards[status.shard] = shards.get(status.shard, 0) + 1
             rows += status.rows
-            late = max((lag.seconds for lag in status.lags.values() if lag.answers), default=0.0)
-            if late > MAX_LAG_SECONDS:
-                ill.append(f"{url} is {late:.0f} s behind")
+            lag_seconds = max(
+                (lag.seconds for lag in status.lags.values() if lag.answers), default=0.0
+            )
+            if lag_seconds > MAX_LAG_SECONDS:
+                problems.append(f"{url} lags {lag_seconds:.0f} s behind the catalog")
             if status.missing:
-                named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
-                ill.append(
-                    f"{url} can't read {len(status.missing)} chunks, and answers without them: "
-                    f"{named} (placewise verify --repair)"
+                chunks = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
+                problems.append(
+                    f"{url} can't read {len(status.missing)} chunks and searches without them: "
+                    f"{chunks} (run placewise verify --repair)"
                 )
-            ill += [f"{url}: {d.name} failed" for d in status.devices if d.failure is not None]
+            problems += [
+                f"{url}: device {d.name} failed" for d in status.devices if d.failure is not None
+            ]
     counts = {int(shard.split("/")[1]) for shard in shards}
-    unanswered = [
+    missing_shards = [
         f"{number}/{count}"
         for count in counts
         for number in range(count)
         if f"{number}/{count}" not in shards
     ]
-    if not shards or unanswered or ill or len(counts) > 1:
-        wrong = [*ill, *(f"nobody answers for shard {shard}" for shard in unanswered)]
-        wrong += ["SEARCH_SHARD divides differently: " + ", ".join(shards)] * (len(counts) > 1)
-        wrong += [f"away: {one}" for one in away]
-        raise Unavailable("search_ill", "; ".join(wrong) + ". Look at those workers' logs.")
-    answered = f"{len(shards)} shards, {sum(shards.values())} workers, {rows} rows"
-    return answered + (f"; away: {'; '.join(away)} (their shards have others)" if away else "")
+    if not shards or missing_shards or problems or len(counts) > 1:
+        problems += [f"no worker serves shard {shard}" for shard in missing_shards]
+        if len(counts) > 1:
+            problems.append("SEARCH_SHARD has different shard counts: " + ", ".join(shards))
+        problems += [f"unreachable: {error}" for error in unreachable]
+        raise Unavailable("search_ill", "; ".join(problems) + ". Check the logs of these workers.")
+    summary = f"{len(shards)} shards, {sum(shards.values())} workers, {rows} rows"
+    if unreachable:
+        summary += f"; unreachable: {'; '.join(unreachable)} (other workers serve their shards)"
+    return summary
 
 
 def check_processes(settings: Settings, role: str) -> str:
-    """Who of this role gave a sign of life in the last seconds."""
+    """Check that at least one process of a role has a recent heartbeat.
+
+    Raises:
+        Unavailable: `nobody_there`.
+    """
     catalog = open_catalog(settings, "doctor")
     try:
         with catalog.read() as session:
-            known = [one for one in list_processes(session) if one.role == role]
+            processes = [p for p in list_processes(session) if p.role == role]
     except SQLAlchemyError as error:
         raise _catalog_error(error) from error
     finally:
         catalog.close()
-    live = [one for one in known if one.seconds_since_heartbeat < PROCESS_TIMEOUT_SECONDS]
+    live = [p for p in processes if p.seconds_since_heartbeat < PROCESS_TIMEOUT_SECONDS]
     if live:
         return _names_by_release(live)
-    last = min((one.seconds_since_heartbeat for one in known), default=None)
-    seen = "" if last is None else f" The last sign of one is {last:.0f} s old."
+    last = min((p.seconds_since_heartbeat for p in processes), default=None)
+    hint = "" if last is None else f" The last heartbeat was {last:.0f} s ago."
     if role == "extractor":
-        seen += " (Scaled to none by KEDA, that is as it should be while no job waits.)"
+        hint += " (This is expected if KEDA scaled extractors to zero because no job is queued.)"
     raise Unavailable(
-        "nobody_there", f"No {role} lives.{seen} Start one: placewise {role}; its log says more."
+        "nobody_there",
+        f"No {role} is running.{hint} Start one with placewise {role}, or check its log.",
     )
 
 
 def check_steward(settings: Settings) -> str:
-    """Whether one lives, and does what only a steward does."""
-    said = check_processes(settings, "steward")
+    """Check that a steward runs and that expired leases are released.
+
+    Raises:
+        Unavailable: `nobody_there`, `leases_overdue`.
+    """
+    summary = check_processes(settings, "steward")
     catalog = open_catalog(settings, "doctor")
     try:
         overdue = _count_overdue_leases(catalog)
@@ -113,38 +136,43 @@ def check_steward(settings: Settings) -> str:
     if overdue:
         raise Unavailable(
             "leases_overdue",
-            f"{said}; and {overdue} jobs of dead workers were not given back for "
-            f"{OVERDUE_LEASE_SECONDS:.0f} s. Look at the steward's log.",
+            f"{summary}; but {overdue} jobs have leases that expired more than "
+            f"{OVERDUE_LEASE_SECONDS:.0f} s ago. Check the steward's log.",
         )
-    return f"{said}; no lease is overdue"
+    return f"{summary}; no overdue leases"
 
 
 def check_gateway(server: str, key: str | None) -> str:
-    """What the gateway says of the parts that it needs."""
+    """Check the health that a gateway reports.
+
+    Raises:
+        Unavailable: `server_unreachable`, or `gateway_ill` if one of its dependencies is unhealthy.
+        Misconfigured: The answer is an error (with its code) or not a health report.
+    """
     try:
-        answer = httpx2.get(
+        response = httpx2.get(
             f"{server.rstrip('/')}/api/v1/health",
             headers={"Authorization": f"Bearer {key}"} if key else {},
             timeout=10,
         )
-        said = answer.json()
+        body = response.json()
     except (httpx2.HTTPError, ValueError) as error:
         raise Unavailable(
             "server_unreachable",
-            f"{server} does not answer ({type(error).__name__}). Is it the gateway's address?",
+            f"{server} does not answer ({type(error).__name__}). Check the gateway's URL.",
         ) from error
-    if "parts" not in said:
-        raise Misconfigured(said.get("code", "bad_answer"), said.get("detail", answer.text[:200]))
-    ill = {name: part for name, part in said["parts"].items() if part["status"] != "healthy"}
-    if ill:
-        wrong = "; ".join(
-            f"{name} is {part['status']}: {part['detail']}" for name, part in ill.items()
+    if "parts" not in body:
+        raise Misconfigured(body.get("code", "bad_answer"), body.get("detail", response.text[:200]))
+    unhealthy = {name: part for name, part in body["parts"].items() if part["status"] != "healthy"}
+    if unhealthy:
+        problems = "; ".join(
+            f"{name} is {part['status']}: {part['detail']}" for name, part in unhealthy.items()
         )
-        raise Unavailable("gateway_ill", f"{server} answers, and says: {wrong}")
-    load = said["load"]
+        raise Unavailable("gateway_ill", f"{server} reports: {problems}")
+    load = body["load"]
     return (
-        f"{server} is healthy ({said['version']}): {load['waiting_jobs']} jobs wait, "
-        f"{load['finished_per_second']:.1f} photos a second"
+        f"{server} is healthy ({body['version']}): {load['waiting_jobs']} jobs queued, "
+        f"{load['finished_per_second']:.1f} photos/s"
     )
 
 
@@ -165,8 +193,8 @@ def _count_overdue_leases(catalog: Catalog) -> int:
 
 def _names_by_release(processes: list[ProcessStatus]) -> str:
     by_release: dict[str, list[str]] = defaultdict(list)
-    for one in processes:
-        by_release[one.release].append(one.name)
+    for process in processes:
+        by_release[process.release].append(process.name)
     return "; ".join(
         f"{len(names)} of release {release}: {', '.join(names)}"
         for release, names in sorted(by_release.items())
@@ -176,19 +204,25 @@ def _names_by_release(processes: list[ProcessStatus]) -> str:
 def _catalog_error(error: SQLAlchemyError) -> PlacewiseError:
     return to_unavailable(error) or Misconfigured(
         "catalog_unreadable",
-        f"The catalog can't be asked ({type(error).__name__}): see postgresql.",
+        f"The catalog can't be queried ({type(error).__name__}). See the check postgresql.",
     )
 
 
 MIN_POSTGRES_VERSION = 140000  # server_version_num
 MIN_REDIS_VERSION = (6, 2)
-# Signatures of S3 are refused from 900 s on; ages of objects are compared with the catalog's clock.
+# S3 rejects signatures from a skew of 900 s; object ages are compared with the catalog's clock.
 MAX_CLOCK_SKEW_SECONDS = 60.0
 PROBE_BYTES = b"placewise doctor"
 
 
 def check_postgres(settings: Settings) -> str:
-    """Does it answer, is it new enough, are its tables those of this release, what time is it?"""
+    """Check the connection to PostgreSQL, its version, the schema revision and its clock.
+
+    Raises:
+        Misconfigured: `postgres_too_old`, `catalog_unreadable`, `clocks_differ`, and the errors of
+            `check_schema`.
+        Unavailable: The database can't be reached.
+    """
     catalog = open_catalog(settings, "doctor")
     try:
         with catalog.read() as session:
@@ -197,68 +231,83 @@ def check_postgres(settings: Settings) -> str:
         if number < MIN_POSTGRES_VERSION:
             raise Misconfigured(
                 "postgres_too_old",
-                f"PostgreSQL is {number // 10000}, and 14 or newer is needed: upgrade it.",
+                f"PostgreSQL {number // 10000} is too old. Upgrade to 14 or newer.",
             )
         check_schema(catalog)
     except SQLAlchemyError as error:
         raise to_unavailable(error) or Misconfigured(
             "catalog_unreadable",
-            f"PostgreSQL refuses ({type(error).__name__}): check DATABASE_URL, and what its user "
-            "may do.",
+            f"PostgreSQL rejected the query ({type(error).__name__}). Check DATABASE_URL and the "
+            "privileges of its user.",
         ) from error
     finally:
         catalog.close()
     skew = (datetime.now(UTC) - now).total_seconds()
     _check_clock_skew("PostgreSQL", skew)
     return (
-        f"PostgreSQL {number // 10000}.{number % 10000}, tables up to date, "
-        f"its clock {abs(skew):.1f} s from this machine's"
+        f"PostgreSQL {number // 10000}.{number % 10000}, schema up to date, "
+        f"clock skew {abs(skew):.1f} s"
     )
 
 
 def check_redis(settings: Settings) -> str:
-    """Does it answer, and does it keep what it is given?"""
+    """Check the connection to Redis, its version and that it does not evict keys.
+
+    Raises:
+        Misconfigured: `redis_missing`, `redis_too_old`, `redis_evicts`.
+        Unavailable: `redis_unavailable`.
+    """
     if settings.redis_url is None:
         raise Misconfigured(
-            "redis_missing", "REDIS_URL is not set: without it nobody is woken. Set it."
+            "redis_missing",
+            "REDIS_URL is not set. Workers receive wake-up messages through Redis: set REDIS_URL.",
         )
-    from redis import Redis  # not in every image
+    from redis import Redis  # not installed in every image
     from redis.exceptions import RedisError
 
     with Redis.from_url(
         settings.redis_url.get_secret_value(), socket_timeout=5, socket_connect_timeout=5
     ) as redis:
         try:
-            said = redis.info("server")
+            info = redis.info("server")
         except (RedisError, OSError) as error:
             raise Unavailable(
                 "redis_unavailable",
                 f"Redis (REDIS_URL) does not answer: {error}. Start it, or correct the address or "
-                "the password. Until then jobs are found by the workers' own looks.",
+                "the password. Meanwhile, workers find jobs by polling the database.",
             ) from error
         try:
-            found = redis.config_get("maxmemory-policy")
-        except RedisError:  # some providers let nobody look at it
-            found = {}
-    version = str(said["redis_version"])
+            config = redis.config_get("maxmemory-policy")
+        except RedisError:  # some providers disable CONFIG
+            config = {}
+    version = str(info["redis_version"])
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_REDIS_VERSION:
-        raise Misconfigured("redis_too_old", f"Redis is {version}, and 6.2 or newer is needed.")
-    policy = found.get("maxmemory-policy", "unknown")
+        raise Misconfigured(
+            "redis_too_old", f"Redis {version} is too old. Upgrade to 6.2 or newer."
+        )
+    policy = config.get("maxmemory-policy", "unknown")
     if policy not in ("noeviction", "unknown"):
         raise Misconfigured(
             "redis_evicts",
-            f"Redis throws keys away when it is full (maxmemory-policy {policy}). Set noeviction.",
+            f"Redis evicts keys when its memory is full (maxmemory-policy {policy}). "
+            "Set maxmemory-policy noeviction.",
         )
-    said_of = "evicts nothing" if policy == "noeviction" else "does not tell whether it evicts"
-    return f"Redis {version} answers, and {said_of}"
+    eviction = "no eviction" if policy == "noeviction" else "eviction policy unknown"
+    return f"Redis {version} answers, {eviction}"
 
 
 def check_object_store(settings: Settings) -> str:
-    """Write, look, read a range, delete; and the clock of whoever keeps the objects."""
-    from shared.storage.open_store import open_store  # the minio client takes its time
+    """Write, read, list and delete a probe object, and check the store's clock.
+
+    Raises:
+        Misconfigured: `object_store_forgets` if the store is not read-after-write consistent;
+            `object_store_unfit` if it ignores ranges or prefixes; `clocks_differ`.
+        Unavailable: The store can't be reached.
+    """
+    from shared.storage.open_store import open_store  # importing the minio client is slow
 
     store = open_store(settings, exclusive=False)
-    store.check()  # some servers make a bucket of the first object: a misspelt name would go unseen
+    store.check()  # some servers create missing buckets on write: a misspelt name must fail here
     key = f"work/doctor-{new_id()}/probe"
     started = time.perf_counter()
     try:
@@ -267,27 +316,29 @@ def check_object_store(settings: Settings) -> str:
         if info is None or info.size_bytes != len(PROBE_BYTES):
             raise Misconfigured(
                 "object_store_forgets",
-                "What was written a moment ago is not there: the store is not consistent. Use one "
-                "that gives read-after-write (every S3 server of docs/how-to does).",
+                "An object is missing right after it was written: the store is not "
+                "read-after-write consistent. Use one of the S3 servers of docs/how-to.",
             )
         if store.read_range(key, 5, 6) != PROBE_BYTES[5:11] or key not in {
-            found.key for found in store.list(key.rpartition("/")[0] + "/")
+            listed.key for listed in store.list(key.rpartition("/")[0] + "/")
         }:
             raise Misconfigured(
-                "object_store_unfit", "The store ignores ranges or lists nothing: use another one."
+                "object_store_unfit",
+                "The store ignores byte ranges or does not list by prefix. Use another one.",
             )
     finally:
         store.delete(key)
-    took = time.perf_counter() - started
+    seconds = time.perf_counter() - started
     skew = (datetime.now(UTC) - info.modified_at).total_seconds()
     _check_clock_skew("the object store", skew)
-    where = (
+    location = (
         f"S3_BUCKET {settings.s3_bucket} at {settings.s3_endpoint}"
         if settings.s3_endpoint
         else "the folder"
     )
     return (
-        f"{where}: written, read, listed and deleted in {took:.2f} s, clock {abs(skew):.1f} s off"
+        f"{location}: wrote, read, listed and deleted an object in {seconds:.2f} s, "
+        f"clock skew {abs(skew):.1f} s"
     )
 
 
@@ -295,7 +346,7 @@ def _check_clock_skew(server_name: str, seconds: float) -> None:
     if abs(seconds) > MAX_CLOCK_SKEW_SECONDS:
         raise Misconfigured(
             "clocks_differ",
-            f"The clocks of {server_name} and of this machine are {abs(seconds):.0f} s "
-            "apart. Set them "
-            "by NTP: signatures expire, and orphans are taken for older or younger than they are.",
+            f"The clocks of {server_name} and of this machine differ by {abs(seconds):.0f} s. "
+            "Synchronise them with NTP: otherwise signatures expire and ages of orphaned objects "
+            "are wrong.",
         )

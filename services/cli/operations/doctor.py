@@ -1,6 +1,9 @@
-"""`placewise doctor`: part by part, what works and what to do about what does not.
+"""`placewise doctor`: check an installation part by part.
 
-The doctor's look at what describes photos: the device, its memory, the extractor's weights.
+Each check is a function of the settings that returns a summary, or raises a PlacewiseError whose
+`detail` says what is wrong and what to do. This module contains the checks of the embedded
+installation and of the extractor (device, memory, weights); `deployment_checks` contains those of
+separate services, `store_checks` those of the object store.
 """
 
 from __future__ import annotations
@@ -46,31 +49,37 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.journal.outbox import catalog_lag
 
 BYTES_PER_PARAMETER = 4  # float32
-# Twice what was measured in the forward pass of ViT-g, the widest, at 224 x 224 pixels: the next
-# batch is being decoded meanwhile. Of larger photos, fewer go through in one pass.
+# Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
+# the next batch is decoded meanwhile. Larger photos go through in smaller batches.
 BYTES_PER_BATCH_PHOTO = 40_000_000
-PROCESS_OVERHEAD_BYTES = 1_000_000_000  # PyTorch, or CUDA's context, before any weights
+PROCESS_OVERHEAD_BYTES = 1_000_000_000  # PyTorch or the CUDA context, without weights
 
 
 def check_device(settings: Settings) -> str:
-    """Where photos are described, and in which precision."""
+    """Report the device and the precision that new generations use."""
     import torch
 
     from shared.descriptors.extractor import choose_device
     from shared.descriptors.inference import choose_precision
 
     device = choose_device(settings.device)
-    new = (
-        "new generations in "
+    precision_note = (
+        "precision of new generations: "
         f"{choose_precision(settings.precision, _default_recipe(settings), device)}"
     )
     if device.type == "cuda":
-        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}, {new}"
-    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()}), {new}"
+        name = torch.cuda.get_device_name(device)
+        return f"CUDA: {name}, PyTorch {torch.__version__}, {precision_note}"
+    has_cuda = torch.cuda.is_available()
+    return f"CPU, PyTorch {torch.__version__} (CUDA available: {has_cuda}), {precision_note}"
 
 
 def check_memory(settings: Settings) -> str:
-    """Whether the extractor of new maps fits into the memory of its device: an estimate."""
+    """Estimate whether the default extractor fits into the memory of its device.
+
+    Raises:
+        Misconfigured: `memory_short`.
+    """
     import torch
 
     from shared.descriptors.extractor import choose_device
@@ -79,42 +88,50 @@ def check_memory(settings: Settings) -> str:
 
     recipe = _default_recipe(settings)
     if recipe.parameters is None or recipe.preprocessing is None:
-        return f"{recipe.name} tells its size only when it is loaded"
+        return f"the size of {recipe.name} is unknown until it is loaded"
     device = choose_device(settings.device)
     if device.type == "cuda":
-        there, whose = torch.cuda.get_device_properties(device).total_memory, "the GPU"
+        available, owner = torch.cuda.get_device_properties(device).total_memory, "the GPU"
     else:
-        there, whose = memory_limit_bytes(), "this machine"
+        available, owner = memory_limit_bytes(), "this machine"
     weights = recipe.parameters * BYTES_PER_PARAMETER
-    # One photo always goes through whole, however large its preprocessing leaves it.
-    one = math.ceil(get_preprocessing(recipe.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
-    batch = max(settings.batch_photos, one) * BYTES_PER_BATCH_PHOTO
+    # A single photo is never split, however many pixels its preprocessing produces.
+    min_batch = math.ceil(
+        get_preprocessing(recipe.preprocessing).most_pixels / DEFAULT_PHOTO_PIXELS
+    )
+    batch = max(settings.batch_photos, min_batch) * BYTES_PER_BATCH_PHOTO
     needed = PROCESS_OVERHEAD_BYTES + weights + batch
     estimate = (
-        f"{recipe.name} takes about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, a batch of "
-        f"{settings.batch_photos} photos {batch / 1e9:.1f}), {whose} has {there / 1e9:.1f} GB"
+        f"{recipe.name} requires about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, "
+        f"a batch of {settings.batch_photos} photos {batch / 1e9:.1f}), "
+        f"{owner} has {available / 1e9:.1f} GB"
     )
-    if needed <= there:
+    if needed <= available:
         return estimate
-    ways = []
+    remedies = []
     if (
-        settings.batch_photos > one
-        and PROCESS_OVERHEAD_BYTES + weights + one * BYTES_PER_BATCH_PHOTO <= there
+        settings.batch_photos > min_batch
+        and PROCESS_OVERHEAD_BYTES + weights + min_batch * BYTES_PER_BATCH_PHOTO <= available
     ):
-        ways.append(f"a smaller BATCH_PHOTOS than {settings.batch_photos}")
+        remedies.append(f"BATCH_PHOTOS below {settings.batch_photos}")
     if recipe.depth is not None:
-        ways.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
-    if one > 1:
-        ways.append("EXTRACTOR with the preprocessing square224")
+        remedies.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
+    if min_batch > 1:
+        remedies.append("EXTRACTOR with the preprocessing square224")
     if device.type == "cuda":
-        ways.append("DEVICE=cpu")
-    raise Misconfigured("memory_short", f"{estimate}. Set {', or '.join(ways) or 'more memory'}.")
+        remedies.append("DEVICE=cpu")
+    raise Misconfigured(
+        "memory_short", f"{estimate}. Set {', or '.join(remedies) or 'more memory'}."
+    )
 
 
 def check_extractor(settings: Settings) -> str:
-    """Whether the extractor of new maps has its weights.
+    """Check that the weights of the default extractor are available.
 
-    DINOv2's, up to 4.5 GB, are looked at without being loaded; the others are loaded.
+    DINOv2 weights (up to 4.5 GB) are inspected without loading them; others are loaded.
+
+    Raises:
+        Misconfigured: The weights are missing or don't fit the extractor.
     """
     recipe = _default_recipe(settings)
     if recipe.depth is not None:
@@ -127,8 +144,10 @@ def check_extractor(settings: Settings) -> str:
 
     extractor = load_extractor(recipe, settings)
     shipped = extractor.shipped_vocabulary()
-    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
-        f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"
+    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
+        f"shipped vocabulary of {shipped[0].clusters} centres"
+        if shipped
+        else "no shipped vocabulary"
     )
 
 
@@ -142,8 +161,8 @@ def _check_dinov2(recipe: ExtractorConfig, weights: Path | None) -> str:
     path = find_local_weights(size, weights)
     check_dinov2_weights(size, recipe.layer, recipe.facet, open_weights(path, size))
     return (
-        f"{recipe.name}: the weights {path} ({path.stat().st_size / 1e9:.1f} GB) fit, no shipped "
-        f"vocabulary: photos wait until one is fitted on them or imported"
+        f"{recipe.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
+        "vocabulary: photos are described once one is fitted or imported"
     )
 
 
@@ -156,16 +175,18 @@ MIN_FREE_DISK_BYTES = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
+    """Outcome of one check."""
+
     part: str
     ok: bool
     detail: str
 
 
 def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
-    """Check this installation part by part; exit code 1 when something needs attention.
+    """Check this installation. The exit code is 1 if a part needs attention.
 
-    With DATABASE_URL: of separate services, who lives and what each part says of itself. Run it
-    with the settings of a service, where that one runs; --server names the gateway.
+    With DATABASE_URL, the services of a deployment are checked: run the command where a service
+    runs, with that service's settings. --server is the gateway's URL.
     """
     try:
         settings = read_settings()
@@ -175,14 +196,14 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _check_python)]
     checks.append(("settings", _check_settings))
     if settings.s3_endpoint is None or settings.database_url is None:
-        checks.append(("folder", _check_home))  # else a service may have none that it can write to
+        checks.append(("folder", _check_home))  # other services need no writable folder
         checks.append(("permissions", permissions_check))
     if settings.s3_endpoint is None:
         checks.append(("uploads", _check_upload_dir))
     else:
         checks.append(("objects", check_object_store))
     checks.append(("collection", collection_check))
-    checks.append(("journal", _journal))
+    checks.append(("journal", _check_journal))
     if settings.database_url is None:
         checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
@@ -197,20 +218,20 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     if server is not None:
         checks.append(("gateway", lambda _: check_gateway(server, key)))
     checks += [("device", check_device), ("memory", check_memory), ("extractor", check_extractor)]
-    findings = [_run_check(part, check, settings) for part, check in checks]
-    _print_results(findings, as_json)
-    if not all(finding.ok for finding in findings):
+    results = [_run_check(part, check, settings) for part, check in checks]
+    _print_results(results, as_json)
+    if not all(result.ok for result in results):
         raise typer.Exit(1)
 
 
 def _print_results(results: list[CheckResult], as_json: bool) -> None:
     if as_json:
-        print_json([asdict(finding) for finding in results])
+        print_json([asdict(result) for result in results])
         return
-    for finding in results:
-        mark = "[green]ok[/green]  " if finding.ok else "[red]look[/red]"
-        # What was found is no markup: a path may hold brackets.
-        console.print(f"{mark} {finding.part}: {escape(finding.detail)}", soft_wrap=True)
+    for result in results:
+        mark = "[green]ok[/green]  " if result.ok else "[red]look[/red]"
+        # Escaped: paths may contain brackets, which rich would read as markup.
+        console.print(f"{mark} {result.part}: {escape(result.detail)}", soft_wrap=True)
 
 
 def _run_check(part: str, check: Callable[[Settings], str], settings: Settings) -> CheckResult:
@@ -219,8 +240,8 @@ def _run_check(part: str, check: Callable[[Settings], str], settings: Settings) 
     except PlacewiseError as error:
         return CheckResult(part, False, error.detail)
     except ModuleNotFoundError as error:
-        # Each image has its service's packages only.
-        return CheckResult(part, True, f"not looked at: {error.name} is not installed here")
+        # An image contains only the packages of its service.
+        return CheckResult(part, True, f"skipped: {error.name} is not installed here")
     except OSError as error:
         return CheckResult(
             part, False, f"{error.filename or ''}: {error.strerror}. Check permissions."
@@ -232,50 +253,50 @@ def _check_python(_settings: Settings) -> str:
 
 
 def _check_settings(settings: Settings) -> str:
-    """They were read, or nothing else would be looked at."""
+    """Report the settings; they are valid, or no check would run."""
     if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
         raise Misconfigured(
             "otel_missing",
-            "OTEL_EXPORTER_OTLP_ENDPOINT is set, and the extra otel is not installed: uv pip "
-            "install '.[otel]', or unset it.",
+            "OTEL_EXPORTER_OTLP_ENDPOINT is set, but the extra otel is not installed. Install it "
+            "(uv pip install '.[otel]') or unset the variable.",
         )
-    return f"{len(settings.model_fields_set)} are set (placewise config prints all)"
+    return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
 
 
 def _is_installed(package: str) -> bool:
     try:
         return find_spec(package) is not None
-    except ModuleNotFoundError:  # not even what it is a part of
+    except ModuleNotFoundError:  # the parent package is missing
         return False
 
 
 def _check_home(settings: Settings) -> str:
     home = settings.placewise_home
-    there = next(folder for folder in (home, *home.parents) if folder.exists())
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise OSError(errno.EACCES, "this user may not write there", str(there))
-    free = shutil.disk_usage(there).free
+    existing = next(folder for folder in (home, *home.parents) if folder.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "no write permission for this user", str(existing))
+    free = shutil.disk_usage(existing).free
     if free < MIN_FREE_DISK_BYTES:
-        raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(there))
-    state = "is writable" if there == home else "is not there yet and can be made"
+        raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(existing))
+    state = "is writable" if existing == home else "does not exist yet and can be created"
     return f"{home} {state}, {free / 1e9:.0f} GB free"
 
 
 def _check_upload_dir(settings: Settings) -> str:
     folder = settings.upload_dir
     if folder is None:
-        return "originals lie under PLACEWISE_HOME"
-    there = next(parent for parent in (folder, *folder.parents) if parent.exists())
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise OSError(errno.EACCES, "UPLOAD_DIR: this user may not write there", str(there))
+        return "originals are stored in PLACEWISE_HOME"
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "UPLOAD_DIR: no write permission for this user", str(existing))
     return f"UPLOAD_DIR {folder} is writable"
 
 
-def _journal(settings: Settings) -> str:
-    """Does the catalog know all that the object store's journal tells of?"""
+def _check_journal(settings: Settings) -> str:
+    """Check that the catalog contains every change recorded in the object store's journal."""
     if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
         return "nothing is stored yet"
-    from shared.storage.open_store import open_store  # the minio client takes its time
+    from shared.storage.open_store import open_store  # importing the minio client is slow
 
     catalog = open_catalog(settings, "doctor")
     try:
@@ -291,28 +312,30 @@ def _journal(settings: Settings) -> str:
         catalog.close()
     if lag is not None:
         raise Misconfigured("catalog_behind", lag.detail)
-    return "the catalog is as new as the object store"
+    return "the catalog is up to date with the object store"
 
 
 def _check_vocabulary(settings: Settings) -> str:
     running = find_running_server(settings.placewise_home)
     if running is None:
-        return "asked of a running server only"
+        return "checked only while a server runs"
     with Client(running.url, key=running.key) as client:
         maps = client.maps()
     waiting = [m for m in maps if m["photos"] and m["generation_id"] is None]
     if waiting:
-        named = ", ".join(f"{m['name']} ({m['photos']} photos)" for m in waiting)
+        names = ", ".join(f"{m['name']} ({m['photos']} photos)" for m in waiting)
         raise Misconfigured(
             "vocabulary_missing",
-            f"Photos wait to be described: {named}. Fit a vocabulary (placewise vocabulary fit "
-            "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless they "
-            "were uploaded a moment ago.",
+            f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
+            "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
+            "photos were uploaded just now.",
         )
     foreign = [m["name"] for m in maps if m["vocabulary"] == "foreign"]
     if foreign:
-        return f"foreign in {', '.join(foreign)}: `placewise vocabulary fit` makes it their own"
-    return "no map has a foreign one"
+        return (
+            f"foreign vocabulary in {', '.join(foreign)}: fit one with `placewise vocabulary fit`"
+        )
+    return "no map uses a foreign vocabulary"
 
 
 def _check_server(settings: Settings) -> str:
@@ -322,10 +345,10 @@ def _check_server(settings: Settings) -> str:
         with Client(running.url, key=running.key) as client:
             maps = client.maps()
         searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)
-        named = ", ".join(m["name"] for m in maps)
-        return f"running on {running.url}: {searchable} of {photos} photos searchable ({named})"
+        names = ", ".join(m["name"] for m in maps)
+        return f"running on {running.url}: {searchable} of {photos} photos searchable ({names})"
     if not (settings.placewise_home / "catalog.sqlite").exists():
-        return "not running, and nothing is stored yet (start it: make run)"
+        return "not running, nothing is stored yet (start it with make run)"
     catalog = open_catalog(settings, "doctor")
     try:
         check_pages(catalog, max_bytes=None)
@@ -341,4 +364,4 @@ def _check_server(settings: Settings) -> str:
         ) from error
     finally:
         catalog.close()
-    return f"not running; {photos} photos are stored (start it: make run)"
+    return f"not running; {photos} photos are stored (start it with make run)"

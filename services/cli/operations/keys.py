@@ -1,7 +1,8 @@
-"""`placewise keys create|list|revoke`: of the server that is named, else straight in the catalog.
+"""`placewise keys`: create, list and revoke API keys.
 
-In the catalog (DATABASE_URL, or the one of PLACEWISE_HOME) no key is asked for: whoever can write
-there can do anything. That is how the first admin key comes to be.
+With `--server`, the commands call the HTTP API. Without it, they access the catalog directly
+(DATABASE_URL or PLACEWISE_HOME) and require no key, since write access to the catalog already
+implies full control. This is how the first admin key is created.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
 from shared.telemetry.logs import configure_logging
 
-app = typer.Typer(help="Keys of the HTTP API: who may call, what, and how much.")
+app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
 SECONDS_PER_DAY = 86_400.0
 KEY_FIELDS = (
@@ -52,26 +53,36 @@ KEY_FIELDS = (
 
 @app.command("create")
 def create(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Whose, or what for.")],
-    scope: Annotated[
-        list[Scope], typer.Option("--scope", help="What it may do; give several if need be.")
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the key: its owner or purpose.")
     ],
+    scope: Annotated[list[Scope], typer.Option("--scope", help="Scope to grant. Can be repeated.")],
     days: Annotated[
-        float | None, typer.Option(min=0.001, max=36_500, help="Until it expires; left out: never.")
+        float | None,
+        typer.Option(min=0.001, max=36_500, help="Lifetime in days. Default: no expiry."),
     ] = None,
-    requests_per_minute: Annotated[int | None, typer.Option(min=1, max=10**9)] = None,
-    upload_bytes_per_day: Annotated[int | None, typer.Option(min=1, max=2**53)] = None,
-    max_photos: Annotated[int | None, typer.Option(min=1, max=2**53)] = None,
+    requests_per_minute: Annotated[
+        int | None, typer.Option(min=1, max=10**9, help="Rate limit.")
+    ] = None,
+    upload_bytes_per_day: Annotated[
+        int | None, typer.Option(min=1, max=2**53, help="Upload quota.")
+    ] = None,
+    max_photos: Annotated[
+        int | None, typer.Option(min=1, max=2**53, help="Maximum number of stored photos.")
+    ] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a key and print it, this once. Limits that are left out are those of the settings."""
+    """Create a key and print it. It can't be shown again.
+
+    Limits that are not given default to the server's settings.
+    """
     limits = KeyLimits(requests_per_minute, upload_bytes_per_day, max_photos)
     with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
-                made = client.create_key(
+                created = client.create_key(
                     name,
                     list(scope),
                     days=days,
@@ -82,64 +93,64 @@ def create(
         else:
             life_seconds = None if days is None else days * SECONDS_PER_DAY
             with _open_catalog() as catalog, catalog.write() as session:
-                row, new = create_api_key(
+                row, new_key = create_api_key(
                     session, name, set(scope), life_seconds=life_seconds, limits=limits
                 )
-                made = {**_key_as_json(row), "key": new}
+                created = {**_key_as_json(row), "key": new_key}
         if as_json:
-            print_json(made)
+            print_json(created)
             return
-        # Alone on stdout, so that it can be piped into a file that only its user reads.
-        typer.echo(made["key"])
-        typer.echo("It is shown this once. Use it as PLACEWISE_KEY.", err=True)
+        # The key alone goes to stdout, so that it can be redirected to a file.
+        typer.echo(created["key"])
+        typer.echo("This key is shown only once. Use it as PLACEWISE_KEY.", err=True)
 
 
 @app.command("list")
 def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
-    """Show every key that was ever made, without the keys themselves."""
+    """List all keys, including revoked and expired ones, without their secrets."""
     with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
-                found = client.keys()
+                keys = client.keys()
         else:
             with _open_catalog() as catalog, catalog.read() as session:
-                found = [_key_as_json(row) for row in list_api_keys(session)]
+                keys = [_key_as_json(row) for row in list_api_keys(session)]
         if as_json:
-            print_json(found)
+            print_json(keys)
             return
-        table = Table("key", "name", "scopes", "made", "last used", "state")
-        for one in found:
+        table = Table("key", "name", "scopes", "created", "last used", "state")
+        for item in keys:
             table.add_row(
-                f"{one['prefix']}...",
-                one["name"],
-                ", ".join(one["scopes"]),
-                one["created_at"][:10],
-                (one["last_used_at"] or "never")[:16],
-                _key_status(one),
+                f"{item['prefix']}...",
+                item["name"],
+                ", ".join(item["scopes"]),
+                item["created_at"][:10],
+                (item["last_used_at"] or "never")[:16],
+                _key_status(item),
             )
         console.print(table)
 
 
 @app.command("revoke")
 def revoke(
-    which: Annotated[str, typer.Argument(metavar="KEY", help="Its id, or its shown beginning.")],
+    which: Annotated[str, typer.Argument(metavar="KEY", help="The key's ID or displayed prefix.")],
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Let a key open nothing from now on."""
+    """Revoke a key with immediate effect."""
     with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
                 revoked = client.revoke_key(_resolve_key_id(which, client.keys()))
         else:
             with _open_catalog() as catalog, catalog.write() as session:
-                there = [_key_as_json(row) for row in list_api_keys(session)]
-                revoked = _key_as_json(revoke_api_key(session, UUID(_resolve_key_id(which, there))))
+                keys = [_key_as_json(row) for row in list_api_keys(session)]
+                revoked = _key_as_json(revoke_api_key(session, UUID(_resolve_key_id(which, keys))))
         if as_json:
             print_json(revoked)
             return
-        console.print(f"The key {revoked['prefix']}... ({revoked['name']}) opens nothing any more.")
+        console.print(f"Revoked key {revoked['prefix']}... ({revoked['name']}).")
 
 
 @contextlib.contextmanager
@@ -155,24 +166,26 @@ def _open_catalog() -> Iterator[Catalog]:
 
 
 def _resolve_key_id(id_or_prefix: str, keys: list[Json]) -> str:
-    """NotFound (`key_not_found`), Conflict (`key_ambiguous`)."""
-    wanted = id_or_prefix.removesuffix("...")
-    found = [one["id"] for one in keys if wanted in (one["id"], one["prefix"])]
+    """Resolve an ID or prefix to an ID; NotFound (`key_not_found`), Conflict (`key_ambiguous`)."""
+    prefix = id_or_prefix.removesuffix("...")
+    found = [item["id"] for item in keys if prefix in (item["id"], item["prefix"])]
     if not found:
-        raise NotFound("key_not_found", f"There is no key {id_or_prefix!r}: placewise keys list.")
+        raise NotFound(
+            "key_not_found", f"Key {id_or_prefix!r} does not exist. List keys: placewise keys list."
+        )
     if len(found) > 1:
-        raise Conflict("key_ambiguous", f"Several keys begin with {wanted}: give the id instead.")
+        raise Conflict("key_ambiguous", f"Several keys begin with {prefix}. Use the ID instead.")
     return str(found[0])
 
 
 def _key_as_json(row: ApiKey) -> Json:
-    """As the API answers it."""
-    shown = {name: getattr(row, name) for name in KEY_FIELDS}
-    times = {name: value and value.isoformat() for name, value in shown.items() if "_at" in name}
-    return {**shown, "id": str(row.id), **times}
+    """The key in the API's JSON format."""
+    fields = {name: getattr(row, name) for name in KEY_FIELDS}
+    times = {name: value and value.isoformat() for name, value in fields.items() if "_at" in name}
+    return {**fields, "id": str(row.id), **times}
 
 
 def _key_status(key: Json) -> str:
     if key["revoked_at"]:
         return f"revoked {key['revoked_at'][:10]}"
-    return f"until {key['expires_at'][:10]}" if key["expires_at"] else "good"
+    return f"until {key['expires_at'][:10]}" if key["expires_at"] else "active"

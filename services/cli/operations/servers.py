@@ -1,11 +1,9 @@
-"""`placewise serve`: the embedded Placewise, one process.
+"""Commands that run servers: `serve`, `gateway`, `extractor`, `search`, `steward`, and `migrate`.
 
-`placewise search`: one search worker, for a shard of every map.
-
-`placewise gateway|extractor|steward`: services in processes of their own (`search` is beside).
-
-They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS. What only one of
-them needs is imported there: each has an image of its own, with its own packages.
+`serve` runs the embedded Placewise in one process. The others run one service each; services share
+DATABASE_URL (PostgreSQL), REDIS_URL, the object store and SEARCH_URLS. Modules that only one
+service needs are imported inside its function, because each service has an image with its own
+packages.
 """
 
 from __future__ import annotations
@@ -43,14 +41,14 @@ if TYPE_CHECKING:
 
 
 def serve() -> None:
-    """Serve the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C.
+    """Run the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C.
 
-    Where HOST is not loopback, every call needs a key: the first start makes and prints an
-    admin's, and `placewise keys` makes others.
+    If HOST is not a loopback address, every call requires an API key. The first start creates and
+    prints an admin key; `placewise keys` creates others.
     """
     with report_errors(as_json=False):
         settings = read_settings()
-        from services.standalone import run_standalone  # brings torch, as `connect` says
+        from services.standalone import run_standalone  # imports torch, which takes seconds
 
         configure_logging(settings, "embedded")
         with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
@@ -64,16 +62,16 @@ def _startup_message(running: Standalone, settings: Settings) -> str:
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
         *_key_instructions(running, settings, command),
-        f"  look:     {url}   (the page)   {url}/docs   (the API)",
+        f"  open:     {url}   (console)   {url}/docs   (API reference)",
         (
-            f"  put in:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
+            f"  upload:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
             f"{url}/api/v1/upload"
         ),
         (
-            f"  ask:      curl {header}-F file=@OTHER.jpg -H 'Prefer: wait=30' "
+            f"  query:    curl {header}-F file=@OTHER.jpg -H 'Prefer: wait=30' "
             f"{url}/api/v1/similarity"
         ),
-        f"  a folder: {command} index DIR, then {command} query PHOTO",
+        f"  folder:   {command} index DIR, then {command} query PHOTO",
     ]
     return "\n".join(lines)
 
@@ -83,46 +81,40 @@ def _key_instructions(running: Standalone, settings: Settings, command: str) -> 
         return []
     lines = []
     if not is_loopback(settings.host):
-        lines.append(f"  open to:  whoever reaches {settings.host} and has a key")
+        lines.append(f"  access:   anyone who can reach {settings.host} and has a key")
     if running.first_admin_key is not None:
         lines.append(f"  key:      export PLACEWISE_KEY={running.first_admin_key}")
-        lines.append("            It is shown this once; every call needs one.")
+        lines.append("            It is shown only once. Every call requires a key.")
     elif settings.admin_key is not None:
-        lines.append("  key:      the one in ADMIN_KEY, or one of placewise keys list")
+        lines.append("  key:      ADMIN_KEY, or one of those listed by placewise keys list")
     else:
-        lines.append("  key:      one that was shown when it was made: placewise keys list")
-        lines.append(f"            Lost it? {command} keys create NAME --scope admin")
+        lines.append("  key:      one of those listed by placewise keys list")
+        lines.append(f"            To create one: {command} keys create NAME --scope admin")
     return lines
 
 
 def search() -> None:
-    """Answer searches over HTTP (HOST, PORT) for the part of the maps that SEARCH_SHARD names.
+    """Run a search worker (HOST, PORT) for the shard of all maps given by SEARCH_SHARD.
 
-    DATABASE_URL is the catalog that it follows. It asks for no key: let only the gateway and the
-    steward reach it, which find it by SEARCH_URLS.
+    The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
+    gateway and the steward, which find it through SEARCH_URLS.
     """
     with report_errors(as_json=False):
         settings = read_settings()
-        # Imported only here: the other commands need no server.
         from services.search.service import run_search_service
-        from shared.catalog.installation import open_installation_store
-        from shared.catalog.schema import wait_for_schema
-        from shared.catalog.tables import open_catalog
 
         configure_logging(settings, "search")
         catalog = open_catalog(settings, "search")
         try:
             wait_for_schema(catalog, settings.schema_wait_seconds)
-            store = open_installation_store(
-                catalog, settings, exclusive=False
-            )  # others write there meanwhile
+            store = open_installation_store(catalog, settings, exclusive=False)
             with (
                 configure_tracing(settings, "search"),
                 run_search_service(settings, catalog, store) as running,
             ):
                 err_console.print(
                     f"Placewise search serves shard {settings.shard} on {running.url}\n"
-                    f"  look:     {running.url}/readyz   {running.url}/metrics",
+                    f"  health:   {running.url}/readyz   {running.url}/metrics",
                     soft_wrap=True,
                 )
                 running.serve()
@@ -131,8 +123,10 @@ def search() -> None:
 
 
 def gateway() -> None:
-    """Answer the HTTP API (HOST, PORT). Every call needs a key: ADMIN_KEY, or one of `placewise
-    keys`."""
+    """Run the HTTP API (HOST, PORT).
+
+    Every call requires an API key: ADMIN_KEY, or one created with `placewise keys`.
+    """
     with _service_context("gateway") as (settings, catalog):
         from services.gateway.app import create_app
         from services.gateway.authentication import ApiKeyAuthenticator
@@ -146,12 +140,12 @@ def gateway() -> None:
             _search_client(settings) as search,
         ):
             url = reachable_url(*listener.getsockname()[:2])
-            admins = _admin_key_hashes(settings, catalog)
+            admin_key_hashes = _admin_key_hashes(settings, catalog)
             with catalog.write() as session:
                 get_or_create_default_map(session, settings.new_map_extractor)
             store = open_installation_store(catalog, settings, exclusive=False)
             requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
-            keys = ApiKeyAuthenticator(requests, *admins)
+            keys = ApiKeyAuthenticator(requests, *admin_key_hashes)
             context = GatewayContext(requests, store, hints, search, settings, keys)
             server = http_server(
                 create_app(context),
@@ -164,20 +158,26 @@ def gateway() -> None:
 
 
 def extractor() -> None:
-    """Describe photos: a Celery worker on REDIS_URL, DATABASE_URL and the object store."""
+    """Run an extractor, which computes descriptors of photos.
+
+    It is a Celery worker on REDIS_URL, DATABASE_URL and the object store.
+    """
     with _service_context("extractor") as (settings, catalog):
-        from services.extractor.service import serve_extractor  # brings torch
+        from services.extractor.service import serve_extractor  # imports torch
 
         serve_extractor(
             catalog,
             open_installation_store(catalog, settings, exclusive=False),
             settings,
-            lambda: err_console.print("Placewise extractor is at work"),
+            lambda: err_console.print("Placewise extractor is running"),
         )
 
 
 def steward() -> None:
-    """Keep the store healthy, evaluate maps, bring in batches; any number of them may run."""
+    """Run a steward: maintenance, evaluations, batch uploads and webhooks.
+
+    Any number of stewards can run at the same time.
+    """
     with _service_context("steward") as (settings, catalog):
         from prometheus_client import CollectorRegistry
 
@@ -188,10 +188,10 @@ def steward() -> None:
         from services.steward.webhooks import WebhookDispatcher
         from shared.telemetry.metrics_server import serve_metrics
 
-        stop, died = threading.Event(), threading.Event()
+        stop, failed = threading.Event(), threading.Event()
 
-        def on_death() -> None:
-            died.set()
+        def on_failure() -> None:
+            failed.set()
             stop.set()
 
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -202,26 +202,29 @@ def steward() -> None:
             registry = CollectorRegistry()
             metrics = StewardMetrics(registry)
             batches = BatchWorker(catalog, store, hints, settings, name, metrics)
-            duties = Scheduler(catalog, store, hints, settings, metrics)
+            scheduler = Scheduler(catalog, store, hints, settings, metrics)
             evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
             webhooks = WebhookDispatcher(catalog, settings)
-            parts = [
-                start_service_thread("evaluator", evaluator.run, stop, on_death),
-                start_service_thread("batches", batches.run, stop, on_death),
-                start_service_thread("webhooks", webhooks.run, stop, on_death),
-                start_service_thread("steward", duties.run, stop, on_death),
+            threads = [
+                start_service_thread("evaluator", evaluator.run, stop, on_failure),
+                start_service_thread("batches", batches.run, stop, on_failure),
+                start_service_thread("webhooks", webhooks.run, stop, on_failure),
+                start_service_thread("steward", scheduler.run, stop, on_failure),
             ]
-            err_console.print("Placewise steward is at work")
+            err_console.print("Placewise steward is running")
             with serve_metrics(settings, registry):
-                for part in parts:
-                    part.join()
-        if died.is_set():
-            raise Misconfigured("part_died", "A part of the steward died; the log above says why.")
+                for thread in threads:
+                    thread.join()
+        if failed.is_set():
+            raise Misconfigured("part_died", "A thread of the steward failed. See the log above.")
 
 
 def migrate() -> None:
-    """Bring the catalog's tables up to date (DATABASE_URL): once per release, before its services
-    start. Those of the release before go on meanwhile."""
+    """Migrate the catalog's schema (DATABASE_URL) to this release.
+
+    Run it once per release, before the new services start. Services of the previous release keep
+    working during the migration.
+    """
     with report_errors(as_json=False):
         settings = read_settings()
         configure_logging(settings, "migrate")
@@ -237,7 +240,7 @@ def migrate() -> None:
 
 @contextlib.contextmanager
 def _service_context(name: str) -> Iterator[tuple[Settings, Catalog]]:
-    """The settings, and the catalog, once its schema is the one that this release needs."""
+    """Set up logging, tracing and heartbeat, and open the catalog once its schema is current."""
     with report_errors(as_json=False):
         settings = read_settings()
         configure_logging(settings, name)
@@ -252,7 +255,7 @@ def _service_context(name: str) -> Iterator[tuple[Settings, Catalog]]:
 
 
 def _admin_key_hashes(settings: Settings, catalog: Catalog) -> list[str]:
-    """Of ADMIN_KEY. Misconfigured (`admin_key_missing`) where nobody could make a call."""
+    """The hash of ADMIN_KEY, if set; Misconfigured (`admin_key_missing`) without any admin key."""
     if settings.admin_key is not None:
         return [hash_api_key(settings.admin_key.get_secret_value())]
     with catalog.read() as session:
@@ -260,8 +263,8 @@ def _admin_key_hashes(settings: Settings, catalog: Catalog) -> list[str]:
             return []
     raise Misconfigured(
         "admin_key_missing",
-        "Every call needs a key, and there is none that could make others. Make one (placewise "
-        "keys create NAME --scope admin), or set ADMIN_KEY: openssl rand -hex 24",
+        "Every call requires a key, but no admin key exists. Create one (placewise keys create "
+        "NAME --scope admin), or set ADMIN_KEY (generate it with openssl rand -hex 24).",
     )
 
 
@@ -281,7 +284,7 @@ def _search_client(settings: Settings) -> Iterator[HttpSearchClient]:
     if not settings.search_worker_urls:
         raise Misconfigured(
             "search_missing",
-            "SEARCH_URLS is not set: name every search worker (placewise search), for example "
+            "SEARCH_URLS is not set. List the URL of every search worker, for example "
             "http://search-1:8000,http://search-2:8000.",
         )
     with HttpSearchClient(settings.search_worker_urls, settings.search_timeout_seconds) as search:

@@ -1,8 +1,8 @@
-"""`placewise verify`: every chunk against its hash and the catalog.
+"""`placewise verify` and `placewise storage`: integrity checks and object store maintenance.
 
-`placewise storage ...`: the bucket, the owner of the object store, orphans and the trash.
-
-What belongs to the steward is imported where it is used: not every image has it.
+`verify` checks every chunk against its hash and the catalog. `storage` creates the bucket, assigns
+the store to a catalog, and manages orphaned objects and the trash. Modules of the steward are
+imported where they are used, because not every image contains them.
 """
 
 from __future__ import annotations
@@ -47,58 +47,59 @@ if TYPE_CHECKING:
 
 
 MAX_FAULTS_SHOWN = 20
-UPLOAD_SECONDS = 3600.0  # an original of this age belongs to no upload that is under way
+UPLOAD_SECONDS = 3600.0  # an older original does not belong to an upload in progress
 REMEDIES = {
-    "chunk": "placewise verify --repair describes their photos again",
-    "manifest": "placewise verify --repair describes the photos of their chunks again",
-    "photo": "placewise verify --repair describes them again",
+    "chunk": "placewise verify --repair queues their photos again",
+    "manifest": "placewise verify --repair queues the photos of their chunks again",
+    "photo": "placewise verify --repair queues them again",
     "original": "restore the object from a backup, or delete the photo and upload it again",
     "vocabulary": "restore the object from a backup, or fit a new vocabulary",
-    "whitening": "restore the object from a backup, or start a model change",
-    "archive": "its batch fails: send it again",
-    "file": "its batch fails: send it again",
+    "whitening": "restore the object from a backup, or create a new generation",
+    "archive": "its batch fails: upload it again",
+    "file": "its batch fails: upload it again",
 }
 
 
 def verify(
     originals: Annotated[
-        bool, typer.Option("--originals", help="Read every photo against its hash, too.")
+        bool, typer.Option("--originals", help="Also check every original photo against its hash.")
     ] = False,
-    mend: Annotated[
-        bool, typer.Option("--repair", help="Queue the photos of damaged chunks again.")
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Queue the photos of damaged chunks for description.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read every chunk against its hash and the catalog, while the service runs; exit code 1 when
-    something is wrong, also when it was repaired. Where the catalog is older than the object store,
-    --repair takes in what is missing."""
+    """Check every chunk against its hash and the catalog while services run.
+
+    The exit code is 1 if a fault is found, even if it is repaired. If the catalog is older than the
+    object store, --repair also recovers the missing records from the store's journal.
+    """
     with report_errors(as_json), progress_reporter() as progress:
-        # Imported only here: it is the steward's.
-        from services.steward.tasks.orphans import find_orphans
+        from services.steward.tasks.garbage_collection import find_orphans
 
         settings = read_settings()
         with open_storage(settings, "verify") as (catalog, store):
-            lag, taken = catalog_lag(catalog, store), None
-            if lag is not None and mend:
-                taken = _take_in(catalog, store, settings, lag, progress)
+            lag, recovered = catalog_lag(catalog, store), None
+            if lag is not None and repair:
+                recovered = _recover_from_journal(catalog, store, settings, lag, progress)
             report = verify_store(catalog, store, originals=originals, progress=progress)
             for info in find_orphans(catalog, store, age_seconds=0.0):
                 report.orphans += 1
                 report.orphan_bytes += info.size_bytes
-                progress("objects that no row knows", report.orphans, report.orphans)
+                progress("orphaned objects", report.orphans, report.orphans)
             trash = measure_trash(store)
             report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
-            # Workers look every second, and the steward sends hints.
-            queued = repair_descriptors(catalog, InProcessWakeups(), report) if mend else None
+            # No wake-up message is needed: workers poll, and the steward sends messages.
+            queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
     if as_json:
-        found = {
+        recovery = {
             "lag": lag.detail if lag else None,
-            "taken_in": asdict(taken) if taken else None,
+            "taken_in": asdict(recovered) if recovered else None,
         }
-        print_json(_report_as_json(report, queued) | found)
+        print_json(_report_as_json(report, queued) | recovery)
     else:
-        if taken is not None:
-            print_taken_in(taken)
+        if recovered is not None:
+            print_taken_in(recovered)
         elif lag is not None:
             err_console.print(f"[red]behind[/red] {escape(lag.detail)}", soft_wrap=True)
         _print_report(report, queued)
@@ -106,18 +107,18 @@ def verify(
         raise typer.Exit(1)
 
 
-def _take_in(
+def _recover_from_journal(
     catalog: Catalog, store: ObjectStore, settings: Settings, lag: Lag, progress: BackupProgress
 ) -> RecoveryReport:
     if lag.since is None:
         raise Conflict("rebuild_unfinished", lag.detail)
-    from shared.rebuild.recover import recover_catalog  # it reads photos, which not every image can
+    from shared.rebuild.recover import recover_catalog  # decodes photos: not in every image
 
-    served = settings.database_url is not None or find_running_server(settings.placewise_home)
-    age_seconds = UPLOAD_SECONDS if served else 0.0
-    return recover_catalog(
-        catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress
+    may_be_serving = settings.database_url is not None or find_running_server(
+        settings.placewise_home
     )
+    age_seconds = UPLOAD_SECONDS if may_be_serving else 0.0
+    return take_in(catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress)
 
 
 def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, Any]:
@@ -138,22 +139,23 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
-    looked = ", ".join(f"{count} {what}s" for what, count in sorted(report.checked.items()))
+    checked = ", ".join(f"{count} {kind}s" for kind, count in sorted(report.checked.items()))
     console.print(
-        f"{looked or 'nothing'} looked at, {report.read_bytes / 1e6:.1f} MB read: "
+        f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
         f"{len(report.faults)} faults",
         soft_wrap=True,
     )
     if report.orphans:
         console.print(
-            f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are known to no row: "
-            "just coming in, or left by a crash; the steward moves old ones to the trash",
+            f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are not in the "
+            "catalog: uploads in progress or left by a crash. The steward moves old ones to the "
+            "trash.",
             soft_wrap=True,
         )
     if report.trash_objects:
         console.print(
-            f"{report.trash_objects} objects ({report.trash_bytes / 1e6:.1f} MB) are in the trash; "
-            "`placewise storage restore-trash` puts them back",
+            f"{report.trash_objects} objects ({report.trash_bytes / 1e6:.1f} MB) are in the trash. "
+            "`placewise storage restore-trash` restores them.",
             soft_wrap=True,
         )
     for fault in report.faults[:MAX_FAULTS_SHOWN]:
@@ -162,58 +164,62 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
             soft_wrap=True,
         )
     if len(report.faults) > MAX_FAULTS_SHOWN:
-        console.print(f"and {len(report.faults) - MAX_FAULTS_SHOWN} more: --json names them all")
-    mended = {"chunk", "manifest", "photo"} if queued is not None else set()
-    for what in dict.fromkeys(fault.what for fault in report.faults):
-        if what not in mended:
-            err_console.print(f"{what}s: {REMEDIES[what]}", soft_wrap=True)
+        console.print(
+            f"and {len(report.faults) - MAX_FAULTS_SHOWN} more. --json lists all of them."
+        )
+    repaired = {"chunk", "manifest", "photo"} if queued is not None else set()
+    for kind in dict.fromkeys(fault.what for fault in report.faults):
+        if kind not in repaired:
+            err_console.print(f"{kind}s: {REMEDIES[kind]}", soft_wrap=True)
     if queued is not None:
-        console.print(f"{queued} photos are queued again")
+        console.print(f"Queued {queued} photos for description.")
     if any(f.wrong == FaultKind.MISSING and f.what == "original" for f in report.faults):
-        err_console.print("Lost originals can't be described again.")
+        err_console.print("Photos without their originals can't be described again.")
 
 
-app = typer.Typer(help="Where objects lie.", no_args_is_help=True)
+app = typer.Typer(
+    help="Manage the object store: bucket, owner, orphans and trash.", no_args_is_help=True
+)
 
 ConfirmOption = Annotated[
-    bool, typer.Option("--confirm", help="Do it; without this option nothing is changed.")
+    bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
 ]
 
 
 @app.command("create-bucket")
 def create_bucket_command(as_json: JsonOption = False) -> None:
-    """Make the bucket S3_BUCKET at S3_ENDPOINT, once; one that is there already is fine.
+    """Create the bucket S3_BUCKET at S3_ENDPOINT. An existing bucket is left unchanged.
 
-    S3_ACCESS_KEY has to be allowed to make buckets, which Placewise itself need not be.
+    S3_ACCESS_KEY must be allowed to create buckets. Placewise itself does not need this permission.
     """
     with report_errors(as_json):
-        from shared.storage.s3 import Bucket, create_bucket  # the minio client takes its time
+        from shared.storage.s3 import Bucket, create_bucket  # importing minio is slow
 
         bucket = Bucket.from_settings(read_settings())
-        made = create_bucket(bucket)
+        created = create_bucket(bucket)
     if as_json:
-        print_json({"bucket": bucket.name, "endpoint": bucket.endpoint, "made": made})
+        print_json({"bucket": bucket.name, "endpoint": bucket.endpoint, "made": created})
         return
-    state = "is made" if made else "was there already"
-    console.print(f"The bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)
+    state = "was created" if created else "already exists"
+    console.print(f"Bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)
 
 
 @app.command("adopt")
 def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
-    """Make the catalog of the settings the owner of the object store.
+    """Make this catalog the owner of the object store.
 
-    For a store that belongs to a catalog that is gone for good. Stop every service that uses the
-    store first: the catalog that owned it refuses to start afterwards. Objects that this catalog
-    does not know are kept until `placewise storage collect --confirm`.
+    Use it if the catalog that owns the store is lost. Stop every service that uses the store first:
+    services with the previous catalog refuse to start afterwards. Objects that are not in this
+    catalog are kept until you run `placewise storage collect --confirm`.
     """
-    with report_errors(as_json), contextlib.ExitStack() as held:
-        from services.steward.tasks.orphans import count_store
+    with report_errors(as_json), contextlib.ExitStack() as stack:
+        from services.steward.tasks.garbage_collection import count_store
 
         settings = read_settings()
         if settings.database_url is None:
-            held.enter_context(lock_home(settings.placewise_home))
+            stack.enter_context(lock_home(settings.placewise_home))
         catalog = open_catalog(settings, "storage", NO_TIMEOUTS)
-        held.callback(catalog.close)
+        stack.callback(catalog.close)
         store = open_store(settings, exclusive=False)
         store.check()
         if confirm and catalog.is_sqlite:
@@ -225,32 +231,33 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
         count = count_store(None if is_new else catalog, store)
         unknown = count.orphans.total()
         if confirm:
-            if unknown:  # before the store is ours, or the steward of this catalog could collect
+            # The hold comes first: without it, this catalog's steward could collect the objects.
+            if unknown:
                 unknown_bytes = count.orphan_bytes.total()
                 write_hold(store, Hold(HoldReason.ADOPTED, unknown, unknown_bytes, count.objects))
             adopt_store(catalog, store)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects; unknown to this catalog: {unknown}")
+    console.print(f"{count.objects} objects, {unknown} of them not in this catalog")
     _print_orphans(count)
     if confirm:
-        console.print("The store belongs to this catalog now.")
+        console.print("This catalog is now the owner of the store.")
     else:
         console.print(
-            "Nothing was changed. --confirm makes this catalog the owner; any other catalog then "
-            "refuses to start with this store. Unknown objects are kept: they are not searchable, "
-            "and nothing deletes them before `placewise storage collect --confirm`.",
+            "Nothing was changed. Pass --confirm to make this catalog the owner. Services with "
+            "another catalog then refuse to start with this store. Objects that are not in the "
+            "catalog are kept but not searchable, until `placewise storage collect --confirm`.",
             soft_wrap=True,
         )
 
 
 @app.command("collect")
 def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
-    """List the objects that no row of the catalog knows, by prefix; with --confirm, move them to
-    the trash, also where the steward holds that back.
+    """Count orphaned objects by prefix; with --confirm, move them to the trash.
 
-    Only those older than ORPHAN_AGE_SECONDS. Runs while the service runs.
+    Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
+    overrides a hold on garbage collection. Services can keep running.
     """
     with report_errors(as_json):
         from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
@@ -263,55 +270,58 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
             if confirm:
                 moved = collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
     if as_json:
-        held = None if hold is None else hold.reason
-        print_json({"moved": moved, "held": held, **_as_dict(count)})
+        hold_reason = None if hold is None else hold.reason
+        print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects; known to no row: {count.orphans.total()}")
+    console.print(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
     _print_orphans(count)
     if confirm:
         console.print(
-            f"{moved} objects were moved to the trash, and are deleted after "
+            f"Moved {moved} objects to the trash. They are deleted after "
             f"{settings.trash_days:g} days (TRASH_DAYS)."
         )
         return
     if hold is not None:
-        console.print(f"Collection is held: {escape(hold.describe())}", soft_wrap=True)
-    console.print("Nothing was changed. --confirm moves them to the trash.")
+        console.print(f"Garbage collection is on hold: {escape(hold.describe())}", soft_wrap=True)
+    console.print("Nothing was changed. Pass --confirm to move them to the trash.")
 
 
 @app.command("restore-trash")
 def restore(
     prefix: Annotated[
-        str, typer.Option("--prefix", help="Only objects whose key begins so: originals/.")
+        str,
+        typer.Option(
+            "--prefix", help="Only objects whose key starts with this prefix, such as originals/."
+        ),
     ] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Move the objects of the trash back to their keys, while the service runs.
+    """Move objects from the trash back to their keys while services run.
 
-    The catalog does not know them by that: they become orphans again, and are kept for another
-    ORPHAN_AGE_SECONDS. `placewise verify --repair` takes originals in, `placewise rebuild-catalog`
-    makes a catalog of everything.
+    This does not add them to the catalog: they are orphans again and are kept for another
+    ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise rebuild-catalog`
+    rebuilds a catalog from all objects.
     """
     with report_errors(as_json):
         settings = read_settings()
-        restored, kept = 0, 0
+        restored, skipped = 0, 0
         with open_storage(settings, "storage") as (_, store):
-            for _, is_back in restore_trash(store, prefix):
-                restored += is_back
-                kept += not is_back
+            for _, was_restored in restore_trash(store, prefix):
+                restored += was_restored
+                skipped += not was_restored
     if as_json:
-        print_json({"restored": restored, "kept_in_trash": kept})
+        print_json({"restored": restored, "kept_in_trash": skipped})
         return
-    console.print(f"{restored} objects are back under their keys")
-    if kept:
-        console.print(f"{kept} stay in the trash: another object has their key by now")
+    console.print(f"Restored {restored} objects to their keys.")
+    if skipped:
+        console.print(f"{skipped} objects stay in the trash: their keys are in use again.")
 
 
 def _check_not_owned(catalog: Catalog, owner: str | None) -> None:
     with catalog.write() as session:
         installation_id = get_or_create_installation(session).id
     if owner == str(installation_id):
-        raise Conflict("already_owner", "The store belongs to this catalog already.")
+        raise Conflict("already_owner", "This catalog already owns the store.")
 
 
 def _as_dict(count: StoreCount) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The doctor's checks of the object store: its owner, held collection, file permissions."""
+"""Object store checks of `placewise doctor`: owner, garbage collection, file permissions."""
 
 from __future__ import annotations
 
@@ -21,20 +21,22 @@ from shared.storage.trash import read_hold
 
 
 def collection_check(settings: Settings) -> str:
-    """Whether the store belongs to this catalog, and whether orphans are collected."""
+    """Check that this catalog owns the store and that orphans are collected.
+
+    Raises:
+        Misconfigured: Another catalog owns the store, or `collection_held`.
+    """
     folder = settings.placewise_home / "objects"
     store: OwnedStore
     if settings.s3_endpoint is not None:
         store = open_store(settings, exclusive=False)
     elif folder.exists():
-        store = FolderStore(
-            folder, exclusive=False
-        )  # UPLOAD_DIR, which has no notes, is not marked
+        store = FolderStore(folder, alone=False)  # UPLOAD_DIR has no owner record
     else:
         return "nothing is stored yet"
     owner = read_owner(store)
     if owner is None:
-        return "the object store has no owner yet; the next start marks it"
+        return "the object store has no owner yet; the next start assigns it"
     if str(_installation_id(settings)) != owner:
         raise store_taken_error(store, "belongs to another catalog than this one")
     hold = read_hold(store)
@@ -44,23 +46,28 @@ def collection_check(settings: Settings) -> str:
 
 
 def permissions_check(settings: Settings) -> str:
-    """Whether other users of this machine can read what is stored."""
+    """Check that other users of this machine can't read stored files.
+
+    Raises:
+        Misconfigured: `readable_by_others`.
+    """
     roots = [settings.placewise_home, settings.upload_dir, _sqlite_file(settings)]
-    there = [root for root in roots if root is not None and root.exists()]
-    # What lies in a private folder can't be reached.
-    wide = [
+    existing = [root for root in roots if root is not None and root.exists()]
+    # Contents of a private folder are not accessible, whatever their own permissions.
+    accessible = [
         root
-        for root in there
-        if is_open_to_others(root) and not any(_is_private_parent(parent, root) for parent in there)
+        for root in existing
+        if is_open_to_others(root)
+        and not any(_is_private_parent(parent, root) for parent in existing)
     ]
-    if wide:
-        named = " ".join(f"'{root}'" for root in wide)
+    if accessible:
+        paths = " ".join(f"'{root}'" for root in accessible)
         raise Misconfigured(
             "readable_by_others",
-            f"Other users of this machine have access to {named}: photos, hashes of keys and the "
-            f"catalog lie there. Take it away: chmod -R go-rwx {named}",
+            f"Other users of this machine have access to {paths}, which contain photos, key hashes "
+            f"and the catalog. Revoke it: chmod -R go-rwx {paths}",
         )
-    return "only this user can read what is stored" if there else "nothing is stored yet"
+    return "only this user can read stored files" if existing else "nothing is stored yet"
 
 
 def _is_private_parent(parent: Path, path: Path) -> bool:

@@ -1,8 +1,6 @@
-"""`placewise train`: learn a place descriptor of one's own.
+"""`placewise train` and `placewise grid`: train place descriptors, and run hyperparameter grids.
 
-`placewise grid`: many training runs from one file, and their leaderboard.
-
-A training run on the terminal: bars while it works, tables when it is done.
+`TerminalDisplay` shows the progress of a run on the terminal.
 """
 
 from __future__ import annotations
@@ -35,12 +33,12 @@ from shared.errors import InvalidRequest
 Json = dict[str, Any]
 
 LOG_INTERVAL_SECONDS = 60.0
-"""where stderr is no terminal, and bars would not be seen"""
+"""Interval of progress lines if stderr is not a terminal, where bars would not be visible."""
 SHOWN_KS = ("1", "5", "10", "20")
 
 
 class TerminalDisplay:
-    """Implements `services.trainer.run_control.Display` on stderr."""
+    """Implements `services.trainer.run_control.Display` with progress bars on stderr."""
 
     def __init__(self) -> None:
         self._bars = Progress(
@@ -92,21 +90,21 @@ class TerminalDisplay:
 
 
 def print_summary(report: Json) -> None:
-    """A run's summary: sets x R@k, the best checkpoint, what to type next."""
+    """Print a run's summary: R@k per set, the best checkpoint and suggested next commands."""
     if report.get("fast_dev_run"):
         return
     rows = _summary_rows(report)
     if rows:
         columns = (Column(f"R@{k}", justify="right") for k in SHOWN_KS)
-        table = Table("set", "of", *columns, "queries", "fingerprint")
-        for name, what, recall in rows:
-            about = report["sets"][name]
+        table = Table("set", "stage", *columns, "queries", "fingerprint")
+        for name, stage, recall in rows:
+            set_info = report["sets"][name]
             table.add_row(
                 escape(name),
-                what,
+                stage,
                 *(f"{recall[k]:.1%}" if recall.get(k) is not None else "-" for k in SHOWN_KS),
-                str(about["queries"]),
-                f"{about['fingerprint'][:12]} {about['protocol']}, {about['rule']}",
+                str(set_info["queries"]),
+                f"{set_info['fingerprint'][:12]} {set_info['protocol']}, {set_info['rule']}",
             )
         console.print(table)
     best = report["best"]
@@ -117,9 +115,9 @@ def print_summary(report: Json) -> None:
     )
     if "images" in report and report["images_per_second"]:
         console.print(
-            f"{report['images']} photos learned from, {report['images_per_second']:.1f}/s, "
-            f"{report['share_waiting_for_data']:.1%} of the time waiting for photos; "
-            f"{len(report['bad_photos'])} photos did not decode.",
+            f"Trained on {report['images']} photos ({report['images_per_second']:.1f}/s; "
+            f"{report['share_waiting_for_data']:.1%} of the time waiting for data). "
+            f"{len(report['bad_photos'])} photos could not be decoded.",
             soft_wrap=True,
         )
     console.print("Next:", *(f"  {line}" for line in report["next"]), sep="\n", markup=False,
@@ -130,41 +128,42 @@ def _summary_rows(report: Json) -> list[tuple[str, str, Json]]:
     rows = []
     if report.get("epochs"):
         monitor = report["monitor"]
-        chosen = max(
+        best_epoch = max(
             report["epochs"],
-            key=lambda each: (
-                each["figures"].get(monitor, 0.0)
+            key=lambda epoch: (
+                epoch["figures"].get(monitor, 0.0)
                 * (1 if report["arguments"]["mode"] == "max" else -1)
             ),
         )
         for name in report["arguments"]["val_set_names"]:
-            recall = {k: chosen["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
-            rows.append((name, f"validation, epoch {chosen['number'] + 1}", recall))
-    rows += [(name, "test", one["recall"]) for name, one in report["test"].items()]
+            recall = {k: best_epoch["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
+            rows.append((name, f"validation, epoch {best_epoch['number'] + 1}", recall))
+    rows += [(name, "test", result["recall"]) for name, result in report["test"].items()]
     return rows
 
 
 TRAINING_PACKAGES = ("lightning", "pytorch_metric_learning", "faiss", "torch", "yaml")
-EXIT_INTERRUPTED = 130  # what a shell reports for a program that Ctrl-C ended
+EXIT_INTERRUPTED = 130  # the shell's exit status for a program ended by Ctrl-C
 
 
 @with_training_options
 def train(
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="YAML file of arguments; options override it."),
+        typer.Option("--config", help="YAML file of arguments. Command-line options override it."),
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", help="Go on with the run in this folder, exactly as it was."),
+        typer.Option("--resume", help="Resume the run in this folder with its own arguments."),
     ] = None,
     as_json: JsonOption = False,
     **arguments: Any,
 ) -> None:
-    """Train a place descriptor, validate it while it learns, and test the best checkpoint.
+    """Train a place descriptor, validate it during training, and test the best checkpoint.
 
-    Lists and dicts are JSON. A true-or-false option stands alone, as --no-NAME, or before True or
-    False. Names may be written with hyphens. Ctrl-C keeps the run: --resume goes on with it.
+    Lists and dicts are JSON. A boolean option is written as --NAME, --no-NAME, or --NAME True or
+    False. Option names may contain hyphens or underscores. A run stopped with Ctrl-C can be
+    continued with --resume.
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
@@ -183,7 +182,7 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
 
     if config is not None and resume is not None:
         raise InvalidRequest(
-            "bad_argument", "--resume has the run's own arguments: leave --config out."
+            "bad_argument", "--resume uses the run's own arguments. Remove --config."
         )
     with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
@@ -198,18 +197,20 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
 
 @with_training_options
 def grid(
-    file: Annotated[Path, typer.Argument(help="YAML file: base, grid, runs.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the runs.")] = Path("LOGS/grid"),
+    file: Annotated[Path, typer.Argument(help="YAML file with base, grid and runs.")],
+    out: Annotated[Path, typer.Option("--out", help="Output folder of the runs.")] = Path(
+        "LOGS/grid"
+    ),
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check every run and list them; train nothing.")
+        bool, typer.Option("--dry-run", help="Validate and list all runs without training.")
     ] = False,
     as_json: JsonOption = False,
     **arguments: Any,
 ) -> None:
-    """Train every run of a file: aggregators x losses x miners, or any other arguments.
+    """Train every run of a grid: aggregators x losses x miners, or any other arguments.
 
-    Runs that are finished stay as they are, an interrupted one goes on, one that fails is named
-    and the others are made. Options of `placewise train` override every run's.
+    Finished runs are skipped and interrupted runs are resumed. A failed run is reported, and the
+    grid continues. Options of `placewise train` override those of every run.
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
@@ -236,9 +237,9 @@ def _run_grid_command(
 
     plan = load_grid_plan(file, overrides)
     if dry_run:
-        there = [load_outcome(planned, out) for planned in plan.runs]
+        outcomes = [load_outcome(planned, out) for planned in plan.runs]
         _print_rows([{"run": o.run.name, "state": str(o.state), **_to_strings(o.run.arguments)}
-               for o in there], as_json)  # fmt: skip
+               for o in outcomes], as_json)  # fmt: skip
         return 0
 
     def write(outcomes: list[RunOutcome]) -> None:
@@ -251,7 +252,7 @@ def _run_grid_command(
             outcomes = run_grid(plan, out, trainer, display, stop, write)
         except RunStopped as stopped:
             err_console.print(
-                "Stopped. The same command goes on where the grid is.", soft_wrap=True
+                "Stopped. Run the same command again to continue the grid.", soft_wrap=True
             )
             raise typer.Exit(EXIT_INTERRUPTED) from stopped
     write(outcomes)
@@ -259,7 +260,7 @@ def _run_grid_command(
         print_json([asdict(outcome) for outcome in outcomes])
     else:
         _print_rows(leaderboard(plan, outcomes), False)
-        console.print(f"Written: {out}/leaderboard.csv and {out}/leaderboard.md", markup=False)
+        console.print(f"Wrote {out}/leaderboard.csv and {out}/leaderboard.md", markup=False)
     return sum(outcome.state is not RunState.FINISHED for outcome in outcomes)
 
 
@@ -272,7 +273,7 @@ def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
         print_json(rows)
         return
     columns = list(dict.fromkeys(column for row in rows for column in row))
-    # What all runs share is no news.
+    # Leave out columns whose value is the same for all runs.
     if len(rows) > 1:
         columns = [c for c in columns if len({row.get(c, "") for row in rows}) > 1 or c == "run"]
     table = Table(*columns)

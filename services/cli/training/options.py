@@ -1,8 +1,8 @@
-"""The options of `placewise train`, made from the class of its arguments.
+"""Command-line options of `placewise train`, generated from `TrainingArguments`.
 
-Underscores and hyphens are both accepted; the help shows the predecessor's underscores. A
-true-or-false option stands alone (`--pretrained`), negated (`--no-pretrained`) or before a word
-(`--pretrained False`), as the predecessor's commands write it.
+Underscores and hyphens are both accepted; the help shows underscores, as in GSV-Cities scripts. A
+boolean option is written alone (`--pretrained`), negated (`--no-pretrained`) or with a value
+(`--pretrained False`), for compatibility with those scripts.
 """
 
 from __future__ import annotations
@@ -41,37 +41,37 @@ GROUP_ORDER = (
 
 
 def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that takes `**arguments` one option of text for each training argument.
+    """Decorate a command that takes `**arguments` with a text option per training argument.
 
-    What is left out comes as None; `chosen` drops it.
+    Options that are not given are passed as None; `given_options` removes them.
     """
-    own = [
+    own_parameters = [
         parameter
         for parameter in inspect.signature(command, eval_str=True).parameters.values()
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD
     ]
-    made = [
+    training_parameters = [
         _make_option(name)
         for name in sorted(ARGUMENT_NAMES, key=lambda n: GROUP_ORDER.index(argument_group(n)))
     ]
-    shaped: Any = command
-    shaped.__signature__ = inspect.Signature([*own, *made])
-    shaped.__annotations__ = {each.name: each.annotation for each in [*own, *made]}
-    shaped.command_settings = {"cls": TrainingCommand}
+    parameters = [*own_parameters, *training_parameters]
+    decorated: Any = command
+    decorated.__signature__ = inspect.Signature(parameters)
+    decorated.__annotations__ = {p.name: p.annotation for p in parameters}
+    decorated.command_settings = {"cls": TrainingCommand}
     return command
 
 
 def given_options(arguments: dict[str, str | None]) -> dict[str, str]:
-    """What the command line said, without what it left out."""
+    """The options that were given on the command line."""
     return {name: text for name, text in arguments.items() if text is not None}
 
 
 def _make_option(name: str) -> inspect.Parameter:
     field = TrainingArguments.model_fields[name]
-    shown = field.default
-    default = (
-        "" if shown in (None, ()) or name == "cities" else f" (default: {_format_default(shown)})"
-    )
+    default = ""
+    if field.default not in (None, ()) and name != "cities":
+        default = f" (default: {_format_default(field.default)})"
     option = typer.Option(
         f"--{name}",
         help=f"{field.description}{default}",
@@ -89,34 +89,38 @@ def _make_option(name: str) -> inspect.Parameter:
 
 def _format_default(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"({', '.join(str(each) for each in value)})"
+        return f"({', '.join(str(item) for item in value)})"
     return str(value)
 
 
 class TrainingCommand(TyperCommand):
-    """Reads the tokens as the predecessor's users write them."""
+    """Parses boolean and size options as GSV-Cities scripts write them."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        own = [text for parameter in self.params for text in parameter.opts]
-        return super().parse_args(ctx, normalise_tokens(args, own))
+        own_options = [text for parameter in self.params for text in parameter.opts]
+        return super().parse_args(ctx, normalise_tokens(args, own_options))
 
 
 def normalise_tokens(tokens: Sequence[str], own_options: Sequence[str] = ()) -> list[str]:
-    """The same command line with one token `--name=value` for each training argument.
+    """Rewrite a command line to one token `--name=value` per training argument.
 
-    `own_options` are the command's other options, which stay as they are, with their values. Raises
-    typer.BadParameter for an option that there is not.
+    Args:
+        tokens: The command line.
+        own_options: The command's other options, which are left unchanged with their values.
+
+    Raises:
+        typer.BadParameter: Unknown option or missing value.
     """
-    left, done = list(tokens), []
-    while left:
-        token = left.pop(0)
-        name, given, value = token.removeprefix("--").partition("=")
+    remaining, normalised = list(tokens), []
+    while remaining:
+        token = remaining.pop(0)
+        name, has_value, value = token.removeprefix("--").partition("=")
         if not token.startswith("--") or not name:
-            done.append(token)
+            normalised.append(token)
             continue
         negated = name.removeprefix("no-").removeprefix("no_")
-        if negated != name and not given and _is_boolean_argument(negated):
-            done.append(f"--{resolve_name(negated)}=false")
+        if negated != name and not has_value and _is_boolean_argument(negated):
+            normalised.append(f"--{resolve_name(negated)}=false")
             continue
         try:
             known = resolve_name(name)
@@ -124,14 +128,14 @@ def normalise_tokens(tokens: Sequence[str], own_options: Sequence[str] = ()) -> 
             if f"--{name}" not in (*own_options, "--help"):
                 options = [*(text.removeprefix("--") for text in own_options), *ARGUMENT_NAMES]
                 raise typer.BadParameter(
-                    f"There is no option --{name}.{suggest_name(name, options)}"
+                    f"Unknown option --{name}.{suggest_name(name, options)}"
                 ) from None
-            done.append(token)
+            normalised.append(token)
             continue
-        if not given:
-            value = _pop_value(known, left)
-        done.append(f"--{known}={value}")
-    return done
+        if not has_value:
+            value = _pop_value(known, remaining)
+        normalised.append(f"--{known}={value}")
+    return normalised
 
 
 def _is_boolean_argument(name: str) -> bool:
@@ -147,7 +151,7 @@ def _pop_value(name: str, remaining: list[str]) -> str:
             else "true"
         )
     if not remaining:
-        raise typer.BadParameter(f"--{name} needs a value.")
+        raise typer.BadParameter(f"--{name} requires a value.")
     value = remaining.pop(0)
     if (
         name in SIZE_ARGUMENTS
