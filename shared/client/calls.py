@@ -25,10 +25,10 @@ from shared.client.sending import (
     to_jsonl,
     unreadable_file_error,
 )
-from shared.client.wire import AsyncTransport
+from shared.client.wire import Transport
 
 
-class Client(AsyncTransport):
+class Client(Transport):
     """Client of one server and one map. All calls return the API's JSON."""
 
     def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:

@@ -37,7 +37,7 @@ PAGE_SIZE = 1000  # the server's maximum
 Answer = TypeVar("Answer")
 
 
-class AsyncTransport:
+class Transport:
     """Transport to one server and one map; close it, or use it as a context manager."""
 
     def __init__(

@@ -96,9 +96,7 @@ def check_memory(settings: Settings) -> str:
         available, owner = memory_limit_bytes(), "this machine"
     weights = recipe.parameters * BYTES_PER_PARAMETER
     # A single photo is never split, however many pixels its preprocessing produces.
-    min_batch = math.ceil(
-        get_preprocessing(recipe.preprocessing).most_pixels / DEFAULT_PHOTO_PIXELS
-    )
+    min_batch = math.ceil(get_preprocessing(recipe.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
     batch = max(settings.batch_photos, min_batch) * BYTES_PER_BATCH_PHOTO
     needed = PROCESS_OVERHEAD_BYTES + weights + batch
     estimate = (

@@ -75,7 +75,7 @@ def verify(
     object store, --repair also recovers the missing records from the store's journal.
     """
     with report_errors(as_json), progress_reporter() as progress:
-        from services.steward.tasks.garbage_collection import find_orphans
+        from services.steward.tasks.orphans import find_orphans
 
         settings = read_settings()
         with open_storage(settings, "verify") as (catalog, store):
@@ -118,7 +118,9 @@ def _recover_from_journal(
         settings.placewise_home
     )
     age_seconds = UPLOAD_SECONDS if may_be_serving else 0.0
-    return take_in(catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress)
+    return recover_catalog(
+        catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress
+    )
 
 
 def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, Any]:
@@ -213,7 +215,7 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     catalog are kept until you run `placewise storage collect --confirm`.
     """
     with report_errors(as_json), contextlib.ExitStack() as stack:
-        from services.steward.tasks.garbage_collection import count_store
+        from services.steward.tasks.orphans import count_store
 
         settings = read_settings()
         if settings.database_url is None:

@@ -31,7 +31,7 @@ def collection_check(settings: Settings) -> str:
     if settings.s3_endpoint is not None:
         store = open_store(settings, exclusive=False)
     elif folder.exists():
-        store = FolderStore(folder, alone=False)  # UPLOAD_DIR has no owner record
+        store = FolderStore(folder, exclusive=False)  # UPLOAD_DIR has no owner record
     else:
         return "nothing is stored yet"
     owner = read_owner(store)
