@@ -111,4 +111,4 @@ def test_index_waits_for_a_full_queue_says_so_and_goes_on(
     report = json.loads(ended.stdout)
     assert (report["uploaded"], report["refused"], report["failed"]) == (PHOTOS, [], [])
     assert "Retrying:" in ended.stderr
-    assert "wait already" in ended.stderr
+    assert "The queue is full" in ended.stderr

@@ -392,7 +392,7 @@ def test_a_removed_model_goes_with_its_bytes_and_its_name_means_no_other(walks: 
     assert keys(walks, MODELS) == []
 
     reason = failed(walks, send(walks, some_checkpoint(1)), "model_name_taken")
-    assert "not used again" in reason
+    assert "names are not reused" in reason
     assert not done(walks, send(walks, some_checkpoint()))["already_there"]
     assert done(walks, switch(walks, extractor="gsv:walks"))["dimension"] == 128
 

@@ -310,7 +310,7 @@ def test_candidate_that_the_gpu_can_not_hold_is_left_out_of_the_reranking_alone(
     ]
     (told,) = [text for text in caplog.messages if "is not compared" in text]
     assert heavy in told
-    assert "GPU's memory does not suffice" in told
+    assert "The GPU ran out of memory" in told
     assert jobs(service, "compare")[0]["state"] == "succeeded"
 
 

@@ -26,7 +26,7 @@ from shared.errors import Unavailable
 from shared.jobs import JobKind, JobState, reclaim_expired_leases
 from shared.jobs.transitions import cancel_job, fail_job, retry_job
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
-from shared.storage import FolderStore
+from shared.storage import FolderStore, read_retries
 from tests.integration.gateway import Service
 from tests.integration.town import Seen, Town, Watched, metres_north
 from tests.support.catalog_rows import (
@@ -365,8 +365,11 @@ def test_an_evaluation_that_crashes_is_tried_again_and_fails_in_the_end(town: To
 
 
 @pytest.mark.parametrize("order", [0, 1])
-def test_a_damaged_map_is_not_measured_by_its_rest(town: Town, order: int) -> None:
+def test_a_damaged_map_is_not_measured_by_its_rest(
+    town: Town, order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whether the broken chunk holds photos that are asked with or only such as may be found."""
+    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     town.publish(STREETS)
     town.publish(WITHOUT_PLACE)
     keys = sorted(
