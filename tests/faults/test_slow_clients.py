@@ -18,7 +18,7 @@ from tests.support.server import ServerProcess
 
 ADMIN_KEY = "the-admin-key-of-slow-clients"
 IDLE, BODIES, STREAMS = 150, 8, 6
-SECONDS = 30.0
+SECONDS = 90.0
 FILES = 400  # that the server may open
 
 

@@ -318,7 +318,7 @@ def test_the_gateways_health_names_shards_without_workers_and_stays_ready(
         assert (answer.status_code, answer.json()["status"]) == (503, "degraded")
         assert answer.json()["parts"]["search"] == {
             "status": "degraded",
-            "detail": "no search worker answers for: shard 0/2",
+            "detail": "no search worker is available for: shard 0/2",
         }
         assert client.get("/readyz").status_code == 200
         tier.servers[1][1].stop()
