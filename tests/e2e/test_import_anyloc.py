@@ -58,7 +58,7 @@ def test_photos_are_imported_and_found_by_their_original_names(
     assert [item["filename"] for item in report["missing"]] == ["lost.jpg"]
     assert [item["filename"] for item in report["duplicates"]] == ["castle-again.jpg"]
     assert report["refused"] == report["failed"] == []
-    assert "made anew" in report["notes"][0]
+    assert "Descriptors are computed again" in report["notes"][0]
     assert "c_centers.pt" in report["notes"][1]
 
     [castle] = images(server, filename="piazza castello")

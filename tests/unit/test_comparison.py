@@ -42,7 +42,7 @@ def test_sums_over_patches_can_be_explained(
     ("name", "of_generation", "why"),
     [
         (f"{VITB}:aggregator=gem", spec(768, None), "GeM"),
-        (HUB, spec(8448, None), "whole photo"),
+        (HUB, spec(8448, None), "one feature per photo"),
         (VITB, spec(512, 64), "PCA"),
         (f"{VITB}:aggregator=avg", spec(256, None), "PCA"),
     ],
