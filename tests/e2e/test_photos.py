@@ -212,7 +212,7 @@ def test_a_deleted_photo_is_gone_from_every_call(server: ServerProcess) -> None:
     answer = got(server.client.delete(url(gone)))
     assert answer == {
         "success": True,
-        "message": "gone.jpg is deleted.",
+        "message": "The photo gone.jpg is deleted.",
         "deleted_file_id": gone,
     }
     for refused in (

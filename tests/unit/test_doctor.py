@@ -93,7 +93,7 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr("shared.descriptors.backbones.torchhub.GITHUB", "unreachable")
     missing = f"torchhub:somebody/places@{COMMIT}:colours"
-    with pytest.raises(Misconfigured, match="its code is not here") as caught:
+    with pytest.raises(Misconfigured, match="its code is not downloaded") as caught:
         check_extractor(settings_with(monkeypatch, EXTRACTOR=missing))
     assert caught.value.code == "weights_missing"
     assert str(tmp_path) not in caught.value.detail
