@@ -160,7 +160,7 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
         (
             ("fit", "photos", "--out", "a.npz", "--extractor", "test-tiny-avg"),
             "vocabulary_unfit",
-            "uses no vocabulary",
+            "does not use a vocabulary",
         ),
     ],
 )

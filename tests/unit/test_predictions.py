@@ -164,7 +164,7 @@ def test_runs_are_compared_query_by_query_where_their_ground_truth_is_the_same(
     )["against"]  # fmt: skip
     assert (found["won"], found["lost"]) == ([1, 3], [0])
     assert found["difference"]["1"]["mean"] == pytest.approx(1 / 5)
-    assert "Against found" in (tmp_path / "after" / "report.html").read_text()
+    assert "Compared with found" in (tmp_path / "after" / "report.html").read_text()
 
     other = np.empty(len(TRUTH), object)
     other[:] = [[4], [1], [], [3], [0, 5]]
