@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from uuid import UUID
 
-import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
@@ -18,12 +17,6 @@ from tests.support.catalog_rows import add_map, add_photo
 from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
 FILTERS = 25  # asked of each population of photos
-
-
-@pytest.fixture
-def map_id(catalog: Catalog) -> UUID:
-    with catalog.write() as session:
-        return add_map(session).id
 
 
 def store(

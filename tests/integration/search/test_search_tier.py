@@ -30,8 +30,8 @@ from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, encode_rows
-from tests.contract.search.test_search_backend import SmallMap, assert_answers, unit_rows
 from tests.support.search_tier import SearchServer, SearchTier
+from tests.support.small_map import SmallMap, assert_answers, unit_rows
 
 SLOTS = 7  # three shards have three, two and two of them
 BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth
