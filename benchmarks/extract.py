@@ -52,7 +52,7 @@ from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import Misconfigured, PlacewiseError
 from shared.extractor_config.configs import FACETS, ExtractorConfig
 from shared.imaging.preprocessing import Pixels, get_preprocessing
-from tests.support.fit_memory import memory_bytes
+from tests.support.memory import memory_bytes
 from tests.support.vit import random_weights, save
 
 if TYPE_CHECKING:

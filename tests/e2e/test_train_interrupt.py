@@ -12,8 +12,7 @@ import torch
 from services.trainer import run
 from services.trainer.run_control import NullDisplay, StopRequest
 from tests.support.processes import INHERITED, PLACEWISE, start
-from tests.support.tiny_places import write_tiny_places
-from tests.support.train_runs import assert_same_weights, told, train
+from tests.support.training_runs import assert_same_weights, told, train, write_tiny_places
 
 LIMIT_SECONDS = 240
 

@@ -14,7 +14,7 @@ from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.catalog.session import Catalog
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
-from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
 FILTERS = 25  # asked of each population of photos
 

@@ -15,8 +15,8 @@ from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.search_api.protocol import Mode, SearchBackend
 from shared.storage import FolderStore
+from tests.contract.search.search_methods import int8_on_demand
 from tests.contract.search.test_search_backend import OpenPort, SearchPortContract
-from tests.support.codes import int8_on_demand
 from tests.support.search_tier import SearchTier
 from tests.support.small_map import SmallMap, assert_answers, search_when_built, unit_rows
 

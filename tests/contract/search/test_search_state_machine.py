@@ -25,7 +25,7 @@ from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, manifest_key
-from tests.support.codes import always_by_codes, always_by_int8
+from tests.contract.search.search_methods import always_by_codes, always_by_int8
 from tests.support.small_map import (
     Reference,
     Rows,

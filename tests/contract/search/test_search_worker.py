@@ -23,12 +23,12 @@ from shared.config.shards import SINGLE_SHARD
 from shared.errors import Unavailable
 from shared.search_api.protocol import Mode, SearchBackend
 from shared.storage import FolderStore, read_retries
+from tests.contract.search.search_methods import always_by_codes, always_by_int8, int8_on_demand
 from tests.contract.search.test_search_backend import (
     OpenPort,
     SearchPortContract,
     whatever_the_catalog,
 )
-from tests.support.codes import always_by_codes, always_by_int8, int8_on_demand
 from tests.support.small_map import SmallMap, assert_answers, damaged, search_when_built, unit_rows
 
 

@@ -39,10 +39,10 @@ from tests.integration.comparisons import (
     result,
     searches,
 )
+from tests.integration.extractor.small_gpu import make_too_heavy
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.small_gpu import make_too_heavy
 
 # tests/e2e/test_rerank_and_explain.py does the same on SQLite.
 pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)

@@ -36,7 +36,7 @@ from shared.storage.chunks import Rows, decode_rows, read_row
 from shared.storage.keys import WHITENINGS, WORK, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
-from tests.support.added import none_added
+from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_vocabulary_command.py does the same on SQLite.

@@ -33,12 +33,16 @@ from shared.jobs import InProcessWakeups, Job, JobState
 from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
+from tests.integration.steward.webhook_receiver import (
+    Receiver,
+    certificate,
+    hanging_receiver,
+    receiving,
+)
 from tests.integration.workplace import Workplace
 from tests.support.archives import zip_of
-from tests.support.certificate import certificate
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.receiver import Receiver, hanging_receiver, receiving
 
 PHOTOS = 6
 

@@ -18,8 +18,14 @@ from services.trainer.arguments import build_arguments, load_yaml
 from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
-from tests.support.tiny_places import CITY, write_tiny_places
-from tests.support.train_runs import assert_same_weights, told, train, weights
+from tests.support.training_runs import (
+    CITY,
+    assert_same_weights,
+    told,
+    train,
+    weights,
+    write_tiny_places,
+)
 
 Json = dict[str, Any]
 

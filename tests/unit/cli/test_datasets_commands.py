@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from services.cli.datasets.commands import app
 from shared.datasets.open_dataset import open_evaluation_set
-from tests.support.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
+from tests.unit.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
 
 
 def called(*arguments: object, code: int = 0) -> str:

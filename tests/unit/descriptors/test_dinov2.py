@@ -21,11 +21,10 @@ from tests.support.vit import (
     SIDE,
     SWIGLU,
     WITH_REGISTERS,
-    bicubic_weights,
-    plain_forward,
     random_weights,
     save,
 )
+from tests.unit.descriptors.dinov2_reference import bicubic_weights, plain_forward
 
 CPU = torch.device("cpu")
 NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU, "registers": WITH_REGISTERS}

@@ -20,7 +20,7 @@ from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, ru
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
 from shared.storage import FolderStore
-from tests.support.added import none_added
+from tests.support.checkpoints import none_added
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 SIDE = 224  # pixels: as large as what passes are counted by

@@ -20,7 +20,7 @@ from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.ids import new_id
 from shared.search_api.photo_filter import NO_FILTER
-from tests.support.photo_facts import facts_of
+from tests.unit.search.search_rows import facts_of
 
 Rows = NDArray[np.float32]
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as some
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
-from tests.support.photo_facts import facts_of
-from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.search_rows import facts_of
 
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 

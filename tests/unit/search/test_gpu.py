@@ -25,7 +25,15 @@ from services.search.residency import GpuResidency, open_search_device
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
 from shared.search_api.protocol import Mode
-from tests.support.search_rows import Case, answer, brute_force, cases, hits_of, places, snapshot_of
+from tests.unit.search.search_rows import (
+    Case,
+    answer,
+    brute_force,
+    cases,
+    hits_of,
+    places,
+    snapshot_of,
+)
 
 DIMENSION = 512
 KINDS = ("float16", "int8")

@@ -14,7 +14,7 @@ from services.search import executor
 from services.search.executor import SearchOptions, int8_codes_pay_off, needs_int8_codes
 from shared.ids import new_id
 from shared.search_api.protocol import Mode
-from tests.support.search_rows import (
+from tests.unit.search.search_rows import (
     Case,
     answer,
     brute_force,

@@ -19,7 +19,8 @@ from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import Mode
-from tests.support.search_rows import (
+from tests.support.servers.handle import wait_until
+from tests.unit.search.search_rows import (
     Case,
     answer,
     brute_force,
@@ -29,7 +30,6 @@ from tests.support.search_rows import (
     places,
     snapshot_of,
 )
-from tests.support.servers.handle import wait_until
 
 DIMENSION = 7168
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.fit_memory import CLUSTERS, PATCHES, WIDTH
+from tests.unit.descriptors.vocabularies.fit_memory import CLUSTERS, PATCHES, WIDTH
 
 REPOSITORY = Path(__file__).parents[4]
 ALL_FEATURES_BYTES = 2000 * PATCHES * WIDTH * 4  # 786 MB
@@ -16,7 +16,7 @@ ALL_FEATURES_BYTES = 2000 * PATCHES * WIDTH * 4  # 786 MB
 
 def fit_in_its_own_process(photos: int) -> dict[str, int]:
     child = subprocess.run(
-        [sys.executable, "-m", "tests.support.fit_memory", str(photos)],
+        [sys.executable, "-m", "tests.unit.descriptors.vocabularies.fit_memory", str(photos)],
         cwd=REPOSITORY,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,

@@ -15,7 +15,12 @@ from shared.descriptors.vocabulary_fit import (
     VocabularyFit,
 )
 from shared.errors import Unprocessable
-from tests.support.points import clustered_points, full_kmeans, mean_cosine, unit_points
+from tests.unit.descriptors.vocabularies.points import (
+    clustered_points,
+    full_kmeans,
+    mean_cosine,
+    unit_points,
+)
 
 
 def finish(fit: VocabularyFit) -> torch.Tensor:

@@ -20,7 +20,8 @@ from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
 from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
-from tests.support.vit import PLAIN, plain_forward, random_weights, save
+from tests.support.vit import PLAIN, random_weights, save
+from tests.unit.descriptors.dinov2_reference import plain_forward
 
 CPU = torch.device("cpu")
 

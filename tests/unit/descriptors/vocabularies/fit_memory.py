@@ -1,6 +1,6 @@
 """A process that fits a vocabulary to patches as ViT-S makes them, and says what memory it took:
 
-python -m tests.support.fit_memory PHOTOS
+python -m tests.unit.descriptors.vocabularies.fit_memory PHOTOS
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.patches import fit_vocabulary
 from shared.extractor_config.configs import get_extractor_config
-from tests.support.points import clustered_points
+from tests.support.memory import memory_bytes
+from tests.unit.descriptors.vocabularies.points import clustered_points
 
 WIDTH = 384
 PATCHES = 256
@@ -49,19 +49,6 @@ class ManyPatches:
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return 1, PATCHES
-
-
-def memory_bytes(name: str) -> int:
-    """`VmRSS`, what the process holds now, or `VmHWM`, the most that it has held."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{name}:"):
-            return int(line.split()[1]) * 1024
-    raise AssertionError(f"/proc/self/status has no {name}")
-
-
-def forget_peak_memory() -> None:
-    """`VmHWM` begins anew, at what the process holds now."""
-    Path("/proc/self/clear_refs").write_text("5")
 
 
 def main(photos: int) -> None:

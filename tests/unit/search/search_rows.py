@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import pairwise
 from uuid import UUID
 
@@ -16,10 +17,10 @@ from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult
 from services.search.photo_columns import PhotoColumns
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.codes.int8_codes import int8_codes
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
-from tests.support.photo_facts import facts_of
 
 DIMENSION = 7168
 
@@ -118,4 +119,20 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
         asked=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
         k=draw(st.sampled_from([1, 2, 10, 100, 400])),
         min_score=draw(st.sampled_from([None, 0.1])),
+    )
+
+
+def facts_of(
+    photo_id: UUID,
+    *,
+    role: PhotoRole = PhotoRole.DATABASE,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    captured_at: datetime | None = None,
+    place: str | None = None,
+    tags: tuple[str, ...] = (),
+) -> PhotoFilterValues:
+    """A live photo; fields that are not given are unknown."""
+    return PhotoFilterValues(
+        photo_id, role, None, latitude, longitude, captured_at, place, list(tags)
     )

@@ -8,9 +8,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
+from shared.datasets.open_dataset import EvaluationSet
 from shared.datasets.utm_filenames import UtmFileName
+from shared.errors import PlacewiseError
 
 
 def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:
@@ -53,3 +56,21 @@ def save_lists(path: Path, rows: Sequence[Sequence[int]]) -> Path:
         lists[number] = list(row)
     np.save(path, lists, allow_pickle=True)
     return path
+
+
+def pair(base: Path, database: list[float], queries: list[float]) -> None:
+    """Photos along one street, at these metres."""
+    for name, spots in (("database", database), ("queries", queries)):
+        write_photos(base / name, [utm_name(480_000 + m, 4_880_000) for m in spots])
+
+
+def rows(opened: EvaluationSet) -> list[list[int]]:
+    return [found.tolist() for found in opened.positives]
+
+
+def names(opened: EvaluationSet) -> tuple[list[str], list[str]]:
+    return [s.name for s in opened.database], [s.name for s in opened.queries]
+
+
+def code_of(caught: pytest.ExceptionInfo[PlacewiseError]) -> str:
+    return caught.value.code
