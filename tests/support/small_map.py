@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
-from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map, increment_map_version, lock_map
-from shared.catalog.models import get_or_create_model
-from shared.catalog.photos import Photo, mark_photo_deleted
+from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
 from shared.storage import ObjectStore
-from shared.storage.chunks import encode_rows, write_chunk
+from shared.storage.chunks import encode_rows
+from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, delete
 
 DIMENSION = 12
 NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
@@ -42,33 +41,19 @@ def unit_rows(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
 class SmallMap:
     """A map with one generation, changed as the extractor, the gateway and the steward do.
 
-    `rows` is the model to compare with: every live photo with its descriptor.
+    `rows` holds the expected state: every live photo with its descriptor.
     """
 
     mode = Mode.AUTO
-    """How it is searched."""
+    """Search mode of its requests."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
         self.catalog = catalog
         self.store = store
-        self.map_id, self.generation_id = new_id(), new_id()
         self.rows: dict[UUID, Rows] = {}
         with catalog.write() as session:
-            session.add(Map(id=self.map_id, name=f"map-{self.map_id}", extractor="test"))
-            session.flush()
-            model = get_or_create_model(session, "test", "0" * 64, "MIT", {})
-            session.add(
-                Generation(
-                    id=self.generation_id,
-                    map_id=self.map_id,
-                    state=GenerationState.ACTIVE,
-                    extractor="test",
-                    spec={"extractor": "test"},
-                    spec_fingerprint="0" * 64,
-                    dimension=DIMENSION,
-                    model_id=model.id,
-                )
-            )
+            self.map_id = add_map(session, f"map-{new_id()}").id
+            self.generation_id = add_generation(session, self.map_id, dimension=DIMENSION).id
 
     @property
     def version(self) -> int:
@@ -82,60 +67,17 @@ class SmallMap:
         dead: int = 0,
         about: Callable[[int], dict[str, Any]] = lambda row: {},
     ) -> list[UUID]:
-        """Publish a chunk of photos; its first `dead` rows belong to none (a lease was lost).
+        """Publish a chunk of photos; its first `dead` rows belong to no photo (a lease was lost).
 
-        `about` says what is known of the photo of a row: columns of `Photo`.
+        `about` returns the columns of `Photo` for a row.
         """
-        chunk_id, photo_ids = new_id(), [new_id() for _ in rows]
-        written = write_chunk(
-            self.store,
-            generation_id=self.generation_id,
-            chunk_id=chunk_id,
-            rows=rows,
-            photo_ids=photo_ids,
-            spec={"extractor": "test"},
-        )
         with self.catalog.write() as session:
-            lock_map(session, self.map_id)
-            session.add_all(
-                self._photo(photo_id, **about(row)) for row, photo_id in enumerate(photo_ids)
-            )
-            session.add(
-                Chunk(
-                    id=chunk_id,
-                    generation_id=self.generation_id,
-                    slot=slot,
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
-                )
-            )
-            session.flush()
-            session.add_all(
-                Descriptor(
-                    generation_id=self.generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
-                )
-                for row, photo_id in enumerate(photo_ids)
-                if row >= dead
-            )
-            increment_map_version(session, self.map_id)
+            photo_ids = [add_photo(session, self.map_id, **about(n)).id for n in range(len(rows))]
+        add_chunk(
+            self.catalog, self.store, self.generation_id, photo_ids, rows=rows, slot=slot, dead=dead
+        )
         self.rows |= dict(list(zip(photo_ids, rows, strict=True))[dead:])
         return photo_ids
-
-    def _photo(self, photo_id: UUID, **columns: Any) -> Photo:
-        return Photo(
-            id=photo_id,
-            map_id=self.map_id,
-            sha256=photo_id.hex * 2,
-            object_key=f"originals/{photo_id}",
-            filename="photo.jpg",
-            media_type="image/jpeg",
-            size_bytes=1,
-            width=1,
-            height=1,
-            **columns,
-        )
 
     def patch(self, photo_id: UUID, **columns: Any) -> None:
         """As `PATCH /uploads/{file_id}` does it."""
@@ -147,10 +89,7 @@ class SmallMap:
             photo.changed_version = increment_map_version(session, self.map_id)
 
     def delete(self, photo_id: UUID) -> None:
-        with self.catalog.write() as session:
-            lock_map(session, self.map_id)
-            photo = session.get_one(Photo, photo_id)
-            mark_photo_deleted(session, photo, increment_map_version(session, self.map_id))
+        delete(self.catalog, self.map_id, photo_id)
         del self.rows[photo_id]
 
     def merge(self, slot: int = 0) -> bool:
