@@ -51,8 +51,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files that wait lie evenly among those that calculate, so that both go on at any time.
-    Without the real photos, the tests that need them are deselected, and so are those in a browser
-    where none is asked for; one line says so."""
+    Tests on real photos and in a browser are deselected unless they are enabled."""
     places = {**_places(items, WAITING), **_places(items, CALCULATING)}
     items.sort(key=lambda item: places[item.path])
     without = [

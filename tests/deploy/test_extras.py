@@ -71,9 +71,9 @@ def requirements(extra: str) -> set[str]:
 def installed_with(extra: str) -> set[str]:
     """Every distribution that would be in the image."""
     found: set[str] = set()
-    wanted = requirements(extra) | {name_of(line) for line in PROJECT["dependencies"]}
-    while wanted:
-        name = wanted.pop()
+    expected = requirements(extra) | {name_of(line) for line in PROJECT["dependencies"]}
+    while expected:
+        name = expected.pop()
         if name in found:
             continue
         try:
@@ -82,7 +82,7 @@ def installed_with(extra: str) -> set[str]:
             continue
         found.add(name)
         # Optional requirements: none of them is needed to import anything.
-        wanted |= {name_of(line) for line in lines if "extra ==" not in line}
+        expected |= {name_of(line) for line in lines if "extra ==" not in line}
     return found
 
 

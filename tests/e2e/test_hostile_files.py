@@ -102,6 +102,6 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
     assert server.process.poll() is None
     assert server.client.get("/readyz").status_code == 200
     good = server.indexed(photo_bytes(901), "good.jpg")
-    asked = server.ask(photo_bytes(901)).json()
-    assert asked["similar_images"][0]["image_id"] == good
+    body = server.ask(photo_bytes(901)).json()
+    assert body["similar_images"][0]["image_id"] == good
     assert "Traceback" not in server.log_path.read_text(errors="replace")

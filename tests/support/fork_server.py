@@ -84,7 +84,7 @@ def serve(control: socket.socket) -> dict[str, Any] | None:
 
 
 def run(request: dict[str, Any]) -> None:
-    """Be the process that was asked for. What the program raises is for the interpreter."""
+    """Run the command in this process. The interpreter handles what the program raises."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(request["cwd"])
     os.environ.clear()

@@ -17,7 +17,7 @@ from services.trainer.run_control import NullDisplay, StopRequest
 Json = dict[str, Any]
 
 
-def told(places: Path, out: Path, **others: Any) -> Json:
+def run_arguments(places: Path, out: Path, **others: Any) -> Json:
     """A run of a small network: two epochs of three batches of two places."""
     return {
         "data_root": str(places),
@@ -43,8 +43,8 @@ def told(places: Path, out: Path, **others: Any) -> Json:
     }
 
 
-def train(said: Json, display: NullDisplay | None = None) -> Json:
-    return run.run(build_arguments(said), display or NullDisplay(), StopRequest())
+def train(fields: Json, display: NullDisplay | None = None) -> Json:
+    return run.run(build_arguments(fields), display or NullDisplay(), StopRequest())
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

@@ -22,7 +22,7 @@ SIDE = 37  # of the grid of learnt positions
 
 
 def random_weights(shape: VitShape, blocks: int | None = None, seed: int = 0) -> Weights:
-    """Every tensor of such a network under Meta's names; `blocks` of it, all if not said."""
+    """Every tensor of such a network under Meta's names; `blocks` limits their number."""
     rng = np.random.default_rng(seed)
 
     def random(*size: int, scale: float, around: float = 0.0) -> torch.Tensor:

@@ -20,12 +20,12 @@ from tests.contract.catalog.test_session import MOMENT
 from tests.support.catalog_rows import add_job, add_map, add_photo
 
 
-def found(catalog: Catalog, map_id: UUID, **wanted: Any) -> set[str]:
+def found(catalog: Catalog, map_id: UUID, **params: Any) -> set[str]:
     """The names of all photos that match, with the total checked against them."""
-    about = {name: wanted.pop(name) for name in PhotoFilter.model_fields if name in wanted}
-    wanted["photos"] = PhotoFilter(**about)
+    about = {name: params.pop(name) for name in PhotoFilter.model_fields if name in params}
+    params["photos"] = PhotoFilter(**about)
     with catalog.read() as session:
-        page, total = search_photos(session, map_id, MetadataFilter(**wanted), 1000, None)
+        page, total = search_photos(session, map_id, MetadataFilter(**params), 1000, None)
     assert total == len(page)
     return {photo.filename for photo in page}
 
@@ -112,19 +112,19 @@ def test_all_tags_are_wanted(catalog: Catalog, map_id: UUID) -> None:
 
 
 def test_filters_work_together_and_in_one_map(catalog: Catalog, map_id: UUID) -> None:
-    wanted = {"filename": "x.jpg", "tags": ["t"], "size_bytes": 5, "uploaded_at": MOMENT}
+    params = {"filename": "x.jpg", "tags": ["t"], "size_bytes": 5, "uploaded_at": MOMENT}
     later = MOMENT + timedelta(days=1)
     with catalog.write() as session:
         other = add_map(session, "other").id
-        right = add_photo(session, map_id, **wanted).id
-        add_photo(session, other, **wanted)
+        right = add_photo(session, map_id, **params).id
+        add_photo(session, other, **params)
         for wrong in (
             {"filename": "y.jpg"},
             {"tags": ["u"]},
             {"size_bytes": 6},
             {"uploaded_at": later},
         ):
-            add_photo(session, map_id, **{**wanted, **wrong})
+            add_photo(session, map_id, **{**params, **wrong})
         conditions = MetadataFilter(
             filename="x", upload_before=MOMENT, max_file_size=5, photos=PhotoFilter(tags=("t",))
         )
@@ -199,12 +199,12 @@ def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id
 
 
 def test_metadata_comes_back_as_it_was(catalog: Catalog, map_id: UUID) -> None:
-    said = {"camera": "x'y", "nested": {"list": [1, 2.5, None, True, "日本"]}, "empty": {}}
+    fields = {"camera": "x'y", "nested": {"list": [1, 2.5, None, True, "日本"]}, "empty": {}}
     with catalog.write() as session:
-        photo_id = add_photo(session, map_id, attributes=said, tags=TAGS).id
+        photo_id = add_photo(session, map_id, attributes=fields, tags=TAGS).id
     with catalog.read() as session:
         photo = session.get_one(Photo, photo_id)
-        assert photo.attributes == said
+        assert photo.attributes == fields
         assert photo.tags == TAGS
 
 

@@ -116,11 +116,11 @@ def test_a_large_catalog_is_read_whole_by_the_doctor_only(file: Path, catalog: C
 def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command: str) -> None:
     no_sqlite(file)
     done = run_command(command, env=environment(file.parent), cwd=file.parent)
-    said = done.stdout + done.stderr
+    output = done.stdout + done.stderr
     assert done.returncode == 1
-    assert str(file) in said
-    assert "placewise rebuild-catalog" in said
-    assert "Traceback" not in said
+    assert str(file) in output
+    assert "placewise rebuild-catalog" in output
+    assert "Traceback" not in output
 
 
 # --- while it runs ---------------------------------------------------------------------------
@@ -171,18 +171,18 @@ def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -
 def test_what_a_failing_disk_says_is_no_word_of_being_away() -> None:
     original = sqlite3.OperationalError("disk I/O error")
     original.sqlite_errorname = "SQLITE_IOERR_READ"
-    told = to_unavailable(OperationalError("SELECT 1", {}, original))
-    assert told is not None
-    assert (told.code, told.status) == ("catalog_io_error", 503)
-    assert "dmesg" in told.detail
+    error = to_unavailable(OperationalError("SELECT 1", {}, original))
+    assert error is not None
+    assert (error.code, error.status) == ("catalog_io_error", 503)
+    assert "dmesg" in error.detail
 
 
 def test_postgresql_without_room_is_full_and_not_away() -> None:
     class DiskFull(Exception):
         sqlstate = "53100"
 
-    told = to_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
-    assert isinstance(told, StorageFull)
+    error = to_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
+    assert isinstance(error, StorageFull)
 
 
 def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(

@@ -39,7 +39,7 @@ from tests.support.servers import PostgresServer
 
 
 def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID) -> None:
-    wanted = [
+    expected = [
         (JobKind.REINDEX, 4),
         (JobKind.INDEX, 2),
         (JobKind.FIT, 3),
@@ -47,9 +47,9 @@ def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID)
         (JobKind.DESCRIBE, 1),
         (JobKind.COMPARE, 1),
     ]
-    made = [(place, queue(catalog, map_id, kind=kind)[0]) for kind, place in wanted]
+    made = [(place, queue(catalog, map_id, kind=kind)[0]) for kind, place in expected]
     order = [job_id for _, job_id in sorted(made, key=lambda pair: pair[0])]
-    assert [job_id for _ in wanted for job_id in ids(take(catalog, limit=1))] == order
+    assert [job_id for _ in expected for job_id in ids(take(catalog, limit=1))] == order
     assert take(catalog) == []
 
 

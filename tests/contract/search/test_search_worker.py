@@ -101,8 +101,8 @@ class TestSearchWorker(SearchPortContract):
         monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
         places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
-        kept = places.reference(places.add(unit_rows(2, 5))[0])[0]
-        (key,) = set(places.chunk_keys()) - {kept}
+        retained = places.reference(places.add(unit_rows(2, 5))[0])[0]
+        (key,) = set(places.chunk_keys()) - {retained}
         worker = SearchWorker(
             catalog, store, settings.model_copy(update={"search_memory_bytes": 0})
         )
@@ -110,7 +110,7 @@ class TestSearchWorker(SearchPortContract):
         assert worker.status().rows == 10
         whole = store.get(key)
         os.truncate(store.path(key), 200)
-        store.delete(kept)
+        store.delete(retained)
         worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((key,), 5)
         store.put(key, whole)
@@ -313,7 +313,7 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         places.add(unit_rows(1, 40))
         search = port()
         assert isinstance(search, SearchWorker)
-        told = MeteredSearch(search).render().decode()
+        text = MeteredSearch(search).render().decode()
         bytes_there = search.status().devices[0].resident_bytes
-        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in told
-        assert 'placewise_search_device_failed{device="cpu"} 0.0' in told
+        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in text
+        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text

@@ -117,9 +117,9 @@ def test_bucket_of_another_catalog_is_refused(
     started: Started, catalog: Catalog, other_catalog: Catalog, bucket: Bucket
 ) -> None:
     started(catalog, bucket)
-    said = refused(started, other_catalog, bucket, "bucket_taken")
-    assert bucket.name in said
-    assert "DATABASE_URL" in said
+    reported = refused(started, other_catalog, bucket, "bucket_taken")
+    assert bucket.name in reported
+    assert "DATABASE_URL" in reported
 
 
 def test_bucket_with_other_things_in_it_is_refused_and_left_alone(

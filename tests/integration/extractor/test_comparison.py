@@ -308,9 +308,9 @@ def test_candidate_that_the_gpu_can_not_hold_is_left_out_of_the_reranking_alone(
         *(pytest.approx(scores[one]) for one in ids(answer)[:3]),
         None,
     ]
-    (told,) = [text for text in caplog.messages if "is not compared" in text]
-    assert heavy in told
-    assert "The GPU ran out of memory" in told
+    (messages,) = [text for text in caplog.messages if "is not compared" in text]
+    assert heavy in messages
+    assert "The GPU ran out of memory" in messages
     assert jobs(service, "compare")[0]["state"] == "succeeded"
 
 

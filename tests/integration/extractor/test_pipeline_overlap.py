@@ -48,9 +48,9 @@ class Gate:
         monkeypatch.setattr(Extractor, "describe", described)
         monkeypatch.setattr("services.extractor.worker.publish", published)
 
-    def await_seen(self, *wanted: str) -> None:
+    def await_seen(self, *expected: str) -> None:
         deadline = time.monotonic() + WAIT_SECONDS
-        while self.seen != list(wanted):
+        while self.seen != list(expected):
             assert time.monotonic() < deadline, self.seen
             time.sleep(0.01)
 

@@ -147,14 +147,14 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    wanted = {"clusters": 4, "sample": 5, "seed": 7}
+    params = {"clusters": 4, "sample": 5, "seed": 7}
     vlads.upload(*range(PHOTOS))
-    whole = vlads.fit(**wanted)  # its clusters are found in one slice
+    whole = vlads.fit(**params)  # its clusters are found in one slice
 
     do_one_step_a_slice(monkeypatch)
     torn = workplace_of("test-tiny-vlad")
     torn.upload(*range(PHOTOS))
-    job_id = torn.start(JobKind.FIT, **wanted)
+    job_id = torn.start(JobKind.FIT, **params)
     progress = []
     while torn.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
         do_slices(monkeypatch, make_worker())  # each slice by a worker that knows nothing
@@ -172,7 +172,7 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
 
     other = workplace_of("test-tiny-vlad")
     other.upload(*range(PHOTOS))
-    another = other.fit(**{**wanted, "seed": 8})
+    another = other.fit(**{**params, "seed": 8})
 
     fingerprints = []
     for workplace, job in ((vlads, whole), (torn, again), (other, another)):

@@ -32,7 +32,7 @@ DAY_SECONDS = 86_400.0
 MANY = 100  # chunks that an open slot may have before it is worth merging
 
 
-class House:
+class ChunkMap:
     """A map with an active generation whose chunks the test lays out."""
 
     def __init__(self, catalog: Catalog, store: FolderStore) -> None:

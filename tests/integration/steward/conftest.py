@@ -16,14 +16,14 @@ from shared.storage import FolderStore, OwnedStore
 from shared.storage.s3 import S3Store
 from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import Batches
-from tests.integration.steward.chunk_map import House
+from tests.integration.steward.chunk_map import ChunkMap
 from tests.integration.town import Town
 from tests.support.servers import S3Server
 
 
 @pytest.fixture
-def house(catalog: Catalog, store: FolderStore) -> House:
-    return House(catalog, store)
+def chunk_map(catalog: Catalog, store: FolderStore) -> ChunkMap:
+    return ChunkMap(catalog, store)
 
 
 @pytest.fixture

@@ -123,10 +123,10 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     job_id = batches.start(archive=zip_of(files(*range(4))))
     real = incoming_module.validate_photo
 
-    def die_of_one(store: ObjectStore, received: Any, *rest: Any, **said: Any) -> Any:
+    def die_of_one(store: ObjectStore, received: Any, *rest: Any, **fields: Any) -> Any:
         if received.filename == "2.jpg":
             raise Killed
-        return real(store, received, *rest, **said)
+        return real(store, received, *rest, **fields)
 
     monkeypatch.setattr(bring_in_module, "validate_photo", die_of_one)
     for _ in range(3):

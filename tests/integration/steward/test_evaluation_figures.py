@@ -83,9 +83,9 @@ def test_labelled_queries_do_not_disturb_leave_one_out(town: Town) -> None:
 
 def test_a_sample_is_of_its_size_and_comes_from_its_seed(town: Town) -> None:
     town.publish([(7 * n, at(n)) for n in range(30)])  # each alone
-    asked = [_asked(town, sample=10, seed=seed) for seed in (1, 1, 2)]
-    assert [len(ids) for ids in asked] == [10, 10, 10]
-    assert asked[0] == asked[1] != asked[2]
+    requests = [_asked(town, sample=10, seed=seed) for seed in (1, 1, 2)]
+    assert [len(ids) for ids in requests] == [10, 10, 10]
+    assert requests[0] == requests[1] != requests[2]
     assert len(_asked(town, sample=1000, seed=0)) == 30
 
 

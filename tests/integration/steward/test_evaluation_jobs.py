@@ -46,7 +46,7 @@ def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(town: Town) -> None
 
     search = Watched(town.search, 2, cancel_it)
     assert town.work(search)
-    assert search.asked <= 3
+    assert search.searches <= 3
     assert read_job(town.catalog, job_id).state == JobState.CANCELLED
     assert town.evaluations() == []
     assert town.calibration() is None
@@ -76,7 +76,7 @@ def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(town: Town) -> 
     stop = threading.Event()
     search = Watched(town.search, 2, stop.set)
     assert town.work(search, stop)
-    assert search.asked == 2
+    assert search.searches == 2
     job = read_job(town.catalog, job_id)
     assert (job.state, job.attempts, job.lease_token) == (JobState.QUEUED, 0, None)
     assert town.evaluations() == []
@@ -103,7 +103,7 @@ def test_a_killed_evaluation_begins_anew(town: Town) -> None:
         assert reclaim_expired_leases(session, max_attempts=3) == 1
     search = Watched(town.search, 0, kill)
     assert town.work(search)
-    assert search.asked >= len(STREETS)
+    assert search.searches >= len(STREETS)
     job = read_job(town.catalog, job_id)
     assert job.state == JobState.SUCCEEDED
     assert job.progress_done == job.progress_total == len(STREETS)
@@ -205,7 +205,7 @@ def test_there_must_be_something_to_evaluate(service: Service) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "field"),
+    ("params", "field"),
     [
         ({"sample": 0}, "sample"),
         ({"sample": 1_000_001}, "sample"),
@@ -217,9 +217,9 @@ def test_there_must_be_something_to_evaluate(service: Service) -> None:
     ],
 )
 def test_bad_numbers_are_refused_by_name(
-    service: Service, wanted: dict[str, Any], field: str
+    service: Service, params: dict[str, Any], field: str
 ) -> None:
-    field_refused(service("POST", "/evaluations", json=wanted), field)
+    field_refused(service("POST", "/evaluations", json=params), field)
 
 
 @pytest.mark.parametrize("path", ["evaluations", "searches"])

@@ -28,7 +28,7 @@ from shared.storage.keys import (
     incoming_key,
     new_original_key,
 )
-from tests.integration.steward.chunk_map import HOUR_SECONDS, House
+from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
 from tests.integration.steward.test_garbage_collection import add_one_job
 from tests.support.catalog_rows import (
@@ -42,12 +42,15 @@ from tests.support.catalog_rows import (
 )
 
 
-def test_collecting_twice_at_once_harms_nothing(house: House, settings: Settings) -> None:
-    kept = sum_of(house.chunks(2, 2))
-    merge_slot(house.catalog, house.store, house.generation_id, 0)
-    gone = [upload(house.catalog, house.store, house.map_id, bytes([n]))[0] for n in range(6)]
-    house.delete(*gone)
-    ask(house.catalog, house.store, house.map_id, b"query")
+def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: Settings) -> None:
+    retained = sum_of(chunk_map.chunks(2, 2))
+    merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    gone = [
+        upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, bytes([n]))[0]
+        for n in range(6)
+    ]
+    chunk_map.delete(*gone)
+    ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
     now = settings.model_copy(
         update=dict.fromkeys(
             ("superseded_grace_seconds", "retired_grace_seconds", "query_ttl_seconds"), -1.0
@@ -57,19 +60,21 @@ def test_collecting_twice_at_once_harms_nothing(house: House, settings: Settings
 
     def both() -> None:
         together.wait(timeout=30)
-        collect_garbage(house.catalog, house.store, now)
+        collect_garbage(chunk_map.catalog, chunk_map.store, now)
 
     with ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(both) for _ in range(2)]:
             done.result()
-    house.check_rows(kept)
-    assert {key.split("/")[0] for key in house.objects()} == {"chunks", "journal"}
-    with house.catalog.read() as session:
-        assert set(session.scalars(select(Photo.id))) == set(kept)
+    chunk_map.check_rows(retained)
+    assert {key.split("/")[0] for key in chunk_map.objects()} == {"chunks", "journal"}
+    with chunk_map.catalog.read() as session:
+        assert set(session.scalars(select(Photo.id))) == set(retained)
 
 
-def test_a_duty_that_raises_does_not_stop_the_others(house: House, settings: Settings) -> None:
-    steward = Scheduler(house.catalog, house.store, InProcessWakeups(), settings)
+def test_a_duty_that_raises_does_not_stop_the_others(
+    chunk_map: ChunkMap, settings: Settings
+) -> None:
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings)
     done: list[str] = []
     stop = threading.Event()
 
@@ -88,30 +93,30 @@ def test_a_duty_that_raises_does_not_stop_the_others(house: House, settings: Set
 
 
 def test_each_duty_is_done_by_the_loop(
-    house: House, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One round does everything once: each duty leaves its trace."""
     hints = InProcessWakeups()
     soon = settings.model_copy(
         update={"compact_chunks": 2, "orphan_age_seconds": 0.0, "auto_fit_photos": 1}
     )
-    kept = sum_of(house.chunks(1, 1))
-    gone, _ = upload(house.catalog, house.store, house.map_id, b"gone")
-    house.delete(gone)
-    with house.catalog.write() as session:
+    retained = sum_of(chunk_map.chunks(1, 1))
+    gone, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"gone")
+    chunk_map.delete(gone)
+    with chunk_map.catalog.write() as session:
         other = add_map(session, "other", "test-tiny-vlad").id
         waiting = add_photo(session, other).id
         add_job(session, other, photo_id=waiting, waiting_for="vocabulary")
-        lost = add_job(session, house.map_id).id
-    take(house.catalog)
-    house.change(Job, lost, lease_until=db_now_plus(-1))
-    house.store.put(new_original_key(), b"orphan")
-    house.age(house.objects("originals/"), 60)
-    with house.catalog.write() as session:
+        lost = add_job(session, chunk_map.map_id).id
+    take(chunk_map.catalog)
+    chunk_map.change(Job, lost, lease_until=db_now_plus(-1))
+    chunk_map.store.put(new_original_key(), b"orphan")
+    chunk_map.age(chunk_map.objects("originals/"), 60)
+    with chunk_map.catalog.write() as session:
         made = RequestIdentity("someone", "key", "POST /api/v1/maps", "0" * 64)
         claim_idempotency_key(session, made, lease_seconds=1, life_seconds=-1)
         forgotten = PresignedUpload(
-            map_id=house.map_id,
+            map_id=chunk_map.map_id,
             filename="a.jpg",
             size_bytes=1,
             sha256="0" * 64,
@@ -119,17 +124,17 @@ def test_each_duty_is_done_by_the_loop(
         )
         session.add(forgotten)
         session.flush()
-    house.store.put(incoming_key(forgotten.id), b"never completed")
-    steward = Scheduler(house.catalog, house.store, hints, soon)
+    chunk_map.store.put(incoming_key(forgotten.id), b"never completed")
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, hints, soon)
     stop = threading.Event()
     steward.tasks.append(PeriodicTask("stop", 0.0, stop.set))
     steward.run(stop)
-    assert house.live() == [(0, 2)]
-    assert house.objects("originals/") == set()
-    assert house.objects("incoming/") == set()
+    assert chunk_map.live() == [(0, 2)]
+    assert chunk_map.objects("originals/") == set()
+    assert chunk_map.objects("incoming/") == set()
     assert hints.wait(0)
-    house.check_rows(kept)
-    with house.catalog.read() as session:
+    chunk_map.check_rows(retained)
+    with chunk_map.catalog.read() as session:
         assert session.scalars(select(IdempotencyRecord.id)).all() == []
         assert session.scalars(select(PresignedUpload.id)).all() == []
         assert session.get_one(Job, lost).state == JobState.QUEUED
@@ -137,44 +142,47 @@ def test_each_duty_is_done_by_the_loop(
         assert fit.map_id == other
 
 
-def test_a_lost_hint_is_sent_again_while_there_is_work(house: House) -> None:
+def test_a_lost_hint_is_sent_again_while_there_is_work(chunk_map: ChunkMap) -> None:
     hints = InProcessWakeups()
-    resend_hints(house.catalog, hints)
+    resend_hints(chunk_map.catalog, hints)
     assert not hints.wait(0)
-    add_one_job(house, JobKind.INDEX, waiting_for="vocabulary")
-    add_one_job(house, JobKind.INDEX, run_after=db_now_plus(60))
-    resend_hints(house.catalog, hints)
+    add_one_job(chunk_map, JobKind.INDEX, waiting_for="vocabulary")
+    add_one_job(chunk_map, JobKind.INDEX, run_after=db_now_plus(60))
+    resend_hints(chunk_map.catalog, hints)
     assert not hints.wait(0)  # no worker could do anything
-    add_one_job(house, JobKind.INDEX)
-    resend_hints(house.catalog, hints)
+    add_one_job(chunk_map, JobKind.INDEX)
+    resend_hints(chunk_map.catalog, hints)
     assert hints.wait(0)
-    take(house.catalog)
-    resend_hints(house.catalog, hints)
+    take(chunk_map.catalog)
+    resend_hints(chunk_map.catalog, hints)
     assert not hints.wait(0)
 
 
 def test_jobs_of_an_abandoned_generation_vanish_after_the_grace(
-    house: House, store: FolderStore
+    chunk_map: ChunkMap, store: FolderStore
 ) -> None:
-    (photo_ids,) = house.chunks(3)
-    with house.catalog.write() as session:
+    (photo_ids,) = chunk_map.chunks(3)
+    with chunk_map.catalog.write() as session:
         given_up = add_generation(
-            session, house.map_id, GenerationState.ABANDONED, ended_at=db_now_plus(-HOUR_SECONDS)
+            session,
+            chunk_map.map_id,
+            GenerationState.ABANDONED,
+            ended_at=db_now_plus(-HOUR_SECONDS),
         ).id
         for photo_id in photo_ids:
             add_job(
                 session,
-                house.map_id,
+                chunk_map.map_id,
                 JobKind.REINDEX,
                 photo_id=photo_id,
                 generation_id=given_up,
                 state=JobState.CANCELLED,
             )
-    collect_ended_generations(house.catalog, store, 2 * HOUR_SECONDS)
-    assert count_jobs(house.catalog, given_up) == 3
-    collect_ended_generations(house.catalog, store, HOUR_SECONDS / 2)
-    assert count_jobs(house.catalog, given_up) == 0
-    house.check_rows(photo_ids)
+    collect_ended_generations(chunk_map.catalog, store, 2 * HOUR_SECONDS)
+    assert count_jobs(chunk_map.catalog, given_up) == 3
+    collect_ended_generations(chunk_map.catalog, store, HOUR_SECONDS / 2)
+    assert count_jobs(chunk_map.catalog, given_up) == 0
+    chunk_map.check_rows(photo_ids)
 
 
 def count_jobs(catalog: Catalog, generation_id: UUID) -> int:

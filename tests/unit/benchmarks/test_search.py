@@ -229,16 +229,16 @@ def test_a_wrong_answer_of_ours_is_a_missed_figure(
 
 
 def test_command_asks_for_what_its_options_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, object]] = []
+    requests: list[dict[str, object]] = []
 
     def fake(_progress: Progress, **options: object) -> Report:
-        asked.append(options)
+        requests.append(options)
         return Report("anything")
 
     monkeypatch.setattr("benchmarks.search.measure", fake)
     for arguments in ([], ["--long"], ["--photos", "5,3", "--load", "2"]):
         assert CliRunner().invoke(app, ["search", *arguments]).exit_code == 0
-    short, long, own = asked
+    short, long, own = requests
     assert (short["photos"], short["growth"], short["load_seconds"]) == ([2000], False, 0)
     assert short["dimensions"] == [512, 7168, 98_304]
     assert (long["photos"], long["growth"]) == ([1000, 5000, 10_000], True)

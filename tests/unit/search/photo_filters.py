@@ -110,21 +110,21 @@ def photo_filters(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> PhotoFi
     )
 
 
-def passes(photo: PhotoFilterValues, wanted: PhotoFilter) -> bool | None:
+def passes(photo: PhotoFilterValues, photo_filter: PhotoFilter) -> bool | None:
     """Whether the filter lets the photo pass; None on the very edge of its circle."""
     certain = [
-        wanted.box is None or _is_inside(photo, wanted.box),
-        wanted.captured_after is None
-        or (photo.captured_at is not None and photo.captured_at >= wanted.captured_after),
-        wanted.captured_before is None
-        or (photo.captured_at is not None and photo.captured_at <= wanted.captured_before),
-        wanted.place is None or photo.place == wanted.place,
-        all(tag in photo.tags for tag in wanted.tags),
-        wanted.ids is None or photo.photo_id in wanted.ids,
+        photo_filter.box is None or _is_inside(photo, photo_filter.box),
+        photo_filter.captured_after is None
+        or (photo.captured_at is not None and photo.captured_at >= photo_filter.captured_after),
+        photo_filter.captured_before is None
+        or (photo.captured_at is not None and photo.captured_at <= photo_filter.captured_before),
+        photo_filter.place is None or photo.place == photo_filter.place,
+        all(tag in photo.tags for tag in photo_filter.tags),
+        photo_filter.ids is None or photo.photo_id in photo_filter.ids,
     ]
     if not all(certain):
         return False
-    return True if wanted.near is None else _is_within(photo, wanted.near)
+    return True if photo_filter.near is None else _is_within(photo, photo_filter.near)
 
 
 def _is_within(photo: PhotoFilterValues, circle: Circle) -> bool | None:

@@ -49,7 +49,7 @@ def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
 
 
 def brute_force(
-    rows: Rows, query: Rows, k: int, asked: NDArray[np.bool_], min_score: float = -2.0
+    rows: Rows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
 ) -> list[tuple[UUID, float]]:
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
@@ -57,16 +57,16 @@ def brute_force(
     scored = [
         (-min(1.0, score), photo(number))
         for number, score in enumerate(scores.tolist())
-        if asked[number] and score >= min_score
+        if selected[number] and score >= min_score
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 
 
 def answer(
-    snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: SearchOptions
+    snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], question: SearchOptions
 ) -> SearchResult:
     """Of a query that comes alone."""
-    return executor.execute_query(snapshot, query, asked, question, QueryBatcher())
+    return executor.execute_query(snapshot, query, selected, question, QueryBatcher())
 
 
 def hits_of(found: SearchResult) -> list[tuple[UUID, float]]:
@@ -85,19 +85,19 @@ def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """A map of rows, with duplicates and zeros among them, and what it is asked."""
+    """A map of rows, with duplicates and zeros among them, and a query."""
 
     rows: Rows
     pieces: int
     query: Rows
-    asked: NDArray[np.bool_]
+    selected: NDArray[np.bool_]
     k: int
     min_score: float | None
 
     @property
     def expected(self) -> list[tuple[UUID, float]]:
         least = -2.0 if self.min_score is None else self.min_score
-        return brute_force(self.rows, self.query, self.k, self.asked, least)
+        return brute_force(self.rows, self.query, self.k, self.selected, least)
 
 
 @st.composite
@@ -116,7 +116,7 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
         rows=rows,
         pieces=draw(st.integers(1, 4)),
         query=query,
-        asked=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
+        selected=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
         k=draw(st.sampled_from([1, 2, 10, 100, 400])),
         min_score=draw(st.sampled_from([None, 0.1])),
     )

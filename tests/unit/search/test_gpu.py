@@ -62,11 +62,11 @@ def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
 def test_answers_equal_brute_force_with_order_and_ties(case: Case, kind: str) -> None:
     pieces = min(case.pieces, len(case.rows))
     snapshot = on_device(snapshot_of(case.rows, pieces, "int8"), kind)
-    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score))
     assert hits_of(found) == case.expected
-    if case.asked.any() and case.query.any():
+    if case.selected.any() and case.query.any():
         assert found.certificate == "bound"
-        assert found.rows_scanned == int(case.asked.sum())
+        assert found.rows_scanned == int(case.selected.sum())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -100,11 +100,11 @@ def test_queries_of_a_batch_do_not_see_each_other(kind: str) -> None:
         for number, k, least in ((3, 1, -math.inf), (7, 20, 0.1), (50, 400, -math.inf))
     ]
     together = snapshot.gpu_snapshot.candidates(batch)
-    for asked, found in zip(batch, together, strict=True):
-        (alone,) = snapshot.gpu_snapshot.candidates([asked])
+    for searched, found in zip(batch, together, strict=True):
+        (alone,) = snapshot.gpu_snapshot.candidates([searched])
         np.testing.assert_array_equal(found.rows, alone.rows)
         assert found.floor == pytest.approx(alone.floor, abs=1e-6)
-        assert asked.row_mask[found.rows].all()
+        assert searched.row_mask[found.rows].all()
 
 
 def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:

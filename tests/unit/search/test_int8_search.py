@@ -37,12 +37,12 @@ def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION), mode=st.sampled_from([Mode.AUTO, Mode.DETERMINISTIC]))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case, mode: Mode) -> None:
     snapshot = snapshot_of(case.rows, case.pieces, "int8")
-    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score, mode))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score, mode))
     assert hits_of(found) == case.expected
-    if case.asked.any():
+    if case.selected.any():
         assert found.certificate == "bound"
         assert found.certified_k == len(found.hits)
-        assert found.rows_scanned == int(case.asked.sum())
+        assert found.rows_scanned == int(case.selected.sum())
         assert found.max_z is None
 
 

@@ -24,9 +24,9 @@ def fit_in_its_own_process(photos: int) -> dict[str, int]:
         check=False,
     )
     assert child.returncode == 0, child.stderr
-    said: dict[str, int] = json.loads(child.stdout)
-    assert (said["photos"], said["clusters"]) == (photos, CLUSTERS)
-    return said
+    body: dict[str, int] = json.loads(child.stdout)
+    assert (body["photos"], body["clusters"]) == (photos, CLUSTERS)
+    return body
 
 
 def test_a_fit_on_two_thousand_photos_takes_no_more_memory_than_one_on_five_hundred() -> None:

@@ -138,10 +138,10 @@ def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_pat
         "expected (64, 3, 7, 7)": tensors | {stem: torch.zeros(64, 1, 7, 7)},
         "is not a tensor": tensors | {stem: "a word"},
     }
-    for said, changed in faults.items():
+    for reported, changed in faults.items():
         error = refusal(saved(tmp_path / "other.ckpt", state | {"state_dict": changed}))
         assert error.code == "checkpoint_unfit"
-        assert said in error.detail
+        assert reported in error.detail
 
 
 @pytest.mark.parametrize(
