@@ -49,4 +49,4 @@ def test_a_killed_fetch_goes_on_where_it_was(tmp_path: Path) -> None:
         assert Path(fetched["path"]).is_relative_to(tmp_path / "hf" / "hub")
         # huggingface_hub asks for more than files.
         ranges = [part for path, part in server.requests if path == FILE]
-        assert requests == [f"bytes={BEGUN_BYTES}-"]
+        assert ranges == [f"bytes={BEGUN_BYTES}-"]
