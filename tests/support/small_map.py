@@ -22,7 +22,7 @@ from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
 from shared.storage import ObjectStore
 from shared.storage.chunks import encode_rows
-from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, delete
+from tests.support.catalog_rows import add_chunk, add_generation, add_map, delete, made_up_photo
 
 DIMENSION = 12
 NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
@@ -72,7 +72,9 @@ class SmallMap:
         `about` returns the columns of `Photo` for a row.
         """
         with self.catalog.write() as session:
-            photo_ids = [add_photo(session, self.map_id, **about(n)).id for n in range(len(rows))]
+            photos = [Photo(**made_up_photo(self.map_id, **about(n))) for n in range(len(rows))]
+            session.add_all(photos)
+            photo_ids = [photo.id for photo in photos]
         add_chunk(
             self.catalog, self.store, self.generation_id, photo_ids, rows=rows, slot=slot, dead=dead
         )

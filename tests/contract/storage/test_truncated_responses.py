@@ -13,6 +13,8 @@ from tests.support.servers import start_moto
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.s3 import S3Server
 
+pytestmark = pytest.mark.servers
+
 KEY, BODY = "a/b", bytes(range(256))
 STEP_BYTES = 7  # a prime: the places differ from one line of an answer's head to the next
 LONGEST_BYTES = 3000
