@@ -110,7 +110,7 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
 
 
 @pytest.mark.parametrize(
-    "wanted",
+    "params",
     [
         {},
         {"name": "", "scopes": ["read"]},

@@ -137,7 +137,7 @@ def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "fields",
     [
         {},
         {"host": ""},
