@@ -11,7 +11,7 @@ import pytest
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
-from services.gateway.multipart_upload import (
+from services.gateway.uploads.multipart import (
     MAX_FIELDS_BYTES,
     OVERHEAD_BYTES,
     STORE_WRITE_BYTES,

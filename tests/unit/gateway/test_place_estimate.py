@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.gateway.schemas import EstimateResponse
-from services.gateway.similarity_search import estimate_place, locate_hits
+from services.gateway.similarity.estimate import estimate_place, locate_hits
 from shared.catalog.photos import Photo
 from shared.evaluation.calibration import (
     FALSE_ACCEPT_RATE,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from services.gateway.similarity_search import select_ranking_weights
+from services.gateway.similarity.execute import select_ranking_weights
 from shared.catalog.generations import Generation
 from shared.config.settings import Settings
 from shared.evaluation.calibration import Calibration

@@ -15,7 +15,7 @@ from typing import Any
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.multipart_upload import MultipartFormParser, body_media_type
+from services.gateway.uploads.multipart import MultipartFormParser, body_media_type
 from shared.config.settings import Settings
 from shared.errors import (
     InvalidRequest,

@@ -21,8 +21,8 @@ from services.gateway.schemas import (
     SimilarityResponse,
     SimilarPhotoResponse,
 )
-from services.gateway.search_params import SearchParams
-from services.gateway.similarity_search import SimilarityQuery, run_similarity_search
+from services.gateway.similarity.execute import SimilarityQuery, run_similarity_search
+from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Search, get_map
 from shared.catalog.photos import get_live_photos
