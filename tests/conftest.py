@@ -42,9 +42,11 @@ COMPUTING = ("integration", "contract", "unit")
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: something always waits."""
-    return (os.cpu_count() or 1) + 1
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """`auto` is one more than there are cores, because some test always waits; `logical` is one
+    for each core."""
+    waiting = config.getoption("numprocesses") == "auto"
+    return (os.cpu_count() or 1) + int(waiting)
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` reads the markers
