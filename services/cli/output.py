@@ -12,12 +12,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
+from uuid import UUID
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from placewise.answers import Answer
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
 # Progress and messages go to stderr, so that the answer on stdout can be piped.
@@ -53,8 +55,25 @@ def printable_path(path: Path) -> str:
     return os.fsencode(path).decode("utf-8", "replace")
 
 
+Json = dict[str, Any]
+
+
 def print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    """Print a value as JSON; answers of the server as the server sent them."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=to_json))
+
+
+def to_json(value: Answer | UUID) -> Any:
+    """Convert an answer of the server, or an ID in it, to JSON."""
+    return str(value) if isinstance(value, UUID) else value.as_json()
+
+
+def print_result(result: Any, as_json: bool, message: str) -> None:
+    """Print the result of a command as JSON, or a message about it."""
+    if as_json:
+        print_json(result)
+    else:
+        console.print(message, soft_wrap=True, markup=False)
 
 
 @contextlib.contextmanager

@@ -16,51 +16,13 @@ from pydantic import BaseModel
 import placewise
 from placewise import answers
 from services.gateway import schemas
-from services.gateway.routes import batches, evaluations, maps
+from services.gateway.routes import batches, evaluations, keys, maps, models
 from services.gateway.routes import stats as figures
 from services.gateway.routes import stats as history
+from tests.support.api_responses import JOB, PHOTO, STARTED, UPLOADED
 from tests.unit.test_client import FakeServer, running_server
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
 
-JOB = {
-    "job_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-    "kind": "index",
-    "state": "succeeded",
-    "stage": None,
-    "waiting_for": None,
-    "awaited": None,
-    "progress": {"done": 1, "total": 1, "failed": 0},
-    "attempts": 1,
-    "file_id": None,
-    "result": None,
-    "error": None,
-    "created_at": "2026-11-21T05:46:58Z",
-    "started_at": None,
-    "finished_at": None,
-    "status_url": "/api/v1/jobs/01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-    "result_url": None,
-    "request_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-}
-PHOTO = {
-    "image_id": "01a1fca4-c1a2-7356-bf32-75e1cb64beb1",
-    "image_path": "/image",
-    "original_filename": "street.jpg",
-    "upload_time": "2026-11-21T05:46:58Z",
-    "file_size": 5,
-    "width": 4,
-    "height": 3,
-    "metadata": {},
-    "tags": ["a"],
-    "latitude": 45.5,
-    "longitude": None,
-    "heading": None,
-    "captured_at": None,
-    "place": None,
-    "role": "database",
-    "image_url": "/image",
-    "thumbnail_url": "/thumbnail",
-}
-STARTED = {"job_id": JOB["job_id"], "status": "queued", "status_url": "/", "result_url": None}
 SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Photo, schemas.PhotoResponse),
     (answers.OnePhoto, schemas.PhotoDetailResponse),
@@ -81,6 +43,12 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Search, history.SearchHistoryEntry),
     (answers.Map, maps.MapResponse),
     (answers.Stats, figures.StatsResponse),
+    (answers.WordWeights, evaluations.WordWeightsResponse),
+    (answers.DeletedMap, maps.DeletedMapResponse),
+    (answers.AddedModel, models.ModelResponse),
+    (answers.RemovedModel, models.RemovedModelResponse),
+    (answers.Key, keys.KeyResponse),
+    (answers.CreatedKey, keys.CreatedKeyResponse),
 ]
 
 
@@ -179,18 +147,7 @@ def test_waiting_ends_when_its_time_is_over(server: FakeServer) -> None:
 def test_asynchronous_client_uploads_waits_and_lists(server: FakeServer, tmp_path: Path) -> None:
     path = tmp_path / "street.jpg"
     path.write_bytes(b"the photo's bytes" * 100_000)
-    uploaded = {
-        "file_id": PHOTO["image_id"],
-        "job_id": JOB["job_id"],
-        "filename": "street.jpg",
-        "file_size": 5,
-        "upload_time": "2026-11-21T05:46:58Z",
-        "status": "queued",
-        "status_url": "/",
-        "already_there": False,
-        "message": "",
-    }
-    server.will_answer(202, uploaded)
+    server.will_answer(202, UPLOADED)
     server.will_answer(200, JOB)
     server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
 
