@@ -77,10 +77,10 @@ def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
     outside = [a for a in outcomes if not a.in_map]
     accepted = [a for a in outcomes if a.estimate.in_map]
     errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    confidences = [a.estimate.confidence for a in outcomes]
+    confidences = [a.estimate.confidence for a in outcomes if a.estimate.confidence is not None]
     # Without an estimated location, the best photo decides whether the result is correct.
     right = [a.right or (a.estimate.in_map is False and a.best_is_correct) for a in outcomes]
-    is_calibrated = None not in confidences
+    is_calibrated = len(confidences) == len(outcomes)
     return {
         "queries": len(outcomes),
         "out_of_map": len(outside),

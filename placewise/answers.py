@@ -21,7 +21,7 @@ FINISHED = ("succeeded", "failed", "cancelled")
 class Answer(BaseModel):
     """Base class of all responses."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")
+    model_config = ConfigDict(frozen=True, extra="allow", defer_build=True)
 
     def as_json(self) -> dict[str, Any]:
         """Return the response as the server sent it, for `json.dumps`."""

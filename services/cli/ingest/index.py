@@ -38,7 +38,7 @@ from services.cli.output import (
     progress_bar,
     report_errors,
 )
-from shared.catalog.photos import PhotoRole
+from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest
 
 
