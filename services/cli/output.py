@@ -10,21 +10,22 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from operator import methodcaller
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
-from uuid import UUID
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from placewise.answers import Answer
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
 # Progress and messages go to stderr, so that the answer on stdout can be piped.
 err_console = Console(stderr=True, highlight=False)
 console = Console(highlight=False)
+
+Json = dict[str, Any]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 MapOption = Annotated[
@@ -55,17 +56,9 @@ def printable_path(path: Path) -> str:
     return os.fsencode(path).decode("utf-8", "replace")
 
 
-Json = dict[str, Any]
-
-
 def print_json(value: Any) -> None:
     """Print a value as JSON; answers of the server as the server sent them."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=to_json))
-
-
-def to_json(value: Answer | UUID) -> Any:
-    """Convert an answer of the server, or an ID in it, to JSON."""
-    return str(value) if isinstance(value, UUID) else value.as_json()
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json")))
 
 
 def print_result(result: Any, as_json: bool, message: str) -> None:
