@@ -258,17 +258,17 @@ def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
 
 
 @given(
-    wanted=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
+    sizes=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
     budget=st.integers(0, 300),
 )
 def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
-    params: dict[UUID, list[int]], budget: int
+    sizes: dict[UUID, list[int]], budget: int
 ) -> None:
-    counts = allocate_parts(params, budget)
-    left = budget - sum(sum(params[key][:count]) for key, count in counts.items())
+    counts = allocate_parts(sizes, budget)
+    left = budget - sum(sum(sizes[key][:count]) for key, count in counts.items())
     assert left >= 0
     for key, count in counts.items():
-        assert count == len(params[key]) or params[key][count] > left
+        assert count == len(sizes[key]) or sizes[key][count] > left
 
 
 def test_first_parts_of_all_go_before_the_second_part_of_any() -> None:
