@@ -91,7 +91,7 @@ class ModelRegistry:
             precision: Precision of an existing generation (see `extractor_of_generation`); by
                 default that of new generations, PRECISION.
         """
-        recipe = self._settings.recipe(name)
+        recipe = self._settings.extractor_config(name)
         if precision is None:
             precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
