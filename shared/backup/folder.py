@@ -34,8 +34,17 @@ from shared.config.private_files import FILE_MODE, FOLDER_MODE, make_private_fol
 from shared.errors import Conflict, Misconfigured
 from shared.storage import ObjectStore
 from shared.storage.copying import copy_object
-from shared.storage.folder import OWNER_MARK, FolderStore
-from shared.storage.keys import FEATURES, INCOMING, ORIGINALS, QUERIES, TRASH, WORK, is_original_key
+from shared.storage.folder import FolderStore
+from shared.storage.keys import (
+    FEATURES,
+    INCOMING,
+    ORIGINALS,
+    OWNER_MARK,
+    QUERIES,
+    TRASH,
+    WORK,
+    is_original_key,
+)
 from shared.storage.protocol import ObjectInfo
 
 BACKUP_FORMAT = 1

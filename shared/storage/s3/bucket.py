@@ -32,7 +32,8 @@ from urllib3.exceptions import (
 from urllib3.response import BaseHTTPResponse
 
 from shared.config.settings import Settings
-from shared.errors import Misconfigured, NotFound, PlacewiseError, StorageFull, Unavailable
+from shared.errors import Misconfigured, PlacewiseError, StorageFull, Unavailable
+from shared.storage.keys import object_not_found_error
 
 log = logging.getLogger(__name__)
 
@@ -188,7 +189,7 @@ class Bucket:
     def _translate_s3_error(self, error: S3Error, key: str | None) -> PlacewiseError:
         code = error.code or ""
         if code in NO_SUCH_KEY_CODES and key is not None:
-            return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
+            return object_not_found_error(key)
         if code in NO_SUCH_BUCKET_CODES:
             return self.missing_error()
         log.warning("the object store at %s rejected a request: %s", self.endpoint, error)

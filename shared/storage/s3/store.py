@@ -25,8 +25,7 @@ from minio.helpers import queryencode
 from minio.time import to_amz_date
 
 from shared.errors import NotFound, StorageFull, Unavailable
-from shared.storage.folder import OWNER_MARK
-from shared.storage.keys import TRASH, check_key, is_valid_key
+from shared.storage.keys import TRASH, check_key, check_note_name
 from shared.storage.protocol import ObjectInfo, PresignedPut
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
 from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, open_object, read_range
@@ -179,22 +178,22 @@ class S3Store:
         self.copy(source, target)
         self.delete(source)
 
-    def free_trash(self, least_free_bytes: int) -> int:
+    def free_trash(self, min_free_bytes: int) -> int:
         return 0  # the server's disk is not local; `_free_space_and_retry` handles a full one
 
     def read_note(self, name: str) -> bytes | None:
         try:
-            return self.get(_note(name))
+            return self.get(check_note_name(name))
         except NotFound:
             return None
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
         # Not every server supports conditional writes: the caller reads the note again.
         if replace or self.read_note(name) is None:
-            self.put(_note(name), data)
+            self.put(check_note_name(name), data)
 
     def delete_note(self, name: str) -> None:
-        self.delete(_note(name))
+        self.delete(check_note_name(name))
 
     def _free_space_and_retry(self, send: Callable[[], T]) -> T:
         """Call `send`; when the store is full, empty the trash and retry once."""
@@ -227,9 +226,3 @@ class S3Store:
             if not self.bucket.client.bucket_exists(self.bucket.name):
                 raise self.bucket.missing_error()
         MultipartUpload(self.bucket, PROBE_KEY).abort()
-
-
-def _note(name: str) -> str:
-    if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
-        raise ValueError(f"not the name of a note: {name!r}")
-    return name
