@@ -136,7 +136,6 @@ class BatchItemsResponse(ResponseModel):
     BATCH_UPLOAD_PATH,
     operation_id="upload_batch",
     status_code=202,
-    response_model=BatchAcceptedResponse,
     openapi_extra=REQUEST_BODY,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
@@ -165,12 +164,7 @@ async def upload_batch(
     return accepted
 
 
-@router.get(
-    "/jobs/{job_id}/items",
-    operation_id="list_batch_items",
-    response_model=BatchItemsResponse,
-    dependencies=[READ],
-)
+@router.get("/jobs/{job_id}/items", operation_id="list_batch_items", dependencies=[READ])
 def read_batch_items(
     gateway: GatewayDep,
     job_id: JobId,

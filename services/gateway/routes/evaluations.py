@@ -88,11 +88,7 @@ class EvaluationsResponse(ResponseModel):
 
 
 @router.post(
-    "/evaluations",
-    operation_id="evaluate",
-    status_code=202,
-    response_model=JobAcceptedResponse,
-    dependencies=[WRITE, ADMIT_JOB],
+    "/evaluations", operation_id="evaluate", status_code=202, dependencies=[WRITE, ADMIT_JOB]
 )
 def start_evaluation(
     gateway: GatewayDep,
@@ -121,12 +117,7 @@ def start_evaluation(
     return accept_job(response, job, map_name)
 
 
-@router.get(
-    "/evaluations",
-    operation_id="list_evaluations",
-    response_model=EvaluationsResponse,
-    dependencies=[READ],
-)
+@router.get("/evaluations", operation_id="list_evaluations", dependencies=[READ])
 def read_evaluations(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
@@ -214,7 +205,6 @@ GenerationIdPath = Annotated[GenerationId, PathParameter(description="a generati
     "/generations/{generation_id}/word-weights",
     operation_id="learn_word_weights",
     status_code=202,
-    response_model=JobAcceptedResponse,
     dependencies=[WRITE, ADMIT_JOB],
 )
 def start_word_weights_fit(
@@ -253,7 +243,6 @@ def start_word_weights_fit(
 @router.get(
     "/generations/{generation_id}/word-weights",
     operation_id="read_word_weights",
-    response_model=WordWeightsResponse,
     dependencies=[READ],
 )
 def read_word_weights(

@@ -40,7 +40,7 @@ CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachabl
 HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
-@router.get("/jobs", operation_id="list_jobs", response_model=JobsResponse, dependencies=[READ])
+@router.get("/jobs", operation_id="list_jobs", dependencies=[READ])
 def read_jobs(
     gateway: GatewayDep,
     state: Annotated[list[JobState] | None, Query()] = None,
@@ -61,9 +61,7 @@ def read_jobs(
     )
 
 
-@router.get(
-    "/jobs/{job_id}", operation_id="get_job", response_model=JobResponse, dependencies=[READ]
-)
+@router.get("/jobs/{job_id}", operation_id="get_job", dependencies=[READ])
 async def read_job_status(
     gateway: GatewayDep,
     job_id: JobId,
@@ -108,12 +106,7 @@ async def stream_job_events(
     )
 
 
-@router.post(
-    "/jobs/{job_id}/cancel",
-    operation_id="cancel_job",
-    response_model=JobResponse,
-    dependencies=[WRITE],
-)
+@router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", dependencies=[WRITE])
 def cancel_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:
@@ -136,12 +129,7 @@ def cancel_job_by_id(
     return gateway.catalog.run(cancel)
 
 
-@router.post(
-    "/jobs/{job_id}/retry",
-    operation_id="retry_job",
-    response_model=JobResponse,
-    dependencies=[WRITE, ADMIT_JOB],
-)
+@router.post("/jobs/{job_id}/retry", operation_id="retry_job", dependencies=[WRITE, ADMIT_JOB])
 def retry_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:

@@ -65,9 +65,7 @@ class CreatedKeyResponse(KeyResponse):
     key: str = Field(description="the secret key; it is shown only once")
 
 
-@router.get(
-    "/keys", operation_id="list_keys", response_model=list[KeyResponse], dependencies=[ADMIN]
-)
+@router.get("/keys", operation_id="list_keys", dependencies=[ADMIN])
 def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
     """List all keys, newest first, including revoked ones. The secrets are not stored."""
     with gateway.catalog.read() as session:
@@ -76,13 +74,7 @@ def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
         ]
 
 
-@router.post(
-    "/keys",
-    operation_id="create_key",
-    status_code=201,
-    response_model=CreatedKeyResponse,
-    dependencies=[ADMIN],
-)
+@router.post("/keys", operation_id="create_key", status_code=201, dependencies=[ADMIN])
 def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
     """Create a key. The secret is shown only in this response and is not stored.
 
@@ -98,9 +90,7 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
         return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(api_key), "key": secret})
 
 
-@router.delete(
-    "/keys/{key_id}", operation_id="revoke_key", response_model=KeyResponse, dependencies=[ADMIN]
-)
+@router.delete("/keys/{key_id}", operation_id="revoke_key", dependencies=[ADMIN])
 def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
     """Revoke a key. All gateways refuse it at once; it stays in the list."""
     with gateway.catalog.write() as session:

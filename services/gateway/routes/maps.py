@@ -87,22 +87,14 @@ class DeletedMapResponse(ResponseModel):
     deleted_map: str
 
 
-@router.get(
-    "/maps", operation_id="list_maps", response_model=list[MapResponse], dependencies=[READ]
-)
+@router.get("/maps", operation_id="list_maps", dependencies=[READ])
 def read_maps(gateway: GatewayDep) -> list[MapResponse]:
     """List all maps by name."""
     with gateway.catalog.read() as session:
         return [_map_response(session, map_) for map_ in list_maps(session)]
 
 
-@router.post(
-    "/maps",
-    operation_id="create_map",
-    status_code=201,
-    response_model=MapResponse,
-    dependencies=[WRITE],
-)
+@router.post("/maps", operation_id="create_map", status_code=201, dependencies=[WRITE])
 def create_new_map(
     gateway: GatewayDep, body: CreateMapRequest, idempotent: IdempotentDep
 ) -> MapResponse:
@@ -119,19 +111,14 @@ def create_new_map(
     return response
 
 
-@router.get("/maps/{name}", operation_id="get_map", response_model=MapResponse, dependencies=[READ])
+@router.get("/maps/{name}", operation_id="get_map", dependencies=[READ])
 def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     """Get one map."""
     with gateway.catalog.read() as session:
         return _map_response(session, get_map(session, name))
 
 
-@router.delete(
-    "/maps/{name}",
-    operation_id="delete_map",
-    response_model=DeletedMapResponse,
-    dependencies=[WRITE],
-)
+@router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE])
 def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
     """Delete a map with all its photos. An empty map `default` is created again.
 

@@ -87,11 +87,7 @@ class StartGenerationRequest(BaseModel):
 
 
 @router.post(
-    "/vocabularies",
-    operation_id="fit_vocabulary",
-    status_code=202,
-    response_model=JobAcceptedResponse,
-    dependencies=[WRITE, ADMIT_JOB],
+    "/vocabularies", operation_id="fit_vocabulary", status_code=202, dependencies=[WRITE, ADMIT_JOB]
 )
 def start_vocabulary_fit(
     gateway: GatewayDep,
@@ -119,7 +115,6 @@ def start_vocabulary_fit(
     "/vocabularies/import",
     operation_id="import_vocabulary",
     status_code=202,
-    response_model=JobAcceptedResponse,
     openapi_extra=multipart_schema(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
         "(clusters, dimension) floats"
@@ -152,12 +147,7 @@ async def start_vocabulary_import(
     return _model_change_response(gateway, response, job, map_name)
 
 
-@router.get(
-    "/vocabularies",
-    operation_id="list_vocabularies",
-    response_model=list[VocabularyResponse],
-    dependencies=[READ],
-)
+@router.get("/vocabularies", operation_id="list_vocabularies", dependencies=[READ])
 def read_vocabularies(
     gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
 ) -> list[VocabularyResponse]:
@@ -203,12 +193,7 @@ def read_vocabulary_file(
     )
 
 
-@router.get(
-    "/generations",
-    operation_id="list_generations",
-    response_model=list[GenerationResponse],
-    dependencies=[READ],
-)
+@router.get("/generations", operation_id="list_generations", dependencies=[READ])
 def read_generations(
     gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
 ) -> list[GenerationResponse]:
@@ -224,7 +209,6 @@ def read_generations(
     "/generations",
     operation_id="start_generation",
     status_code=202,
-    response_model=JobAcceptedResponse,
     dependencies=[WRITE, ADMIT_JOB],
 )
 def start_generation(

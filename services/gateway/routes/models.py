@@ -115,7 +115,6 @@ class RemovedModelResponse(ResponseModel):
     "/models",
     operation_id="add_model",
     status_code=202,
-    response_model=JobAcceptedResponse,
     openapi_extra=multipart_schema(
         "a checkpoint (`.ckpt`) of `placewise train`",
         ["name"],
@@ -162,9 +161,7 @@ async def upload_model(
     return accept_job(response, job, map_name)
 
 
-@router.get(
-    "/models", operation_id="list_models", response_model=ModelsResponse, dependencies=[READ]
-)
+@router.get("/models", operation_id="list_models", dependencies=[READ])
 def read_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
@@ -172,21 +169,14 @@ def read_models(gateway: GatewayDep) -> ModelsResponse:
     return ModelsResponse(models=models)
 
 
-@router.get(
-    "/models/{name}", operation_id="get_model", response_model=ModelResponse, dependencies=[READ]
-)
+@router.get("/models/{name}", operation_id="get_model", dependencies=[READ])
 def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:
         return ModelResponse.of(session, get_registered_model(session, name))
 
 
-@router.delete(
-    "/models/{name}",
-    operation_id="remove_model",
-    response_model=RemovedModelResponse,
-    dependencies=[ADMIN],
-)
+@router.delete("/models/{name}", operation_id="remove_model", dependencies=[ADMIN])
 def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelResponse:
     """Remove a model; 409 (`model_in_use`) while a map uses it.
 

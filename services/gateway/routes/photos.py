@@ -49,12 +49,7 @@ IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get(
-    "/uploads/{file_id}",
-    operation_id="get_photo",
-    response_model=PhotoDetailResponse,
-    dependencies=[READ],
-)
+@router.get("/uploads/{file_id}", operation_id="get_photo", dependencies=[READ])
 def read_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> PhotoDetailResponse:
@@ -97,12 +92,7 @@ class PhotoUpdate(BaseModel):
         return columns
 
 
-@router.patch(
-    "/uploads/{file_id}",
-    operation_id="patch_photo",
-    response_model=PhotoDetailResponse,
-    dependencies=[WRITE],
-)
+@router.patch("/uploads/{file_id}", operation_id="patch_photo", dependencies=[WRITE])
 def patch_photo(
     gateway: GatewayDep,
     file_id: FileId,
@@ -122,12 +112,7 @@ def patch_photo(
         return _photo_detail_response(session, photo, map_name)
 
 
-@router.delete(
-    "/uploads/{file_id}",
-    operation_id="delete_photo",
-    response_model=DeletedPhotoResponse,
-    dependencies=[WRITE],
-)
+@router.delete("/uploads/{file_id}", operation_id="delete_photo", dependencies=[WRITE])
 def delete_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> DeletedPhotoResponse:
@@ -200,12 +185,7 @@ def read_thumbnail(
     return Response(data, media_type="image/jpeg")
 
 
-@router.get(
-    "/search",
-    operation_id="search_metadata",
-    response_model=MetadataSearchResponse,
-    dependencies=[READ],
-)
+@router.get("/search", operation_id="search_metadata", dependencies=[READ])
 def search_photos_by_metadata(
     gateway: GatewayDep,
     photos: FilterDep,

@@ -99,7 +99,6 @@ class PresignResponse(ResponseModel):
     "/uploads/presign",
     operation_id="presign_upload",
     status_code=201,
-    response_model=PresignResponse,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
 def create_presigned_upload(
@@ -157,7 +156,6 @@ def create_presigned_upload(
     "/uploads/presign/{upload_id}/complete",
     operation_id="complete_upload",
     status_code=202,
-    response_model=UploadResponse,
     responses=UPLOAD_RESPONSES,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )

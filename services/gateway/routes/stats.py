@@ -54,12 +54,7 @@ class SearchHistoryResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get(
-    "/searches",
-    operation_id="list_searches",
-    response_model=SearchHistoryResponse,
-    dependencies=[READ],
-)
+@router.get("/searches", operation_id="list_searches", dependencies=[READ])
 def read_searches(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
@@ -98,12 +93,7 @@ class StatsResponse(ResponseModel):
     counted_at: datetime = Field(description="when the statistics were computed")
 
 
-@router.get(
-    "/database/stats",
-    operation_id="database_stats",
-    response_model=StatsResponse,
-    dependencies=[READ],
-)
+@router.get("/database/stats", operation_id="database_stats", dependencies=[READ])
 def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsResponse:
     """Get statistics of a map. Search times cover the last seven days.
 

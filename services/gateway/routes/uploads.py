@@ -69,7 +69,6 @@ UPLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
     "/upload",
     operation_id="upload",
     status_code=202,
-    response_model=UploadResponse,
     responses=UPLOAD_RESPONSES,
     openapi_extra=UPLOAD_FORM,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],

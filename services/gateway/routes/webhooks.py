@@ -94,25 +94,14 @@ class DeliveriesResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get(
-    "/webhooks",
-    operation_id="list_webhooks",
-    response_model=list[WebhookResponse],
-    dependencies=[ADMIN],
-)
+@router.get("/webhooks", operation_id="list_webhooks", dependencies=[ADMIN])
 def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
     """List webhooks, newest first, without their secrets."""
     with gateway.catalog.read() as session:
         return [WebhookResponse.of(webhook) for webhook in list_webhooks(session)]
 
 
-@router.post(
-    "/webhooks",
-    operation_id="create_webhook",
-    status_code=201,
-    response_model=CreatedWebhookResponse,
-    dependencies=[ADMIN],
-)
+@router.post("/webhooks", operation_id="create_webhook", status_code=201, dependencies=[ADMIN])
 def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
     """Create a webhook: events are POSTed to the URL, signed with the returned secret.
 
@@ -131,12 +120,7 @@ def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> Created
         return CreatedWebhookResponse(**fields, secret=webhook.secret)
 
 
-@router.delete(
-    "/webhooks/{webhook_id}",
-    operation_id="delete_webhook",
-    response_model=WebhookResponse,
-    dependencies=[ADMIN],
-)
+@router.delete("/webhooks/{webhook_id}", operation_id="delete_webhook", dependencies=[ADMIN])
 def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
     """Delete a webhook, its pending deliveries and its delivery log."""
     with gateway.catalog.write() as session:
@@ -144,10 +128,7 @@ def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookR
 
 
 @router.get(
-    "/webhooks/{webhook_id}/deliveries",
-    operation_id="list_deliveries",
-    response_model=DeliveriesResponse,
-    dependencies=[ADMIN],
+    "/webhooks/{webhook_id}/deliveries", operation_id="list_deliveries", dependencies=[ADMIN]
 )
 def read_deliveries(
     gateway: GatewayDep,
