@@ -27,7 +27,7 @@ from fastapi import Depends, Request
 
 from services.gateway.authentication import Caller, get_caller
 from services.gateway.concurrency import ConcurrencyLimit
-from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName
+from services.gateway.dependencies import GatewayDep, get_map_name
 from shared.catalog.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
@@ -168,8 +168,8 @@ def get_admission_control(request: Request) -> AdmissionControl:
 AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
 
 
-def _admit_job(admission: AdmissionDep, map_name: MapName = DEFAULT_MAP) -> None:
-    admission.admit_job(map_name)
+def _admit_job(request: Request, admission: AdmissionDep) -> None:
+    admission.admit_job(get_map_name(request))
 
 
 def _admit_query(admission: AdmissionDep) -> None:

@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
-from services.gateway.dependencies import GatewayContext, GatewayDep
+from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
 from shared.catalog.database_errors import to_unavailable
 from shared.catalog.maps import Map
@@ -20,7 +20,7 @@ from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull
 
 probe_router = APIRouter(tags=["operations"])
-router = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
 
 STATUSES_WORST_FIRST = ("unhealthy", "degraded", "healthy")
 

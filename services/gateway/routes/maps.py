@@ -12,11 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import DEFAULT_MAP, NO_NUL_PATTERN, GatewayDep
+from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import ResponseModel
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import (
+    DEFAULT_MAP,
     MAP_NAME_PATTERN,
     Map,
     create_map,
@@ -33,7 +34,7 @@ from shared.errors import Misconfigured, invalid_field_error
 from shared.jobs import Job
 from shared.jobs.transitions import cancel_jobs
 
-router = APIRouter(tags=["maps"])
+router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
 
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)

@@ -84,8 +84,7 @@ def start_comparison_of_stored_photo(
     """Searches with a stored photo and queues a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
     with gateway.catalog.write() as session:
-        session.add_all([job, history])
-        session.flush()
+        session.add(history)
         idempotent.store_job_response(session, job)
     gateway.hints.send(WakeupQueue.QUERY)
     return job
