@@ -14,7 +14,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy import select
@@ -40,10 +39,6 @@ from shared.search_api.protocol import IndexPart, ReplicationLag
 from shared.storage import ObjectStore
 from shared.storage.chunks import CODED_DIMENSION
 from shared.storage.read_retries import ReadRetries
-
-if TYPE_CHECKING:
-    from shared.codes.int8_codes import Int8Codes
-
 
 log = logging.getLogger(__name__)
 
@@ -141,7 +136,7 @@ def sync_snapshot(
         _compile_kernels(loaded)
     loader.evict_except(loaded)
     mid_dimension = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
-    if (mid_dimension and large) or (old is not None and old.has_int8_codes):
+    if mid_dimension and large:
         loaded = _attach_int8_to_all(loader, loaded)
     return _apply_memory_budget(
         memory_budget,
@@ -152,24 +147,6 @@ def sync_snapshot(
             chunks=tuple(loaded),
             missing=tuple(missing),
         ),
-    )
-
-
-def with_int8_codes(
-    store: ObjectStore,
-    folder: Path,
-    memory_budget: MemoryBudget,
-    old: Snapshot,
-    built: Mapping[UUID, Int8Codes],
-) -> Snapshot:
-    """Return the snapshot with int8 codes of every chunk.
-
-    Codes in `built`, by chunk id, are used; the others are loaded or computed.
-    """
-    loader = generation_loader(store, folder, old.generation_id)
-    return _apply_memory_budget(
-        memory_budget,
-        replace(old, chunks=tuple(_attach_int8(loader, c, built) for c in old.chunks)),
     )
 
 
@@ -207,7 +184,7 @@ def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[
     Without codes every row is compared, with the same results.
     """
     try:
-        return [_attach_int8(loader, chunk, {}) for chunk in chunks]
+        return [_attach_int8(loader, chunk) for chunk in chunks]
     except OSError as error:
         log.error("int8 codes can't be stored, searching without them: %s", error)
         return [
@@ -216,13 +193,11 @@ def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[
         ]
 
 
-def _attach_int8(
-    loader: ChunkLoader, chunk: LoadedChunk, built: Mapping[UUID, Int8Codes]
-) -> LoadedChunk:
+def _attach_int8(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
     stored = chunk.stored
     if stored is None or stored.int8 is not None:
         return chunk
-    codes = built.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
+    codes = loader.load_int8_codes(chunk.object_key, stored)
     return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
 
 

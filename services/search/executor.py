@@ -16,7 +16,6 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import catalog_sync
 from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
@@ -165,22 +164,17 @@ def _score_rows(
         scored = _search_on_gpu(snapshot, query, row_mask, options)
         if scored is None and options.mode == Mode.AUTO and snapshot.has_sign_codes:
             scored = _search_by_sign_codes(snapshot, query, row_mask, options, batcher)
-    if scored is None and _uses_int8_codes(snapshot, options.mode, selected, options.k):
+    if (
+        scored is None
+        and options.mode != Mode.DENSE
+        and snapshot.has_int8_codes
+        and int8_codes_pay_off(selected, options.k, snapshot.dimension)
+    ):
         scored = _search_by_int8(snapshot, query, row_mask, options)
     if scored is None:
         rows, scores = scan_top_k(snapshot.chunks, query, options.k, row_mask)
         scored = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
     return scored
-
-
-def _uses_int8_codes(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
-    """Whether int8 codes exist, suit the mode, and are faster than a dense scan."""
-    suits_mode = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.has_sign_codes)
-    return (
-        suits_mode
-        and snapshot.has_int8_codes
-        and int8_codes_pay_off(selected, k, snapshot.dimension)
-    )
 
 
 def _mask_min_score(
@@ -219,19 +213,6 @@ def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
     row_bytes = 4 * dimension
     code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
-
-
-def needs_int8_codes(snapshot: Snapshot, row_mask: NDArray[np.bool_], k: int) -> bool:
-    """Whether a deterministic search would have to scan all rows because int8 codes are missing."""
-    if (
-        snapshot.has_int8_codes
-        or snapshot.gpu_snapshot
-        or snapshot.row_bytes < catalog_sync.MIN_CODED_BYTES
-    ):
-        return False
-    if not snapshot.chunks:
-        return False
-    return int8_codes_pay_off(int(np.count_nonzero(row_mask)), k, snapshot.dimension)
 
 
 def _search_on_gpu(

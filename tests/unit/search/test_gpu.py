@@ -147,13 +147,6 @@ def test_rows_that_do_not_fit_are_searched_by_the_cpu() -> None:
     found = residency.update(snapshot)
     assert found.gpu_snapshot is None
     assert not residency.needs_update(found), "it is tried again later, not at every look"
-    assert not residency.needs_int8_codes(found)
-    unbounded = replace(snapshot, chunks=tuple(replace(c, int8=None) for c in snapshot.chunks))
-    little = GpuResidency(device_with(90_000))
-    assert little.update(unbounded).gpu_snapshot is None
-    assert little.needs_int8_codes(unbounded), "a byte for each number would fit"
-    assert little.update(snapshot).gpu_snapshot is not None
-    assert not GpuResidency(device_with(1000)).needs_int8_codes(unbounded)
 
 
 def out_of_memory(*_: object, **__: object) -> Any:
