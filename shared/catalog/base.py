@@ -9,22 +9,39 @@ convert column values, with the same result from SQLite and PostgreSQL.
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 from uuid import UUID
 
-from sqlalchemy import JSON, BigInteger, Column, DateTime, Dialect, Index, MetaData, Uuid, text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Column,
+    DateTime,
+    Dialect,
+    Index,
+    MetaData,
+    Select,
+    Uuid,
+    func,
+    literal,
+    select,
+    text,
+)
 from sqlalchemy.dialects.postgresql import ARRAY, JSONB
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
+from shared.errors import NotFound
 from shared.geodesy import EARTH_RADIUS_M, flush_to_zero
 
 SQLITE_DISTANCE_FUNCTION = "placewise_distance_m"
 
 Condition = ColumnElement[bool]
+Row = TypeVar("Row")
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -74,9 +91,9 @@ class Base(DeclarativeBase):
     )
 
 
-def partial_index(name: str, *columns: Any, only: Condition) -> Index:
+def partial_index(name: str, *columns: Any, only: Condition, unique: bool = False) -> Index:
     """Return a partial index of the rows that match `only`."""
-    return Index(name, *columns, postgresql_where=only, sqlite_where=only)
+    return Index(name, *columns, unique=unique, postgresql_where=only, sqlite_where=only)
 
 
 class db_now(FunctionElement[datetime]):
@@ -181,6 +198,66 @@ def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
     # SQLite may be built without trigonometry: `session` registers this function with each
     # connection.
     return f"{SQLITE_DISTANCE_FUNCTION}({compiler.process(element.clauses, **kw)})"
+
+
+def for_update(statement: Select[Row]) -> Select[Row]:
+    """Lock the rows of a SELECT until the end of the transaction, and refresh loaded objects."""
+    return statement.with_for_update().execution_options(populate_existing=True)
+
+
+def page_newest_first(
+    session: Session, statement: Select[Row], id_column: Any, limit: int, before: UUID | None
+) -> list[Row]:
+    """Return up to `limit` rows by descending id (UUIDv7: newest first).
+
+    Args:
+        session: The session.
+        statement: SELECT of a table, with its conditions.
+        id_column: The id column of the table.
+        limit: Page size.
+        before: Cursor: the last id of the previous page, if any.
+    """
+    if before is not None:
+        statement = statement.where(id_column < before)
+    return list(session.scalars(statement.order_by(id_column.desc()).limit(limit)))
+
+
+def get_in_map(
+    session: Session, table: type[Row], map_id: UUID, row_id: UUID, *, lock: bool = False
+) -> Row:
+    """Return a row by its id and its map; NotFound (`job_not_found` for the table of jobs)."""
+    columns: Any = table
+    statement = select(table).where(columns.id == row_id, columns.map_id == map_id)
+    row = session.scalar(for_update(statement) if lock else statement)
+    if row is None:
+        noun = table.__name__.lower()
+        raise NotFound(
+            f"{noun}_not_found",
+            f"There is no {noun} {row_id} in this map.",
+            **{f"{noun}_id": str(row_id)},
+        )
+    return row
+
+
+def get_or_insert(session: Session, statement: Select[Row], row: Row) -> Row:
+    """Return the row that `statement` selects; if there is none, insert and return `row`."""
+    existing = session.scalar(statement)
+    if existing is not None:
+        return existing
+    try:
+        with session.begin_nested():
+            session.add(row)
+            session.flush()
+    except IntegrityError:  # another process inserted it between the two statements
+        return session.scalars(statement).one()
+    return row
+
+
+def count_rows(session: Session, statement: Select[Any], limit: int | None = None) -> int:
+    """Count the rows of a SELECT, up to `limit`."""
+    one_each = statement.with_only_columns(literal(1), maintain_column_froms=True)
+    rows = one_each.limit(limit).subquery()
+    return session.scalar(select(func.count()).select_from(rows)) or 0
 
 
 def affected_rows(result: Any) -> int:

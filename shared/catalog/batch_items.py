@@ -37,7 +37,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue
+from shared.catalog.base import Base, JsonValue, count_rows, for_update, partial_index
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority, WaitingFor
 from shared.catalog.maps import lock_map
@@ -81,12 +81,7 @@ class BatchItem(Base):
 
     __table_args__ = (
         Index("ix_batch_items_state", "job_id", "state", "number"),
-        Index(
-            "ix_batch_items_object_key",
-            "object_key",
-            postgresql_where=object_key.is_not(None),
-            sqlite_where=object_key.is_not(None),
-        ),
+        partial_index("ix_batch_items_object_key", "object_key", only=object_key.is_not(None)),
     )
 
 
@@ -166,18 +161,14 @@ def count_queued_photos(session: Session, limit: int) -> int:
 
     Photos that wait for a vocabulary don't count: a fit may need more of them.
     """
-    waiting = (
-        select(Job.id)
-        .where(
-            Job.state.in_(UNFINISHED_STATES),
-            Job.lease_token.is_(None),
-            Job.priority >= Priority.BATCH,
-            Job.kind == JobKind.INDEX,
-            Job.waiting_for.is_(None),
-        )
-        .limit(limit)
+    waiting = select(Job.id).where(
+        Job.state.in_(UNFINISHED_STATES),
+        Job.lease_token.is_(None),
+        Job.priority >= Priority.BATCH,
+        Job.kind == JobKind.INDEX,
+        Job.waiting_for.is_(None),
     )
-    return session.scalar(select(func.count()).select_from(waiting.subquery())) or 0
+    return count_rows(session, waiting, limit)
 
 
 def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
@@ -266,9 +257,4 @@ def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
 def lock_batch(session: Session, job: Job, token: UUID) -> Job | None:
     """Lock the map, then the batch; return the batch if it is still under the token."""
     lock_map(session, job.map_id)
-    return session.scalar(
-        select(Job)
-        .where(Job.id == job.id, Job.lease_token == token)
-        .with_for_update()
-        .execution_options(populate_existing=True)
-    )
+    return session.scalar(for_update(select(Job).where(Job.id == job.id, Job.lease_token == token)))

@@ -25,7 +25,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, UtcDateTime, db_now
+from shared.catalog.base import Base, UtcDateTime, count_rows, db_now, partial_index
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
@@ -53,19 +53,8 @@ class Chunk(Base):
     superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     __table_args__ = (
-        Index(
-            "ix_chunks_live",
-            "generation_id",
-            "slot",
-            postgresql_where=superseded_at.is_(None),
-            sqlite_where=superseded_at.is_(None),
-        ),
-        Index(
-            "ix_chunks_superseded",
-            "superseded_at",
-            postgresql_where=superseded_at.is_not(None),
-            sqlite_where=superseded_at.is_not(None),
-        ),
+        partial_index("ix_chunks_live", "generation_id", "slot", only=superseded_at.is_(None)),
+        partial_index("ix_chunks_superseded", "superseded_at", only=superseded_at.is_not(None)),
     )
 
 
@@ -155,15 +144,7 @@ def list_live_filter_values(
 
 def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos, of one role or of all, with a descriptor in the generation."""
-    statement = (
-        select(func.count())
-        .select_from(Descriptor)
-        .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
-    )
-    if role is not None:
-        statement = statement.where(Photo.role == role)
-    return session.scalar(statement) or 0
+    return count_rows(session, _select_described(generation_id, role))
 
 
 def estimate_described(session: Session, generation_id: UUID) -> int:
@@ -187,26 +168,22 @@ def count_searchable(session: Session, generation_id: UUID) -> int:
 
 def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:
     """Count the live geotagged photos of a role with a descriptor in the generation."""
-    geotagged = _select_geotagged(generation_id, role).subquery()
-    return session.scalar(select(func.count()).select_from(geotagged)) or 0
+    return count_rows(session, _select_described(generation_id, role).where(is_geotagged()))
 
 
 def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> bool:
     """Return whether `count_geotagged` is not 0."""
-    return session.scalar(_select_geotagged(generation_id, role).limit(1)) is not None
+    geotagged = _select_described(generation_id, role).where(is_geotagged())
+    return session.scalar(geotagged.limit(1)) is not None
 
 
-def _select_geotagged(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
-    return (
+def _select_described(generation_id: UUID, role: PhotoRole | None) -> Select[UUID]:
+    statement = (
         select(Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(
-            Descriptor.generation_id == generation_id,
-            Photo.deleted_at.is_(None),
-            Photo.role == role,
-            is_geotagged(),
-        )
+        .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
     )
+    return statement if role is None else statement.where(Photo.role == role)
 
 
 def allocate_slot(generation: Generation, rows: int, slot_rows: int) -> int:

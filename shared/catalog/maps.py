@@ -23,7 +23,6 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
-    Select,
     String,
     Text,
     Uuid,
@@ -35,7 +34,18 @@ from sqlalchemy import (
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now, db_now_plus
+from shared.catalog.base import (
+    Base,
+    Journaled,
+    JsonValue,
+    UtcDateTime,
+    count_rows,
+    db_now,
+    db_now_plus,
+    for_update,
+    get_or_insert,
+    page_newest_first,
+)
 from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import Job
@@ -90,13 +100,8 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
 def get_or_create_default_map(session: Session, extractor: str) -> Map:
     """Return the map named `default`, created on first use."""
-    existing = session.scalar(select(Map).where(Map.name == DEFAULT_MAP))
-    if existing is not None:
-        return existing
-    try:
-        return create_map(session, DEFAULT_MAP, extractor)
-    except Conflict:  # another process created it between the two statements
-        return get_map(session, DEFAULT_MAP)
+    named_default = select(Map).where(Map.name == DEFAULT_MAP)
+    return get_or_insert(session, named_default, Map(name=DEFAULT_MAP, extractor=extractor))
 
 
 def get_map(session: Session, name: str) -> Map:
@@ -118,12 +123,7 @@ def lock_map(session: Session, map_id: UUID) -> Map:
     Publishing, activation and deletion take this lock, so the state of the map that they read stays
     valid until they commit. SQLite has one writer and needs no row lock.
     """
-    return session.scalars(
-        select(Map)
-        .where(Map.id == map_id)
-        .with_for_update()
-        .execution_options(populate_existing=True)
-    ).one()
+    return session.scalars(for_update(select(Map).where(Map.id == map_id))).one()
 
 
 def increment_map_version(session: Session, map_id: UUID) -> int:
@@ -165,9 +165,7 @@ def list_searches(
 ) -> list[Search]:
     """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
     statement = select(Search).where(Search.map_id == map_id)
-    if before is not None:
-        statement = statement.where(Search.id < before)
-    return list(session.scalars(statement.order_by(Search.id.desc()).limit(limit)))
+    return page_newest_first(session, statement, Search.id, limit, before)
 
 
 MIN_STATISTICS_AGE_SECONDS = 30.0
@@ -221,15 +219,10 @@ def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, d
 
 def is_large_map(session: Session, map_id: UUID) -> bool:
     """Return whether the map has more than MAX_EXACT_COUNT photos, jobs or searches."""
-    row_selects: tuple[Select[Any], ...] = (
-        select(literal(1)).select_from(Photo).where(Photo.map_id == map_id),
-        select(literal(1)).select_from(Job).where(Job.map_id == map_id),
-        select(literal(1)).select_from(Search).where(Search.map_id == map_id),
-    )
     limit = MAX_EXACT_COUNT + 1
     return any(
-        session.scalar(select(func.count()).select_from(rows.limit(limit).subquery())) == limit
-        for rows in row_selects
+        count_rows(session, select(table.id).where(table.map_id == map_id), limit) == limit
+        for table in (Photo, Job, Search)
     )
 
 
@@ -238,14 +231,13 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
     day_ago = db_now_plus(-DAY_SECONDS)
-    searches = select(func.count()).select_from(Search).where(Search.map_id == map_id)
+    searches = select(Search.id).where(Search.map_id == map_id)
     average, longest = session.execute(
         select(func.avg(Search.processing_ms), func.max(Search.processing_ms)).where(
             Search.map_id == map_id, Search.searched_at > db_now_plus(-7 * DAY_SECONDS)
         )
     ).one()
     jobs = select(Job.state, func.count()).where(Job.map_id == map_id).group_by(Job.state)
-    recent = select(func.count()).select_from(Photo).where(live, Photo.uploaded_at > day_ago)
     geotagged = (
         [count_geotagged(session, generation.id, role) for role in PhotoRole]
         if generation
@@ -255,12 +247,12 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
         photos=count_live_photos(session, map_id, PhotoRole.DATABASE),
         labelled_queries=count_live_photos(session, map_id, PhotoRole.QUERY),
         photo_bytes=int(session.scalar(select(func.sum(Photo.size_bytes)).where(live)) or 0),
-        uploads_24h=session.scalar(recent) or 0,
+        uploads_24h=count_rows(session, select(Photo.id).where(live, Photo.uploaded_at > day_ago)),
         searchable=count_searchable(session, generation.id) if generation else 0,
         located=geotagged[0],
         located_queries=geotagged[1],
-        searches=session.scalar(searches) or 0,
-        searches_24h=session.scalar(searches.where(Search.searched_at > day_ago)) or 0,
+        searches=count_rows(session, searches),
+        searches_24h=count_rows(session, searches.where(Search.searched_at > day_ago)),
         average_ms=average,
         longest_ms=longest,
         jobs={str(state): count for state, count in session.execute(jobs)},

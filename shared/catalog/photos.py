@@ -26,7 +26,6 @@ from sqlalchemy import (
     Uuid,
     and_,
     column,
-    func,
     or_,
     select,
     update,
@@ -40,6 +39,7 @@ from shared.catalog.base import (
     Journaled,
     JsonValue,
     UtcDateTime,
+    count_rows,
     db_now,
     filename_trigrams,
     partial_index,
@@ -91,13 +91,8 @@ class Photo(Journaled, Base):
         CheckConstraint(
             "(latitude IS NULL) = (longitude IS NULL)", name="coordinates_come_in_pairs"
         ),
-        Index(
-            "uq_photos_live_sha256",
-            "map_id",
-            "sha256",
-            unique=True,
-            postgresql_where=deleted_at.is_(None),
-            sqlite_where=deleted_at.is_(None),
+        partial_index(
+            "uq_photos_live_sha256", "map_id", "sha256", only=deleted_at.is_(None), unique=True
         ),
         Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
         Index("ix_photos_map_changed", "map_id", "changed_version"),
@@ -142,12 +137,7 @@ class Photo(Journaled, Base):
             postgresql_using="gin",
             postgresql_where=deleted_at.is_(None),
         ).ddl_if(dialect="postgresql"),
-        Index(
-            "ix_photos_deleted",
-            "deleted_at",
-            postgresql_where=deleted_at.is_not(None),
-            sqlite_where=deleted_at.is_not(None),
-        ),
+        partial_index("ix_photos_deleted", "deleted_at", only=deleted_at.is_not(None)),
     )
 
 
@@ -228,14 +218,8 @@ def list_photos_changed_since(
 
 def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos of the map, of one role or of all."""
-    statement = (
-        select(func.count())
-        .select_from(Photo)
-        .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
-    )
-    if role is not None:
-        statement = statement.where(Photo.role == role)
-    return session.scalar(statement) or 0
+    statement = select(Photo.id).where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+    return count_rows(session, statement if role is None else statement.where(Photo.role == role))
 
 
 def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
