@@ -156,11 +156,7 @@ class IdempotentRequest:
         self._token = claimed
 
     def store_response(
-        self,
-        session: Session,
-        status: int,
-        body: BaseModel,
-        headers: dict[str, str] | None = None,
+        self, session: Session, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """Stores the response, in the transaction that executes the request.
 
@@ -230,10 +226,7 @@ def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
 
 
 async def idempotent_form_request(
-    request: Request,
-    response: Response,
-    gateway: GatewayDep,
-    key: IdempotencyKeyHeader = None,
+    request: Request, response: Response, gateway: GatewayDep, key: IdempotencyKeyHeader = None
 ) -> AsyncIterator[IdempotentRequest]:
     """Dependency for streamed bodies: the route calls `claim_form` or `claim_key` itself."""
     idempotent = IdempotentRequest(gateway, request, response, key)

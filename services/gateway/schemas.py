@@ -245,9 +245,7 @@ class JobResponse(ResponseModel):
             waiting_for=job.waiting_for,
             awaited=job.awaited,
             progress=JobProgress(
-                done=job.progress_done,
-                total=job.progress_total,
-                failed=job.progress_failed,
+                done=job.progress_done, total=job.progress_total, failed=job.progress_failed
             ),
             attempts=job.attempts,
             file_id=job.photo_id,

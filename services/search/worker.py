@@ -26,11 +26,7 @@ from services.search.catalog_sync import (
     sync_snapshot,
 )
 from services.search.chunk_loader import remove_stale_folders
-from services.search.executor import (
-    SearchOptions,
-    execute_query,
-    execute_weighted_query,
-)
+from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.query_batcher import QueryBatcher
 from services.search.residency import GpuResidency, MemoryBudget, open_search_device
@@ -41,7 +37,7 @@ from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
-from shared.search_api.protocol import NONE, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
@@ -233,23 +229,7 @@ class SearchWorker:
             most_seconds=request.most_seconds,
         )
         weighted = _weight_query(query, request.word_weights)
-        if weighted is None:
-            result = execute_query(snapshot, query, row_mask, options, self._batcher)
-        else:
-            result = execute_weighted_query(
-                snapshot, query, weighted, row_mask, options, self._batcher
-            )
-        return SearchResponse(
-            hits=result.hits,
-            # Missing chunks may contain better rows.
-            certificate=NONE if snapshot.missing else result.certificate,
-            certified_k=0 if snapshot.missing else result.certified_k,
-            rows_scanned=result.rows_scanned,
-            rows_reranked=result.rows_reranked,
-            max_z=result.max_z,
-            snapshot_version=snapshot.version,
-            missing=snapshot.missing,
-        )
+        return execute_query(snapshot, query, row_mask, options, self._batcher, weighted)
 
     @property
     def query_batcher(self) -> QueryBatcher:

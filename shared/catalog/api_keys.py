@@ -121,8 +121,7 @@ def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:
 def has_admin_key(session: Session) -> bool:
     """Return whether a valid key with the admin scope exists."""
     usable = select(ApiKey.scopes).where(
-        ApiKey.revoked_at.is_(None),
-        or_(ApiKey.expires_at.is_(None), ApiKey.expires_at > db_now()),
+        ApiKey.revoked_at.is_(None), or_(ApiKey.expires_at.is_(None), ApiKey.expires_at > db_now())
     )
     return any(Scope.ADMIN in scopes for scopes in session.scalars(usable))
 

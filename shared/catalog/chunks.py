@@ -10,19 +10,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    ForeignKey,
-    Index,
-    Integer,
-    Select,
-    String,
-    Text,
-    Uuid,
-    func,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, count_rows, db_now, partial_index
@@ -41,14 +29,16 @@ class Chunk(Base):
 
     __tablename__ = "chunks"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"), index=True)
-    slot: Mapped[int] = mapped_column(Integer)
-    object_key: Mapped[str] = mapped_column(Text, unique=True)
-    rows: Mapped[int] = mapped_column(Integer)
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
-    sha256: Mapped[str] = mapped_column(String(64))
-    sealed: Mapped[bool] = mapped_column(Boolean, default=False)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    generation_id: Mapped[UUID] = mapped_column(
+        sa.Uuid, sa.ForeignKey("generations.id"), index=True
+    )
+    slot: Mapped[int] = mapped_column(sa.Integer)
+    object_key: Mapped[str] = mapped_column(sa.Text, unique=True)
+    rows: Mapped[int] = mapped_column(sa.Integer)
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
+    sha256: Mapped[str] = mapped_column(sa.String(64))
+    sealed: Mapped[bool] = mapped_column(sa.Boolean, default=False)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
@@ -64,15 +54,15 @@ class Descriptor(Base):
     __tablename__ = "descriptors"
 
     generation_id: Mapped[UUID] = mapped_column(
-        Uuid, ForeignKey("generations.id"), primary_key=True
+        sa.Uuid, sa.ForeignKey("generations.id"), primary_key=True
     )
-    photo_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("photos.id"), primary_key=True)
-    chunk_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("chunks.id"))
-    row: Mapped[int] = mapped_column(Integer)
+    photo_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("photos.id"), primary_key=True)
+    chunk_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("chunks.id"))
+    row: Mapped[int] = mapped_column(sa.Integer)
 
     __table_args__ = (
-        Index("uq_descriptors_chunk_row", "chunk_id", "row", unique=True),
-        Index("ix_descriptors_photo", "photo_id"),
+        sa.Index("uq_descriptors_chunk_row", "chunk_id", "row", unique=True),
+        sa.Index("ix_descriptors_photo", "photo_id"),
     )
 
 
@@ -81,7 +71,7 @@ def find_descriptor(
 ) -> tuple[Descriptor, Chunk] | None:
     """Return the photo's descriptor in the generation and its chunk; None if there is none."""
     row = session.execute(
-        select(Descriptor, Chunk)
+        sa.select(Descriptor, Chunk)
         .join(Chunk, Chunk.id == Descriptor.chunk_id)
         .where(Descriptor.generation_id == generation_id, Descriptor.photo_id == photo_id)
     ).one_or_none()
@@ -99,7 +89,7 @@ def find_descriptor_rows(
     rows_by_key: dict[str, list[tuple[int, UUID]]] = {}
     for begin in range(0, len(photo_ids), IDS_PER_QUERY):
         located = session.execute(
-            select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
+            sa.select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
             .join(Chunk, Chunk.id == Descriptor.chunk_id)
             .where(
                 Descriptor.generation_id == generation_id,
@@ -117,7 +107,7 @@ def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
     """List the chunks of the generation that are not superseded, by slot."""
     return list(
         session.scalars(
-            select(Chunk)
+            sa.select(Chunk)
             .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
             .order_by(Chunk.slot, Chunk.id)
         )
@@ -134,7 +124,7 @@ def list_live_filter_values(
 ) -> list[tuple[int, PhotoFilterValues]]:
     """List (row, filter values of its photo) of the chunk's live rows, by row."""
     rows = session.execute(
-        select(Descriptor.row, *PhotoFilterValues.COLUMNS)
+        sa.select(Descriptor.row, *PhotoFilterValues.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
         .order_by(Descriptor.row)
@@ -154,7 +144,7 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
     were deleted since the last compaction.
     """
     rows = session.scalar(
-        select(func.sum(Chunk.rows)).where(
+        sa.select(sa.func.sum(Chunk.rows)).where(
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
         )
     )
@@ -177,9 +167,9 @@ def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> boo
     return session.scalar(geotagged.limit(1)) is not None
 
 
-def _select_described(generation_id: UUID, role: PhotoRole | None) -> Select[UUID]:
+def _select_described(generation_id: UUID, role: PhotoRole | None) -> sa.Select[UUID]:
     statement = (
-        select(Descriptor.photo_id)
+        sa.select(Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
     )

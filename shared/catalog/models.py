@@ -11,17 +11,7 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import (
-    BigInteger,
-    Index,
-    Integer,
-    Select,
-    String,
-    Text,
-    UniqueConstraint,
-    Uuid,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import (
@@ -51,24 +41,24 @@ class Model(Journaled, Base):
 
     __tablename__ = "models"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    name: Mapped[str] = mapped_column(String(200))
-    fingerprint: Mapped[str] = mapped_column(String(64))
-    licence: Mapped[str] = mapped_column(Text)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(sa.String(200))
+    fingerprint: Mapped[str] = mapped_column(sa.String(64))
+    licence: Mapped[str] = mapped_column(sa.Text)
     card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
-    added_name: Mapped[str | None] = mapped_column(String(100))
+    added_name: Mapped[str | None] = mapped_column(sa.String(100))
     added_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    object_key: Mapped[str | None] = mapped_column(Text)
-    sha256: Mapped[str | None] = mapped_column(String(64))
-    size_bytes: Mapped[int | None] = mapped_column(BigInteger)
-    dimension: Mapped[int | None] = mapped_column(Integer)
+    object_key: Mapped[str | None] = mapped_column(sa.Text)
+    sha256: Mapped[str | None] = mapped_column(sa.String(64))
+    size_bytes: Mapped[int | None] = mapped_column(sa.BigInteger)
+    dimension: Mapped[int | None] = mapped_column(sa.Integer)
     config: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
-    note: Mapped[str | None] = mapped_column(Text)
+    note: Mapped[str | None] = mapped_column(sa.Text)
 
     __table_args__ = (
-        UniqueConstraint("name", "fingerprint"),
-        Index("uq_models_added_name", "added_name", unique=True),
+        sa.UniqueConstraint("name", "fingerprint"),
+        sa.Index("uq_models_added_name", "added_name", unique=True),
     )
 
 
@@ -76,7 +66,7 @@ def get_or_create_model(
     session: Session, name: str, fingerprint: str, licence: str, card: dict[str, Any]
 ) -> Model:
     """Return the row of these weights, created on first use."""
-    statement = select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
+    statement = sa.select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
     created = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
     return get_or_insert(session, statement, created)
 
@@ -153,7 +143,7 @@ def list_registered_models(session: Session) -> list[Model]:
     """List the added models that were not removed, by name."""
     return list(
         session.scalars(
-            select(Model)
+            sa.select(Model)
             .where(Model.added_name.is_not(None), Model.object_key.is_not(None))
             .order_by(Model.added_name)
         )
@@ -229,7 +219,7 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
     A map uses it with its active generation, a generation that is being built, or its extractor.
     """
     by_generation = (
-        select(Map.name)
+        sa.select(Map.name)
         .join(Generation, Generation.map_id == Map.id)
         .where(
             Map.deleted_at.is_(None),
@@ -237,12 +227,12 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
             Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
         )
     )
-    by_extractor = select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
+    by_extractor = sa.select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
     return sorted({*session.scalars(by_generation), *session.scalars(by_extractor)})
 
 
-def _select_model(name: str, *, lock: bool = False) -> Select[Model]:
-    statement = select(Model).where(Model.added_name == name)
+def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:
+    statement = sa.select(Model).where(Model.added_name == name)
     return for_update(statement) if lock else statement
 
 

@@ -47,12 +47,7 @@ from services.gateway.uploads.batch import (
     parse_batch_upload,
     too_many_photos_error,
 )
-from shared.catalog.batch_items import (
-    BatchSource,
-    add_batch_items,
-    create_batch,
-    list_batch_items,
-)
+from shared.catalog.batch_items import BatchSource, add_batch_items, create_batch, list_batch_items
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import get_map
 from shared.config.settings import Settings
@@ -254,12 +249,7 @@ def _plan_items(
     if len(entries) > gateway.settings.max_batch_photos:
         raise too_many_photos_error(gateway.settings.max_batch_photos)
     rows = [
-        {
-            "name": entry.name,
-            "object_key": entry.name,
-            "fields": entry.fields,
-            "line": entry.line,
-        }
+        {"name": entry.name, "object_key": entry.name, "fields": entry.fields, "line": entry.line}
         for entry in entries
     ]
     return rows, BatchSource.KEYS, {}

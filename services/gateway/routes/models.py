@@ -110,9 +110,7 @@ class RemovedModelResponse(ResponseModel):
     operation_id="add_model",
     status_code=202,
     openapi_extra=multipart_schema(
-        "a checkpoint (`.ckpt`) of `placewise train`",
-        ["name"],
-        **MODEL_FORM_FIELDS,
+        "a checkpoint (`.ckpt`) of `placewise train`", ["name"], **MODEL_FORM_FIELDS
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )

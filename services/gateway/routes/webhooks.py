@@ -123,6 +123,5 @@ def read_deliveries(
         deliveries = list_deliveries(session, webhook.id, query.limit + 1, before)
     page, next_cursor = query.split(deliveries)
     return DeliveriesResponse(
-        deliveries=[DeliveryResponse.of(delivery) for delivery in page],
-        next_cursor=next_cursor,
+        deliveries=[DeliveryResponse.of(delivery) for delivery in page], next_cursor=next_cursor
     )

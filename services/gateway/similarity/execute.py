@@ -152,8 +152,7 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
         generation = session.get(Generation, UUID(result["generation_id"]))
         if generation is None:
             raise Gone(
-                "query_expired",
-                "The generation of the query was deleted. Send the photo again.",
+                "query_expired", "The generation of the query was deleted. Send the photo again."
             )
         return SimilarityQuery(
             map_id=map_.id,
@@ -252,11 +251,7 @@ def run_similarity_search(
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
     return SimilarityResult(
-        response_without_photos,
-        similar,
-        photos,
-        weights.values if weighted else (),
-        history,
+        response_without_photos, similar, photos, weights.values if weighted else (), history
     )
 
 
