@@ -118,7 +118,7 @@ class GpuResidency:
                 name=self._device.name,
                 resident_bytes=sum(gpu_snapshot.nbytes for gpu_snapshot in loaded.values()),
                 generations={
-                    key: gpu_snapshot.row_format
+                    key: "float16"
                     for key, gpu_snapshot in loaded.items()
                     if not gpu_snapshot.failure
                 },

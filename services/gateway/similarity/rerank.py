@@ -34,7 +34,6 @@ from shared.search_api.comparison import (
     CompareRequest,
     CompareResult,
     RerankCandidate,
-    RerankedCandidate,
     check_explainable,
     check_rerankable,
     query_expired_error,
@@ -137,7 +136,8 @@ def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> Sim
             similarity_score=searched[candidate.photo_id].score,
             weighted_score=searched[candidate.photo_id].weighted_score,
             rerank_score=candidate.rerank_score,
-            explanation=_explanation_response(candidate),
+            explanation=candidate.explanation
+            and ExplanationResponse.model_validate(candidate.explanation),
             **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
         )
         for candidate in live[: params.top_k]
@@ -183,11 +183,3 @@ def _build_compare_job(
         params=params.model_dump(mode="json"),
     )
     return job, result.history_row
-
-
-def _explanation_response(candidate: RerankedCandidate) -> ExplanationResponse | None:
-    return (
-        ExplanationResponse.model_validate(candidate.explanation.model_dump())
-        if candidate.explanation
-        else None
-    )

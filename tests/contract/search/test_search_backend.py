@@ -46,7 +46,7 @@ from shared.config.shards import SINGLE_SHARD
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
-from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
+from shared.search_api.protocol import SearchBackend, SearchRequest, SearchResponse
 from shared.storage import FolderStore, ObjectStore, read_retries
 from shared.storage.chunks import decode_rows, encode_rows, manifest_key, write_chunk
 from tests.support.codes import always_by_codes, always_by_int8
@@ -72,7 +72,6 @@ class SmallMap:
     `rows` is the model to compare with: every live photo with its descriptor.
     """
 
-    mode = Mode.AUTO
     """How it is searched."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
@@ -218,7 +217,6 @@ class SmallMap:
             photos=PhotoFilter(**photos),
             min_score=min_score,
             exclude=exclude,
-            mode=self.mode,
         )
 
     def brute_force(
@@ -848,35 +846,20 @@ class TestSearchWorkerByInt8(TestSearchWorker):
 
 
 @whatever_the_catalog
-class TestSearchWorkerDeterministic(TestSearchWorker):
-    """The same promises of `mode=deterministic`, which leaves the sign codes out."""
-
-    certificate = "exhaustive"
-
-    @pytest.fixture(autouse=True)
-    def deterministic(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        always_by_codes(monkeypatch)
-        monkeypatch.setattr(SmallMap, "mode", Mode.DETERMINISTIC)
-
-
-@whatever_the_catalog
 class TestSearchWorkerOnADevice(TestSearchWorker):
     """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
 
     certificate = "bound"
 
-    @pytest.fixture(params=["float16", "int8"])
+    @pytest.fixture
     def port(
         self,
-        request: pytest.FixtureRequest,
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
         monkeypatch: pytest.MonkeyPatch,
     ) -> OpenPort:
-        always_by_int8(monkeypatch)
         monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-        monkeypatch.setattr(gpu, "ROW_FORMATS", (request.param,))
 
         def open_port(**changes: object) -> SearchBackend:
             device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)
