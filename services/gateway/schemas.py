@@ -22,6 +22,12 @@ from shared.catalog.vocabularies import VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
 
 
+class RequestModel(BaseModel):
+    """A JSON body; unknown fields are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
 class ResponseModel(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 

@@ -230,7 +230,7 @@ def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
 
 
 class PresignedUpload(Base):
-    """A presigned upload. `status` and `answer` are the response of its completion."""
+    """A presigned upload. `status` and `response_body` are the response of its completion."""
 
     __tablename__ = "direct_uploads"
 
@@ -239,9 +239,9 @@ class PresignedUpload(Base):
     filename: Mapped[str] = mapped_column(sa.Text)
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     sha256: Mapped[str] = mapped_column(sa.String(64))
-    said: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
     status: Mapped[int | None] = mapped_column(sa.Integer)
-    answer: Mapped[str | None] = mapped_column(sa.Text)  # JSON, as it was sent
+    response_body: Mapped[str | None] = mapped_column("answer", sa.Text)  # JSON, as it was sent
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     expires_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
@@ -272,7 +272,7 @@ def get_presigned_upload(
             f"There is no upload {upload_id} in this map. Start one: POST /api/v1/uploads/presign.",
         )
     upload: PresignedUpload = row[0]
-    if row.expired and upload.answer is None:
+    if row.expired and upload.response_body is None:
         raise Gone(
             "upload_expired",
             f"The upload {upload_id} expired before it was completed. Start another one: POST "

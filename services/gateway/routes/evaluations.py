@@ -12,14 +12,14 @@ from uuid import UUID
 
 from fastapi import APIRouter
 from fastapi import Path as PathParameter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel
+from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
 from shared.catalog.chunks import has_geotagged
 from shared.catalog.generations import (
     Generation,
@@ -39,10 +39,8 @@ from shared.word_weights.record import HeldOut, Outcome, WordWeights, parse_word
 router = APIRouter(tags=["evaluations"])
 
 
-class EvaluationRequest(BaseModel):
+class EvaluationRequest(RequestModel):
     """Options of an evaluation; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
         1000, ge=1, le=1_000_000, description="maximum number of photos of the map to query with"
@@ -127,10 +125,8 @@ def _new_evaluation_job(
     return Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
 
 
-class WordWeightsRequest(BaseModel):
+class WordWeightsRequest(RequestModel):
     """Options of the fit; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
         1000, ge=1, le=1_000_000, description="maximum number of photos to validate on"

@@ -7,11 +7,11 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
-from services.gateway.schemas import ResponseModel
+from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.security.api_keys import Scope
 
@@ -23,10 +23,8 @@ MAX_KEY_DAYS = 36_500
 KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 
-class CreateKeyRequest(BaseModel):
+class CreateKeyRequest(RequestModel):
     """The key to create. Omitted limits are those of the server's settings."""
-
-    model_config = ConfigDict(extra="forbid")
 
     name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
     scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))

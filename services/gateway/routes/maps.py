@@ -8,13 +8,13 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Path
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import ResponseModel
+from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import (
     DEFAULT_MAP,
@@ -41,9 +41,7 @@ MapNamePath = Annotated[
 ]
 
 
-class CreateMapRequest(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class CreateMapRequest(RequestModel):
     name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
     extractor: str | None = Field(
         None,

@@ -6,7 +6,7 @@ from typing import Any
 from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -14,7 +14,12 @@ from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, delete_if_refused
-from services.gateway.schemas import GenerationResponse, JobAcceptedResponse, VocabularyResponse
+from services.gateway.schemas import (
+    GenerationResponse,
+    JobAcceptedResponse,
+    RequestModel,
+    VocabularyResponse,
+)
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.chunks import estimate_described
 from shared.catalog.generations import list_generations
@@ -33,10 +38,8 @@ from shared.storage.vocabulary_npz import encode_vocabulary_file
 router = APIRouter(tags=["model changes"])
 
 
-class FitVocabularyRequest(BaseModel):
+class FitVocabularyRequest(RequestModel):
     """Options of the fit; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     clusters: int | None = Field(
         None,
@@ -49,10 +52,8 @@ class FitVocabularyRequest(BaseModel):
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
-class StartGenerationRequest(BaseModel):
+class StartGenerationRequest(RequestModel):
     """Extractor, vocabulary or PCA dimension of the new generation."""
-
-    model_config = ConfigDict(extra="forbid")
 
     extractor: str | None = Field(
         None,

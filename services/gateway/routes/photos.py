@@ -13,7 +13,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ, WRITE
@@ -29,6 +29,7 @@ from services.gateway.schemas import (
     MetadataSearchResponse,
     PhotoDetailResponse,
     PhotoResponse,
+    RequestModel,
 )
 from services.gateway.similarity.search_params import FilterParams, parse_optional_time
 from shared.catalog.chunks import find_descriptor
@@ -63,10 +64,8 @@ def read_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> PhotoDe
         return _photo_detail_response(session, photo, query.map)
 
 
-class PhotoUpdate(BaseModel):
+class PhotoUpdate(RequestModel):
     """Fields to update: omitted fields are unchanged, null clears a field."""
-
-    model_config = ConfigDict(extra="forbid")
 
     latitude: Annotated[float | None, Field(ge=-90, le=90, allow_inf_nan=False)] = None
     longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None

@@ -134,7 +134,7 @@ def create_presigned_upload(
             filename=base_name(body.filename),
             size_bytes=body.file_size,
             sha256=body.sha256,
-            said=fields,
+            fields=fields,
             expires_at=db_now_plus(seconds),
         )
         session.add(upload)
@@ -184,7 +184,7 @@ async def complete_presigned_upload(
         with gateway.catalog.write() as session:
             upload = session.get(PresignedUpload, upload_id)
             if upload is not None:  # its map may have been deleted during the wait
-                upload.status, upload.answer = outcome.status, outcome.body.model_dump_json()
+                upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
 
     return await respond_to_upload(
         request, response, gateway, query.map, stored, key, replace_response
@@ -218,7 +218,7 @@ def _complete_upload(
         locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
         _replay_if_completed(locked)
         outcome = UploadOutcome.of(stored, stored.job, key, map_name)
-        locked.status, locked.answer = outcome.status, outcome.body.model_dump_json()
+        locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
         return stored
 
     with delete_if_refused(store, key):
@@ -228,7 +228,7 @@ def _complete_upload(
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = ValidatedPhoto(
-            received, media_type, header, _parse_photo_fields(upload.said), key_id
+            received, media_type, header, _parse_photo_fields(upload.fields), key_id
         )
         with quota:
             stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
@@ -280,12 +280,12 @@ def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
 
 
 def _replay_if_completed(upload: PresignedUpload) -> None:
-    if upload.answer is None:
+    if upload.response_body is None:
         return
     assert upload.status is not None
-    status_url = json.loads(upload.answer)["status_url"]
+    status_url = json.loads(upload.response_body)["status_url"]
     headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
-    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.answer))
+    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.response_body))
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

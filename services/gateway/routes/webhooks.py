@@ -6,11 +6,11 @@ from datetime import datetime
 from uuid import UUID
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageQuery, WebhookId
-from services.gateway.schemas import ResponseModel
+from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
@@ -27,9 +27,7 @@ from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_t
 router = APIRouter(tags=["administration"])
 
 
-class CreateWebhookRequest(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class CreateWebhookRequest(RequestModel):
     url: str = Field(
         min_length=1,
         max_length=2000,
