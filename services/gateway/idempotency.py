@@ -88,7 +88,7 @@ async def replay_response(request: Request, replay: Exception) -> Response:
 
 
 class IdempotentRequest:
-    """A request with an `Idempotency-Key`; without the header, all methods do nothing."""
+    """A request with an `Idempotency-Key`; without the header, nothing is claimed or stored."""
 
     def __init__(
         self, gateway: GatewayContext, request: Request, response: Response, key: str | None

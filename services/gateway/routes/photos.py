@@ -22,6 +22,7 @@ from services.gateway.dependencies import (
     FileId,
     GatewayDep,
     MapQuery,
+    PageParams,
     invalid_cursor_error,
 )
 from services.gateway.schemas import (
@@ -176,7 +177,7 @@ def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Res
     return Response(data, media_type="image/jpeg")
 
 
-class MetadataSearchParams(FilterParams):
+class MetadataSearchParams(FilterParams, PageParams):
     filename: str | None = Field(
         None, max_length=255, description="part of the file name, case-insensitive"
     )
@@ -186,7 +187,6 @@ class MetadataSearchParams(FilterParams):
     max_file_size: int | None = Field(None, ge=0, le=2**62)
     role: PhotoRole | None = Field(None, description="photos with this role; omitted: all")
     limit: int = Field(100, ge=1, le=1000)
-    cursor: str | None = Field(None, description="`next_cursor` of the previous page")
 
     def metadata_filter(self) -> MetadataFilter:
         """Parses the conditions; 422 (`invalid_field`) names the invalid parameter."""

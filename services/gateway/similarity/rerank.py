@@ -176,7 +176,7 @@ def _build_compare_job(
     )
     job = Job(
         id=new_id(),
-        map_id=query.map_id,
+        map_id=query.map.id,
         kind=JobKind.COMPARE,
         priority=Priority.QUERY,
         generation_id=query.generation.id,
