@@ -33,7 +33,6 @@ from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import (
     CompareRequest,
     CompareResult,
-    RerankCandidate,
     check_explainable,
     check_rerankable,
     query_expired_error,
@@ -161,12 +160,7 @@ def _build_compare_job(
         request=CompareRequest(
             query_photo_id=query.photo_id,
             query_job_id=describe_job_id,
-            candidates=tuple(
-                RerankCandidate(
-                    photo_id=hit.photo_id, score=hit.score, weighted_score=hit.weighted_score
-                )
-                for hit in result.hits
-            ),
+            candidates=tuple(result.hits),
             rerank=search_params.rerank or 0,
             explain=search_params.top_k if search_params.explain else 0,
             word_weights=result.word_weights,
