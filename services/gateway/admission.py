@@ -18,6 +18,7 @@ import math
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Annotated
@@ -26,8 +27,8 @@ from uuid import UUID
 from fastapi import Depends, Request
 
 from services.gateway.authentication import Caller, get_caller
-from services.gateway.concurrency import ConcurrencyLimit
-from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName
+from services.gateway.dependencies import GatewayDep, get_map_name
+from services.http_connections import address_group
 from shared.catalog.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
@@ -41,6 +42,71 @@ RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share
 MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
+
+
+class ConcurrencyLimit:
+    """Limits concurrent requests of one kind. Must be used on the event loop only."""
+
+    def __init__(
+        self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
+    ) -> None:
+        """Creates the limit.
+
+        Args:
+            what: Names the requests, and the settings of both limits, in error messages.
+            code: Error code of the refusal.
+            total: Limit for all callers together.
+            per_caller: Limit for one API key, and for one client address.
+            retry_after_seconds: Sent as `Retry-After`.
+        """
+        self._what = what
+        self._code = code
+        self._total = total
+        self._per_caller = per_caller
+        self._retry_after_seconds = retry_after_seconds
+        self._count_by_caller: Counter[str] = Counter()
+        self.count = 0
+
+    @contextlib.contextmanager
+    def hold(self, request: Request) -> Iterator[None]:
+        """Counts the request while the block runs.
+
+        Raises:
+            TooManyRequests: The total limit or the limit of the caller is reached.
+        """
+        callers = _callers(request)
+        if self.count >= self._total:
+            raise self._refusal(f"The server is already handling {self._total} {self._what}.")
+        for caller in callers:
+            if self._count_by_caller[caller] >= self._per_caller:
+                raise self._refusal(
+                    f"The server is already handling {self._per_caller} {self._what} of this "
+                    f"{caller.partition(' ')[0]}."
+                )
+        self.count += 1
+        self._count_by_caller.update(callers)
+        try:
+            yield
+        finally:
+            self.count -= 1
+            self._count_by_caller.subtract(callers)
+            self._count_by_caller += Counter()  # removes callers whose count is 0
+
+    def _refusal(self, detail: str) -> TooManyRequests:
+        return TooManyRequests(
+            self._code,
+            f"{detail} Try again in a moment.",
+            retry_after_seconds=self._retry_after_seconds,
+        )
+
+
+def _callers(request: Request) -> list[str]:
+    """The request's key and address. ADMIN_KEY has no key id, so it is counted by address only."""
+    key_id = get_caller(request).key_id
+    callers = [] if key_id is None else [f"key {key_id}"]
+    if request.client is not None:
+        callers.append(f"address {address_group(request.client.host)}")
+    return callers
 
 
 class UploadKind(StrEnum):
@@ -168,8 +234,8 @@ def get_admission_control(request: Request) -> AdmissionControl:
 AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
 
 
-def _admit_job(admission: AdmissionDep, map_name: MapName = DEFAULT_MAP) -> None:
-    admission.admit_job(map_name)
+def _admit_job(request: Request, admission: AdmissionDep) -> None:
+    admission.admit_job(get_map_name(request))
 
 
 def _admit_query(admission: AdmissionDep) -> None:

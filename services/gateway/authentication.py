@@ -208,16 +208,7 @@ def parse_bearer(authorization: str | None) -> str:
 
 
 # Health probes, the web page and the API documentation: none of them exposes stored data.
-PUBLIC_PATHS = frozenset(
-    {
-        "/",
-        "/livez",
-        "/readyz",
-        "/docs",
-        "/redoc",
-        "/openapi.json",
-    }
-)
+PUBLIC_PATHS = frozenset({"/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"})
 PUBLIC_PATH_PREFIX = "/console/"  # assets of the web page, where the user enters the key
 
 # For the OpenAPI schema only: `AuthenticationMiddleware` checks the key, before routing.

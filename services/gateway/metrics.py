@@ -94,7 +94,7 @@ def count_jobs(session: Session) -> list[JobCount]:
 router = APIRouter(tags=["operations"])
 
 # From a health probe to the longest `Prefer: wait`.
-LATENCY_BUCKETS_SECONDS = (
+LATENCY_BUCKETS = (
     0.005,
     0.01,
     0.025,
@@ -108,7 +108,7 @@ LATENCY_BUCKETS_SECONDS = (
     10.0,
     30.0,
     60.0,
-)
+)  # seconds
 METRIC_PREFIX = "placewise_gateway"
 
 
@@ -127,7 +127,7 @@ class GatewayMetrics:
             f"{METRIC_PREFIX}_request_seconds",
             "Seconds from the request to the first byte of the response.",
             ["method", "route"],
-            buckets=LATENCY_BUCKETS_SECONDS,
+            buckets=LATENCY_BUCKETS,
             registry=registry,
         )
         self._received = Counter(

@@ -37,7 +37,7 @@ from services.steward.tasks.model_changes import (
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database_errors import OutageLog
-from shared.catalog.file_checks import sqlite_file
+from shared.catalog.schema import sqlite_file
 from shared.catalog.session import Catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings

@@ -203,11 +203,7 @@ class Catalog:
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.engine = create_engine(
-                self.url,
-                connect_args={
-                    "timeout": SQLITE_BUSY_SECONDS,
-                    "check_same_thread": False,
-                },
+                self.url, connect_args={"timeout": SQLITE_BUSY_SECONDS, "check_same_thread": False}
             )
             event.listen(self.engine, "connect", _prepare_sqlite)
             event.listen(self.engine, "begin", _begin_sqlite)

@@ -33,22 +33,21 @@ from services.gateway.admission import (
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
-    DEFAULT_MAP,
     NO_NUL_PATTERN,
     GatewayContext,
     GatewayDep,
-    MapName,
+    MapQuery,
     UploadId,
 )
-from services.gateway.idempotency import IdempotentDep, IdempotentReplay
+from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import UPLOAD_RESPONSES, UploadOutcome, respond_to_upload
-from services.gateway.schemas import ResponseModel, UploadResponse, url_in_map
+from services.gateway.schemas import ResponseModel, UploadResponse, accepted_headers, url_in_map
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
-from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
+from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
@@ -96,7 +95,6 @@ class PresignResponse(ResponseModel):
     "/uploads/presign",
     operation_id="presign_upload",
     status_code=201,
-    response_model=PresignResponse,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
 def create_presigned_upload(
@@ -104,7 +102,7 @@ def create_presigned_upload(
     gateway: GatewayDep,
     body: PresignRequest,
     idempotent: IdempotentDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> PresignResponse:
     """Create a presigned URL for uploading a photo directly to the bucket.
 
@@ -129,7 +127,7 @@ def create_presigned_upload(
     with gateway.catalog.write() as session:
         upload = PresignedUpload(
             id=upload_id,
-            map_id=get_map(session, map_name).id,
+            map_id=get_map(session, query.map).id,
             filename=base_name(body.filename),
             size_bytes=body.file_size,
             sha256=body.sha256,
@@ -143,7 +141,7 @@ def create_presigned_upload(
             method="PUT",
             url=put.url,
             headers=put.headers,
-            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
+            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", query.map),
             expires_at=upload.expires_at,
         )
         idempotent.store_response(session, 201, response)
@@ -154,7 +152,6 @@ def create_presigned_upload(
     "/uploads/presign/{upload_id}/complete",
     operation_id="complete_upload",
     status_code=202,
-    response_model=UploadResponse,
     responses=UPLOAD_RESPONSES,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
@@ -166,7 +163,7 @@ async def complete_presigned_upload(
     upload_id: Annotated[
         UploadId, PathParameter(description="from the response of `POST /uploads/presign`")
     ],
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> UploadResponse:
     """Complete a presigned upload: validate the sent file and store the photo.
 
@@ -177,17 +174,17 @@ async def complete_presigned_upload(
         key_id = get_caller(request).key_id
         quota = reserve_photo_quota(request, gateway.settings)
         stored = await run_in_threadpool(
-            _complete_upload, gateway, map_name, upload_id, key, key_id, quota
+            _complete_upload, gateway, query.map, upload_id, key, key_id, quota
         )
 
     def replace_response(outcome: UploadOutcome) -> None:
         with gateway.catalog.write() as session:
             upload = session.get(PresignedUpload, upload_id)
             if upload is not None:  # its map may have been deleted during the wait
-                upload.status, upload.answer = outcome.status, outcome.body.model_dump_json()
+                upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
 
     return await respond_to_upload(
-        request, response, gateway, map_name, stored, key, replace_response
+        request, response, gateway, query.map, stored, key, replace_response
     )
 
 
@@ -218,10 +215,10 @@ def _complete_upload(
         locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
         _replay_if_completed(locked)
         outcome = UploadOutcome.of(stored, stored.job, key, map_name)
-        locked.status, locked.answer = outcome.status, outcome.body.model_dump_json()
+        locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
         return stored
 
-    try:
+    with delete_if_refused(store, key):
         _check_object_size(store.head(key), upload)
         received = _verify_copied_object(store, key, upload)
         media_type = check_photo_signature(received.first_bytes)
@@ -232,9 +229,6 @@ def _complete_upload(
         )
         with quota:
             stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
-    except (PlacewiseError, IdempotentReplay):
-        store.delete(key)
-        raise
     if stored.photo.object_key != key:
         store.delete(key)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
@@ -277,13 +271,12 @@ def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
 
 
 def _replay_if_completed(upload: PresignedUpload) -> None:
-    if upload.answer is None:
+    if upload.response_body is None:
         return
     assert upload.status is not None
-    headers = {"Location": json.loads(upload.answer)["status_url"]}
-    if upload.status == 202:
-        headers["Retry-After"] = "1"
-    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.answer))
+    status_url = json.loads(upload.response_body)["status_url"]
+    headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
+    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.response_body))
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

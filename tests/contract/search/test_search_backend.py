@@ -8,7 +8,6 @@ import os
 import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -32,7 +31,6 @@ from numpy.typing import NDArray
 
 from services.search import executor, gpu
 from services.search import worker as worker_module
-from services.search.chunk_loader import ChunkLoader, StoredChunk
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from services.steward.tasks.compaction import merge_slot
@@ -43,16 +41,15 @@ from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, PhotoRole, mark_photo_deleted
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.codes.int8_codes import Int8Codes
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
-from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
+from shared.search_api.protocol import SearchBackend, SearchRequest, SearchResponse
 from shared.storage import FolderStore, ObjectStore, read_retries
 from shared.storage.chunks import decode_rows, encode_rows, manifest_key, write_chunk
-from tests.support.codes import always_by_codes, always_by_int8, int8_on_demand
+from tests.support.codes import always_by_codes, always_by_int8
 from tests.support.search_tier import SearchTier
 
 DIMENSION = 12
@@ -75,7 +72,6 @@ class SmallMap:
     `rows` is the model to compare with: every live photo with its descriptor.
     """
 
-    mode = Mode.AUTO
     """How it is searched."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
@@ -221,7 +217,6 @@ class SmallMap:
             photos=PhotoFilter(**photos),
             min_score=min_score,
             exclude=exclude,
-            mode=self.mode,
         )
 
     def brute_force(
@@ -851,96 +846,20 @@ class TestSearchWorkerByInt8(TestSearchWorker):
 
 
 @whatever_the_catalog
-class TestSearchWorkerDeterministic(TestSearchWorker):
-    """The same promises of `mode=deterministic`, whose codes are made when they are asked for."""
-
-    certificate = "bound"
-
-    @pytest.fixture(autouse=True)
-    def deterministic(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        int8_on_demand(monkeypatch)
-        monkeypatch.setattr(SmallMap, "mode", Mode.DETERMINISTIC)
-
-    def test_codes_are_made_once_asked_for_and_counted(
-        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        places.add(unit_rows(1, 30))
-        search = port()
-        reference = places.query(unit_rows(2, 1)[0])
-        with monkeypatch.context() as patch:
-            patch.setattr(SmallMap, "mode", Mode.DENSE)
-            dense = search.search(places.request(reference))
-        assert dense.certificate == "exhaustive"
-        before = search.status().resident_bytes
-        found = search.search(places.request(reference))
-        assert found.certificate == "bound"
-        assert found.hits == dense.hits
-        assert search.status().resident_bytes == before + 30 * 64  # 12 numbers are padded to 64
-
-    def test_codes_that_take_long_refuse_with_progress_and_come(
-        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        go_on = threading.Event()
-        make = ChunkLoader.load_int8_codes
-
-        def slowly(self: ChunkLoader, object_key: str, stored: StoredChunk) -> Int8Codes:
-            assert go_on.wait(60)
-            return make(self, object_key, stored)
-
-        monkeypatch.setattr(ChunkLoader, "load_int8_codes", slowly)
-        places.add(unit_rows(1, 30))
-        vector = unit_rows(2, 1)[0]
-        request = places.request(places.query(vector))
-        search = port(search_wait_seconds=0.01)
-        for _ in range(2):
-            with pytest.raises(Unavailable) as caught:
-                search.search(request)
-            assert caught.value.code == "codes_being_made"
-            assert caught.value.extra["retry_after_seconds"] >= 1
-            assert (caught.value.extra["done"], caught.value.extra["rows"]) == (0, 30)
-        auto = search.search(request.model_copy(update={"mode": Mode.AUTO}))
-        assert_answers(auto, places.brute_force(vector))
-        go_on.set()
-        response = _once_made(search, request)
-        assert_answers(response, places.brute_force(vector))
-        assert response.certificate == "bound"
-
-    def test_codes_that_can_not_be_kept_are_refused_and_tried_again(
-        self, places: SmallMap, port: OpenPort, settings: Settings
-    ) -> None:
-        places.add(unit_rows(1, 30))
-        vector = unit_rows(2, 1)[0]
-        request = places.request(places.query(vector))
-        search = port()
-        search.search(request.model_copy(update={"mode": Mode.AUTO}))
-        folder = settings.search_cache_folder(SINGLE_SHARD)
-        shutil.rmtree(folder)
-        folder.write_text("no folder can be here")
-        with pytest.raises(Unavailable) as caught:
-            search.search(request)
-        assert caught.value.code == "codes_not_made"
-        folder.unlink()
-        assert_answers(search.search(request), places.brute_force(vector))
-
-
-@whatever_the_catalog
 class TestSearchWorkerOnADevice(TestSearchWorker):
     """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
 
     certificate = "bound"
 
-    @pytest.fixture(params=["float16", "int8"])
+    @pytest.fixture
     def port(
         self,
-        request: pytest.FixtureRequest,
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
         monkeypatch: pytest.MonkeyPatch,
     ) -> OpenPort:
-        always_by_int8(monkeypatch)
         monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-        monkeypatch.setattr(gpu, "ROW_FORMATS", (request.param,))
 
         def open_port(**changes: object) -> SearchBackend:
             device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)
@@ -975,17 +894,6 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         assert 'placewise_search_device_failed{device="cpu"} 0.0' in told
 
 
-def _once_made(search: SearchBackend, request: SearchRequest) -> SearchResponse:
-    for _ in range(1000):
-        try:
-            return search.search(request)
-        except Unavailable as error:
-            if error.code != "codes_being_made":
-                raise
-            time.sleep(0.01)
-    raise AssertionError("the codes never came")
-
-
 @pytest.mark.parametrize(
     ("catalog", "replicas"),
     [("sqlite", (1,)), ("postgresql", (2, 1, 1))],
@@ -1015,35 +923,6 @@ class TestSearchOverHttp(SearchPortContract):
                 return running.enter_context(tier).port
 
             yield open_port
-
-    def test_codes_that_are_being_made_are_no_reason_to_leave_shards_out(
-        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        int8_on_demand(monkeypatch)
-        go_on = threading.Event()
-        make = ChunkLoader.load_int8_codes
-
-        def slowly(self: ChunkLoader, object_key: str, stored: StoredChunk) -> Int8Codes:
-            assert go_on.wait(60)
-            return make(self, object_key, stored)
-
-        monkeypatch.setattr(ChunkLoader, "load_int8_codes", slowly)
-        for slot in range(3):
-            places.add(unit_rows(slot, 10), slot=slot)
-        vector = unit_rows(9, 1)[0]
-        request = places.request(places.query(vector))
-        request = request.model_copy(update={"mode": Mode.DETERMINISTIC})
-        search = port(search_wait_seconds=0.2, search_timeout_seconds=1)
-        try:
-            with pytest.raises(Unavailable) as caught:
-                search.search(request)
-        finally:
-            go_on.set()
-        assert caught.value.code == "codes_being_made"
-        assert caught.value.extra["retry_after_seconds"] >= 1
-        response = _once_made(search, request)
-        assert_answers(response, places.brute_force(vector))
-        assert response.certificate == "bound"
 
 
 class AddDeleteMerge(RuleBasedStateMachine):
