@@ -325,18 +325,16 @@ def scale(
     """Estimate machines, storage and cost for 10 thousand, 1 million and 100 million photos."""
     with report_errors(as_json):
         program = _load_benchmark("scale")
-        measurements = None
-        if measured:
-            with progress_bar() as progress:
-                measurements = program.measure(progress)
-        sizing = program.size_up(inputs or [], measurements)
+        values = program.measure_inputs() if measured else {}
+        values |= program.parse_assignments(inputs or [])
+        sizing = program.Sizing(values, page.read_text(encoding="utf-8") if page else None)
         if page is not None:
-            page.write_text(sizing.put_into(page.read_text(encoding="utf-8")), encoding="utf-8")
+            page.write_text(sizing.updated_page(), encoding="utf-8")
     if as_json:
         print_json(sizing.as_json())
     elif page is None:
-        for sheet in sizing.sheets():
-            console.print(sheet.table())
+        for table in sizing.terminal_tables():
+            console.print(table)
 
 
 def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
