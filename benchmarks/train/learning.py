@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.table import Table
 
+from benchmarks.generated_city import generate_city
 from services.trainer import run
 from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything
-from services.trainer.grid import GridPlan, PlannedRun, RunFunctions, run_grid
-from services.trainer.leaderboard import leaderboard
 from services.trainer.model_describer import ModelDescriber
 from services.trainer.module import make_model
 from services.trainer.resolve import Device
@@ -30,8 +28,7 @@ from shared.descriptors.vpr_models.model import VprModel
 from shared.evaluation.bootstrap import cluster_queries, paired_differences
 from shared.evaluation.ranking import evaluate_recall
 from shared.evaluation.retrieval_metrics import compute_hits
-from shared.synthetic_city.plan import CityOptions, make_plan
-from shared.synthetic_city.write import write_city
+from shared.synthetic_city.plan import CityOptions
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -40,13 +37,6 @@ PHOTO_SIZE = (160, 120)
 """width and height of the generated photos"""
 VIEWS = 2
 PLACES_PER_BATCH = 16
-AGGREGATORS = (
-    {"agg_arch": "AVG"},
-    {"agg_arch": "GeM"},
-    {"agg_arch": "ConvAP", "agg_config": {"out_channels": 64}},
-)
-LOSSES = ("MultiSimilarityLoss", "NTXentLoss")
-
 Json = dict[str, Any]
 
 
@@ -97,9 +87,11 @@ def measure_learning(
     here = CityOptions(places, VIEWS, places, seed, 0, 0.0, width, height)
     elsewhere = replace(here, seed=seed + 1, catalogue_seed=1, train=False)
     sets = {
-        "other streets": _draw_city(progress, here, folder / "here"),
-        "another catalogue": _draw_city(progress, elsewhere, folder / "elsewhere"),
+        "other streets": folder / "here",
+        "another catalogue": folder / "elsewhere",
     }
+    for options, out in zip((here, elsewhere), sets.values(), strict=True):
+        generate_city(options, out, progress)
     arguments = _training_arguments(
         folder / "here", folder / "runs", epochs, image_size, workers, device, seed
     )
@@ -110,8 +102,8 @@ def measure_learning(
     seed_everything(seed)
     untrained = make_model(build_arguments(arguments), NullDisplay(), resuming=False)
     return {
-        name: measure_gain(untrained, trained, evaluation_set, image_size, device)
-        for name, evaluation_set in sets.items()
+        name: measure_gain(untrained, trained, open_evaluation_set(out), image_size, device)
+        for name, out in sets.items()
     }
 
 
@@ -146,48 +138,6 @@ def measure_gain(
         len(evaluation_set.queries),
         evaluation_set.fingerprint,
     )
-
-
-def measure_grid(
-    progress: Progress,
-    folder: Path,
-    epochs: int,
-    image_size: int,
-    workers: int,
-    device: Device,
-    seed: int,
-) -> tuple[Table, list[dict[str, str]]]:
-    """Train three aggregators x two losses on the city that `measure_learning` has generated."""
-    arguments = _training_arguments(
-        folder / "here", folder / "grid", epochs, image_size, workers, device, seed
-    )
-    del arguments["default_root_dir"]
-    plan = GridPlan(
-        tuple(
-            PlannedRun(
-                f"{aggregator['agg_arch']}-{loss}", {**arguments, **aggregator, "loss_name": loss}
-            )
-            for aggregator in AGGREGATORS
-            for loss in LOSSES
-        ),
-        {},
-    )
-    trainer = RunFunctions(run.run, run.resume)
-    outcomes = run_grid(
-        plan, folder / "grid", trainer, BarDisplay(progress), StopRequest(), lambda done: None
-    )
-    rows = leaderboard(plan, outcomes)
-    table = Table(*rows[0], title="six settings, other streets")
-    for row in rows:
-        table.add_row(*row.values())
-    return table, rows
-
-
-def _draw_city(progress: Progress, options: CityOptions, out: Path) -> EvaluationSet:
-    plan = make_plan(options)
-    bar = progress.add_task(f"drawing {out.name}", total=len(plan.photos))
-    write_city(plan, out, lambda count: progress.advance(bar, count))
-    return open_evaluation_set(out)
 
 
 def _training_arguments(

@@ -151,9 +151,6 @@ def train(
     device: Annotated[
         str, typer.Option("--device", help="Device: auto, cpu, gpu or mps.")
     ] = "auto",
-    grid: Annotated[
-        bool, typer.Option("--grid", help="Also train three aggregators with two losses each.")
-    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the city and the network.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -168,7 +165,6 @@ def train(
         photos=photos,
         workers=workers,
         device=device,
-        grid=grid,
         seed=seed,
     )
 
