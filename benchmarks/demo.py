@@ -152,24 +152,17 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
-    """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
-    given = [a for a in outcomes if a.estimate["in_map"]]
-    right = [a for a in given if a.best_is_correct]
-    wrong = [a for a in given if not a.best_is_correct]
-    refused = [a for a in outcomes if a.estimate["in_map"] is False]
-    strangers = [a for a in refused if not a.in_map]
-    missed = [a for a in refused if a.in_map]
-    return [
-        *_evenly_spaced(right, COLUMNS + 1),
-        *_evenly_spaced(wrong, 1),
-        *_evenly_spaced(missed, 1),
-        *_evenly_spaced(strangers, 3),
-    ][: 2 * COLUMNS]
-
-
-def _evenly_spaced(found: Sequence[QueryOutcome], count: int) -> list[QueryOutcome]:
-    step = max(1, len(found) // count) if count else 1
-    return list(found[::step][:count])
+    """Choose two rows: mostly accepted and correct, then wrong, then rejected queries."""
+    accepted = [a for a in outcomes if a.estimate["in_map"]]
+    rejected = [a for a in outcomes if a.estimate["in_map"] is False]
+    groups = (
+        ([a for a in accepted if a.best_is_correct], COLUMNS + 1),
+        ([a for a in accepted if not a.best_is_correct], 1),
+        ([a for a in rejected if a.in_map], 1),
+        ([a for a in rejected if not a.in_map], 3),
+    )
+    chosen = [group[:: max(1, len(group) // count)][:count] for group, count in groups]
+    return [outcome for group in chosen for outcome in group][: 2 * COLUMNS]
 
 
 def _caption(answer: QueryOutcome) -> str:

@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,16 +57,16 @@ def _measure_calls(
 
     started_at = time.perf_counter()
     with ThreadPoolExecutor(CLIENTS) as pool:
-        uploads = list(pool.map(lambda file: timed(lambda: client.upload(file)), files))
+        uploads = list(pool.map(lambda file: timed(partial(client.upload, file)), files))
     uploaded_at = time.perf_counter()
     for _, response in uploads:
         client.wait_for(response["job_id"])
     searchable_at = time.perf_counter()
     stored = [
-        timed(lambda photo_id=response["file_id"]: client.similar_to(photo_id))[0]
+        timed(partial(client.similar_to, response["file_id"]))[0]
         for _, response in uploads[:queries]
     ]
-    new = [timed(lambda file=file: client.similar_to_file(file))[0] for file in files[:queries]]
+    new = [timed(partial(client.similar_to_file, file))[0] for file in files[:queries]]
     for name, seconds, rate in (
         ("upload, 4 clients", [s for s, _ in uploads], len(files) / (uploaded_at - started_at)),
         ("query by stored photo", stored, len(stored) / sum(stored)),

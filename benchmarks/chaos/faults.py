@@ -14,7 +14,7 @@ from benchmarks.fleet import Fleet
 from benchmarks.fleet.fault_injection import MessageDuplicator, ProxyMode
 from tests.support.servers.handle import Handle
 
-# From beginning to end these have another idea of the time of day, by so many seconds.
+# Services whose clock is wrong during the whole run, by so many seconds.
 CLOCK_OFFSETS_SECONDS = {
     "gateway-1": 3600,
     "extractor-1": 3600,

@@ -255,9 +255,7 @@ def catalog(
 
     Creates a temporary database on the server of DATABASE_URL and drops it at the end.
     """
-    with report_errors(as_json):
-        program = _load_benchmark("catalog.command")
-    program.bench_catalog(photos, as_json)
+    _run_benchmark("catalog.command", as_json, photos=photos)
 
 
 @app.command("chaos")
