@@ -97,15 +97,6 @@ def active_generation(session: Session, map_id: UUID) -> Generation | None:
     )
 
 
-def building_generation(session: Session, map_id: UUID) -> Generation | None:
-    """Return the map's generation that is being built, if any."""
-    return session.scalar(
-        select(Generation).where(
-            Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
-        )
-    )
-
-
 def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
     """Return a generation of the map; NotFound (`generation_not_found`)."""
     generation = session.scalar(
