@@ -13,7 +13,7 @@ from PIL import Image
 from shared.descriptors.extractor import Extractor
 from shared.evaluation.recall import positives_within
 from shared.imaging.preprocessing import Pixels
-from shared.synthetic_city.plan import CityOptions, PlannedPhoto, make_plan
+from shared.synthetic_city.plan import CityOptions, make_plan, positions_m
 from shared.synthetic_city.write import write_city
 
 if TYPE_CHECKING:
@@ -34,17 +34,12 @@ def generate_city(options: CityOptions, folder: Path, progress: Progress) -> Gen
     plan = make_plan(options)
     bar = progress.add_task("rendering", total=len(plan.photos))
     write_city(plan, folder, lambda count: progress.advance(bar, count))
-    database = [photo for photo in plan.photos if photo.role == "database"]
-    queries = [p for p in plan.photos if p.role == "query" and p.kind != "out_of_map"]
-
-    def paths(photos: list[PlannedPhoto]) -> list[Path]:
-        return [folder / photo.folder / photo.name for photo in photos]
-
-    def positions(photos: list[PlannedPhoto]) -> NDArray[np.float64]:
-        return np.array([(photo.camera.x, photo.camera.y) for photo in photos])
-
-    positives = positives_within(positions(queries), positions(database))
-    return GeneratedCity(paths(database), paths(queries), positives)
+    database, queries = plan.evaluation_photos()
+    return GeneratedCity(
+        [photo.path(folder) for photo in database],
+        [photo.path(folder) for photo in queries],
+        positives_within(positions_m(queries), positions_m(database)),
+    )
 
 
 def load_pixels(extractor: Extractor, path: Path) -> Pixels:

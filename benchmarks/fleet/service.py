@@ -182,7 +182,10 @@ def start_embedded_server(
             deadline = time.monotonic() + START_TIMEOUT_SECONDS
             while (running := find_running_server(home)) is None:
                 if server.poll() is not None or time.monotonic() > deadline:
-                    raise Unavailable("server_unreachable", "The server did not start.")
+                    output = (folder / "server.log").read_text(errors="replace")
+                    raise Unavailable(
+                        "server_unreachable", f"The server did not start: {output[-3000:]}"
+                    )
                 time.sleep(0.1)
             yield running
         finally:

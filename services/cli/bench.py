@@ -317,6 +317,8 @@ def scale(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate machines, storage and cost for 10 thousand, 1 million and 100 million photos."""
+    if page is not None and (inputs or measured):
+        raise typer.BadParameter("edit the inputs in the page instead of --set or --measure")
     with report_errors(as_json):
         program = _load_benchmark("scale")
         values = program.measure_inputs() if measured else {}

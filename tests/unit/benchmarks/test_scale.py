@@ -104,6 +104,15 @@ def test_what_is_no_input_is_refused(given: str) -> None:
     assert json.loads(ended.output)["code"] == "unknown_input"
 
 
+def test_page_is_computed_from_its_own_inputs_only(tmp_path: Path) -> None:
+    page = tmp_path / "scale.md"
+    page.write_text(PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    ended = runner.invoke(app, ["scale", "--set", "ram_used=0.5", "--markdown", str(page)])
+    assert ended.exit_code == 2
+    assert runner.invoke(app, ["scale", "--markdown", str(page)]).exit_code == 0
+    assert page.read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
 def test_an_input_is_a_positive_number(value: str) -> None:
     with pytest.raises(Misconfigured, match="above 0"):
