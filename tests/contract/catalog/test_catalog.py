@@ -209,7 +209,7 @@ def test_a_photo_of_no_map_is_refused(catalog: Catalog) -> None:
         add_photo(session, new_id())
 
 
-def generations_of(map_id: UUID, state: GenerationState) -> Select[tuple[Generation]]:
+def generations_of(map_id: UUID, state: GenerationState) -> Select[Generation]:
     return select(Generation).where(Generation.map_id == map_id, Generation.state == state)
 
 
