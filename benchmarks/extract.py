@@ -41,7 +41,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import normalize
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.load_generator import make_jpegs
+from benchmarks.fleet.load_generator import make_jpegs
 from benchmarks.report import Report
 from services.cli.environment import read_settings
 from services.extractor.decoder_pool import DecoderPool

@@ -23,7 +23,7 @@ import torch
 from sqlalchemy import select
 
 from benchmarks.fleet import Fleet, ServiceProcess, open_fleet, start_servers
-from benchmarks.load_generator import make_jpegs, multipart_forms, upload_all, wait_for_jobs
+from benchmarks.fleet.load_generator import make_jpegs, multipart_forms, upload_all, wait_for_jobs
 from benchmarks.report import Report
 from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
@@ -172,7 +172,7 @@ def _start_bare_server(fleet: Fleet) -> Iterator[str]:
     port = free_ports(1)[0]
     service = ServiceProcess(
         "bare",
-        [sys.executable, "-m", "benchmarks.bare_upload", str(port)],
+        [sys.executable, "-m", "benchmarks.fleet.bare_upload", str(port)],
         fleet["gateway-0"].environment | {"PYTHONPATH": str(Path(__file__).parents[1])},
         fleet["gateway-0"].log_path.with_name("bare.log"),
         f"http://127.0.0.1:{port}/readyz",

@@ -22,7 +22,7 @@ from sqlalchemy import func, insert, select
 
 from benchmarks.chaos.run import count_unfinished_jobs
 from benchmarks.fleet import Fleet, open_fleet
-from benchmarks.load_generator import (
+from benchmarks.fleet.load_generator import (
     HttpCaller,
     make_jpegs,
     multipart_form,

@@ -24,7 +24,7 @@ from uuid import UUID
 from sqlalchemy import select
 
 from benchmarks.fleet import Fleet, Servers, start_servers
-from benchmarks.load_generator import (
+from benchmarks.fleet.load_generator import (
     CONTENT_TYPE,
     HttpCaller,
     HttpResponse,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
 from benchmarks.fleet import Fleet, ServiceProcess, open_fleet
-from benchmarks.load_generator import (
+from benchmarks.fleet.load_generator import (
     count_descriptions,
     load_jobs,
     make_jpegs,

@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from benchmarks.fleet.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from benchmarks.fleet.service import start_embedded_server
-from benchmarks.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from benchmarks.report import LatencySummary, Report
 from shared.client import Client
 from shared.errors import Unavailable

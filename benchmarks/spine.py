@@ -17,8 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks.fleet.load_generator import make_jpegs
 from benchmarks.fleet.service import START_TIMEOUT_SECONDS, start_embedded_server
-from benchmarks.load_generator import make_jpegs
 from benchmarks.report import Report
 from shared.client import Client, Json
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from rich.progress import Progress
 
+from benchmarks.fleet.load_generator import HttpCaller
 from benchmarks.fleet.service import ServiceProcess
-from benchmarks.load_generator import HttpCaller
 from benchmarks.report import Report
 from benchmarks.search.methods import BruteForce, Ranking, same_ranking
 from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
