@@ -12,10 +12,9 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import median
+from typing import Any
 
 from rich.table import Table
-
-from shared.client import Json
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class Report:
 
     title: str
     figures: list[Figure] = field(default_factory=list)
-    details: Json = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
     """Further values of the JSON output; not shown in the table."""
     tables: list[Table] = field(default_factory=list)
     """Shown before that of the figures."""
@@ -85,7 +84,7 @@ class Report:
         """Whether any value misses its target."""
         return any(figure.missed for figure in self.figures)
 
-    def as_json(self) -> Json:
+    def as_json(self) -> dict[str, Any]:
         figures = [
             {
                 "what": figure.what,

@@ -20,7 +20,6 @@ import numpy as np
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from shared.client import Json
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.search_api.client import MAX_CONCURRENT_CALLS
@@ -113,7 +112,7 @@ class Sizing:
                 found[-1].add_row(*row)
         return found
 
-    def as_json(self) -> Json:
+    def as_json(self) -> dict[str, Any]:
         """Return inputs, and for each size the plan and the limits, without units."""
         plans = []
         for width in WIDTHS:

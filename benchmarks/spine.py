@@ -15,17 +15,19 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from benchmarks.fleet.load_generator import make_jpegs
 from benchmarks.fleet.service import START_TIMEOUT_SECONDS, start_embedded_server
 from benchmarks.report import Report
-from shared.client import Client, Json
+from placewise.client import Client
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 CLIENTS = 4
+
+Answer = TypeVar("Answer")
 
 
 def measure(progress: Progress, *, photos: int, queries: int) -> Report:
@@ -49,7 +51,7 @@ def _measure_calls(
 ) -> None:
     bar = progress.add_task("calls", total=len(files) + 2 * queries)
 
-    def timed(call: Callable[[], Json]) -> tuple[float, Json]:
+    def timed(call: Callable[[], Answer]) -> tuple[float, Answer]:
         started_at = time.perf_counter()
         response = call()
         progress.advance(bar)
@@ -60,13 +62,12 @@ def _measure_calls(
         uploads = list(pool.map(lambda file: timed(partial(client.upload, file)), files))
     uploaded_at = time.perf_counter()
     for _, response in uploads:
-        client.wait_for(response["job_id"])
+        client.wait(response)
     searchable_at = time.perf_counter()
     stored = [
-        timed(partial(client.similar_to, response["file_id"]))[0]
-        for _, response in uploads[:queries]
+        timed(partial(client.similar, response.file_id))[0] for _, response in uploads[:queries]
     ]
-    new = [timed(partial(client.similar_to_file, file))[0] for file in files[:queries]]
+    new = [timed(partial(client.similar, file))[0] for file in files[:queries]]
     for name, seconds, rate in (
         ("upload, 4 clients", [s for s, _ in uploads], len(files) / (uploaded_at - started_at)),
         ("query by stored photo", stored, len(stored) / sum(stored)),
