@@ -265,7 +265,7 @@ class PresignedUpload(Base):
     filename: Mapped[str] = mapped_column(Text)
     size_bytes: Mapped[int] = mapped_column(BigInteger)
     sha256: Mapped[str] = mapped_column(String(64))
-    said: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    photo_fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
     status: Mapped[int | None] = mapped_column(Integer)
     answer: Mapped[str | None] = mapped_column(Text)  # JSON, as it was sent
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())

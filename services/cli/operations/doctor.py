@@ -165,7 +165,7 @@ def _check_dinov2(recipe: ExtractorConfig, weights: Path | None) -> str:
 
 
 def _default_recipe(settings: Settings) -> ExtractorConfig:
-    return settings.recipe(settings.new_map_extractor)
+    return settings.extractor_config(settings.new_map_extractor)
 
 
 MIN_FREE_DISK_BYTES = 1_000_000_000
