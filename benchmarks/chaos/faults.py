@@ -14,8 +14,8 @@ from benchmarks.fleet import Fleet
 from benchmarks.fleet.fault_injection import MessageDuplicator, ProxyMode
 from tests.support.servers.handle import Handle
 
-# From beginning to end these have another idea of the time of day, by so many seconds. S3 servers
-# reject what is signed with a clock that is off by more than 900.
+# Services whose clock is wrong during the whole run, by so many seconds. S3 servers reject what is
+# signed with a clock that is off by more than 900.
 CLOCK_OFFSETS_SECONDS = {
     "gateway-1": 600,
     "extractor-1": 600,

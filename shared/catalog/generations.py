@@ -94,19 +94,10 @@ class Generation(Journaled, Base):
 
 def active_generation(session: Session, map_id: UUID) -> Generation | None:
     """Return the map's active generation, if any."""
-    return _generation_in_state(session, map_id, GenerationState.ACTIVE)
-
-
-def building_generation(session: Session, map_id: UUID) -> Generation | None:
-    """Return the map's generation that is being built, if any."""
-    return _generation_in_state(session, map_id, GenerationState.BUILDING)
-
-
-def _generation_in_state(
-    session: Session, map_id: UUID, state: GenerationState
-) -> Generation | None:
     return session.scalar(
-        select(Generation).where(Generation.map_id == map_id, Generation.state == state)
+        select(Generation).where(
+            Generation.map_id == map_id, Generation.state == GenerationState.ACTIVE
+        )
     )
 
 
