@@ -79,7 +79,7 @@ class _PrecisionComparison:
     def add(self, photos: list[Pixels]) -> None:
         local: list[torch.Tensor] = []
         for precision in PRECISIONS:
-            made = self.single.at(precision)
+            made = self.single.with_precision(precision)
             local.append(torch.stack(made.local_features(photos)))
             self.rows[precision].append(made.describe(photos, self.centres))
         self.patch_cosines.append((local[0] * local[1]).sum(dim=-1).flatten().numpy())

@@ -20,6 +20,7 @@ from prometheus_client.registry import Collector
 from services.extractor.publish import PublishResult
 from shared.descriptors.inference import gpu_memory
 from shared.jobs import JobKind
+from shared.jobs.runner import StepOutcome
 
 METRIC_PREFIX = "placewise_extractor"
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -41,6 +42,13 @@ STAGE_BUCKETS_SECONDS = (
     120.0,
 )
 LOAD_BUCKETS_SECONDS = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+# A step that is done is not counted here: its jobs are, each with its own outcome.
+STEP_OUTCOME_LABELS = {
+    StepOutcome.INTERRUPTED: "given_back",
+    StepOutcome.PAUSED: "paused",
+    StepOutcome.FAILED: "refused",
+    StepOutcome.CRASHED: "crashed",
+}
 
 
 class ExtractorMetrics:
@@ -93,6 +101,11 @@ class ExtractorMetrics:
     def count_outcome(self, kind: JobKind, outcome: str, jobs: int = 1) -> None:
         """Count jobs with an outcome."""
         self._jobs.labels(kind, outcome).inc(jobs)
+
+    def count_step_outcome(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
+        """Count the jobs of a step that was not done."""
+        if outcome in STEP_OUTCOME_LABELS:
+            self.count_outcome(kind, STEP_OUTCOME_LABELS[outcome], jobs)
 
     def observe_batch(
         self, kind: JobKind, outcome: PublishResult, seconds: dict[str, float]

@@ -120,7 +120,7 @@ class ModelRegistry:
             precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
             extractor = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
-            return extractor.at(precision)
+            return extractor.with_precision(precision)
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
         """Return the generation's extractor in the precision that the generation was created with.
