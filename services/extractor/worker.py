@@ -46,7 +46,7 @@ from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
-from shared.jobs.runner import ClaimedJobs, JobRunner
+from shared.jobs.runner import IDLE_POLL_SECONDS, ClaimedJobs, JobRunner
 from shared.jobs.trace_context import job_trace_context
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows
@@ -55,7 +55,6 @@ from shared.telemetry.heartbeat import Heartbeat
 log = logging.getLogger(__name__)
 
 QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is described
-IDLE_POLL_SECONDS = 1.0  # polling interval when idle: the delay that a lost wakeup costs
 
 
 @dataclass(slots=True)

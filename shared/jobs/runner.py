@@ -45,7 +45,7 @@ from shared.jobs.transitions import cancel_batch_items, fail_job, release_job
 
 log = logging.getLogger(__name__)
 
-IDLE_POLL_SECONDS = 0.5
+IDLE_POLL_SECONDS = 0.5  # the delay that a lost wakeup costs
 UNAVAILABLE_RETRY_SECONDS = 2.0  # while the store, the search tier or the catalog is unavailable
 REFUSED_RETRY_SECONDS = 15.0  # retry delay of photos that need an operator (say, missing weights)
 
