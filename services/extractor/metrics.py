@@ -42,13 +42,7 @@ STAGE_BUCKETS_SECONDS = (
     120.0,
 )
 LOAD_BUCKETS_SECONDS = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
-# A step that is done is not counted here: its jobs are, each with its own outcome.
-STEP_OUTCOME_LABELS = {
-    StepOutcome.INTERRUPTED: "given_back",
-    StepOutcome.PAUSED: "paused",
-    StepOutcome.FAILED: "refused",
-    StepOutcome.CRASHED: "crashed",
-}
+STEP_OUTCOME_LABELS = {StepOutcome.INTERRUPTED: "given_back", StepOutcome.FAILED: "refused"}
 
 
 class ExtractorMetrics:
@@ -103,9 +97,9 @@ class ExtractorMetrics:
         self._jobs.labels(kind, outcome).inc(jobs)
 
     def count_step_outcome(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
-        """Count the jobs of a step that was not done."""
-        if outcome in STEP_OUTCOME_LABELS:
-            self.count_outcome(kind, STEP_OUTCOME_LABELS[outcome], jobs)
+        """Count the jobs of a step that was not done; `observe_batch` counts the others."""
+        if outcome != StepOutcome.DONE:
+            self.count_outcome(kind, STEP_OUTCOME_LABELS.get(outcome, outcome), jobs)
 
     def observe_batch(
         self, kind: JobKind, outcome: PublishResult, seconds: dict[str, float]

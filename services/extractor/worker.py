@@ -46,7 +46,7 @@ from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
-from shared.jobs.runner import IDLE_POLL_SECONDS, ClaimedJobs, JobRunner
+from shared.jobs.runner import ClaimedJobs, JobRunner
 from shared.jobs.trace_context import job_trace_context
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows
@@ -61,7 +61,7 @@ QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is d
 class ExtractorBatch(ClaimedJobs):
     """Claimed jobs, and the pending decoding of their photos."""
 
-    preparation: Future[DescribeBatch | PreparedComparison | None] | None
+    preparation: Future[DescribeBatch | PreparedComparison | None] | None = None
     """A result of None means that the map has no vocabulary yet. The future itself is None for a
     step of a model change and for the import of a checkpoint."""
 
@@ -135,7 +135,7 @@ class ExtractorWorker:
                 log.info("drained: %s", result.as_dict())
             return result.claimed > 0
 
-        self._runner.run(drain, stop, lambda: hints.wait(IDLE_POLL_SECONDS))
+        self._runner.run(drain, stop, hints.wait)
 
     def drain_once(self, stop: threading.Event, seconds: float) -> DrainStats | None:
         """Drain as `drain` does; pause and return None if the catalog was unavailable."""
@@ -244,7 +244,7 @@ class ExtractorWorker:
         self._metrics.observe_claim(claimed.kind, len(jobs))
         result.claimed += len(jobs)
         result.maps.add(str(jobs[0].map_id))
-        work = ExtractorBatch(jobs, claimed.lease, None)
+        work = ExtractorBatch(jobs, claimed.lease)
         if claimed.kind == JobKind.COMPARE:
             work.preparation = self._prepare_executor.submit(self._comparisons.prepare, jobs[0])
         elif claimed.kind not in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS):
@@ -315,9 +315,9 @@ class ExtractorWorker:
 
     @contextlib.contextmanager
     def _step(self, work: ExtractorBatch, name: str, result: DrainStats) -> Iterator[None]:
-        with self._runner.step(work, name) as step:
+        with self._runner.step(work, name):
             yield
-        result.failed += step.failed
+        result.failed += work.failed
 
     def _publish(self, work: ExtractorBatch, rows: Rows, result: DrainStats) -> None:
         with self._step(work, "publish", result):

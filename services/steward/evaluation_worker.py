@@ -96,7 +96,7 @@ class EvaluationWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run jobs until `stop` is set."""
-        self._runner.run(lambda: self.run_next(stop), stop)
+        self._runner.run(lambda: self.run_next(stop), stop, stop.wait)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run the next job; False when there is none."""

@@ -33,7 +33,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.base import db_now
 from shared.catalog.batch_items import has_batch_items
 from shared.catalog.database_errors import OutageLog
-from shared.catalog.jobs import Job, JobKind
+from shared.catalog.jobs import Job, JobKind, JobState
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
@@ -72,6 +72,8 @@ class ClaimedJobs:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
+    failed: int = 0
+    """Number of jobs that a step has failed because of a PlacewiseError."""
 
     @property
     def token(self) -> UUID:
@@ -82,19 +84,11 @@ class ClaimedJobs:
         return JobKind(self.jobs[0].kind)
 
 
-@dataclass(slots=True)
-class JobStep:
-    """Outcome of a step, set when it has ended."""
-
-    outcome: StepOutcome = StepOutcome.DONE
-    failed: int = 0
-    """Number of jobs that have failed for good."""
-
-
+@dataclass
 class JobRunner:
     """Runs the jobs of one worker.
 
-    Args:
+    Attributes:
         catalog: The catalog.
         settings: LEASE_SECONDS and MAX_ATTEMPTS.
         worker: Name of the worker, stored with its jobs.
@@ -102,37 +96,28 @@ class JobRunner:
         on_outcome: Called with kind, outcome and number of jobs after each step, for metrics.
     """
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        settings: Settings,
-        worker: str,
-        kinds: Sequence[JobKind],
-        on_outcome: Callable[[JobKind, StepOutcome, int], object],
-    ) -> None:
-        self._catalog = catalog
-        self._settings = settings
-        self._worker = worker
-        self._kinds = kinds
-        self._on_outcome = on_outcome
-        self._outage = OutageLog(f"worker {worker}")
+    catalog: Catalog
+    settings: Settings
+    worker: str
+    kinds: Sequence[JobKind]
+    on_outcome: Callable[[JobKind, StepOutcome, int], object]
+
+    def __post_init__(self) -> None:
+        self._outage = OutageLog(f"worker {self.worker}")
 
     def run(
         self,
         work: Callable[[], bool],
         stop: threading.Event,
-        wait: Callable[[], object] | None = None,
+        wait: Callable[[float], object],
     ) -> None:
-        """Repeat `work` until `stop` is set.
+        """Repeat `work`, which returns whether there were jobs, until `stop` is set.
 
-        Args:
-            work: Runs jobs; returns False when there were none.
-            stop: Ends the loop once `work` has returned.
-            wait: Waits for new jobs; by default for IDLE_POLL_SECONDS, or until `stop` is set.
+        Without jobs, `wait` waits for new ones, at most the given seconds.
         """
         while not stop.is_set():
             if self.run_once(work, stop) is False:
-                wait() if wait is not None else stop.wait(IDLE_POLL_SECONDS)
+                wait(IDLE_POLL_SECONDS)
 
     def run_once(self, work: Callable[[], Result], stop: threading.Event) -> Result | None:
         """Run `work`; pause and return None if the catalog was unavailable.
@@ -165,8 +150,8 @@ class JobRunner:
 
     def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
         """Return whether `claim` with the same arguments would find a job."""
-        with self._catalog.read() as session:
-            return has_claimable_jobs(session, self._kinds, min_priority, alone=alone)
+        with self.catalog.read() as session:
+            return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
 
     def claim(
         self,
@@ -177,14 +162,14 @@ class JobRunner:
         started: bool = True,
     ) -> ClaimedJobs | None:
         """Claim jobs and begin to renew their lease; see `claim_jobs`. None if there are none."""
-        lease_seconds = self._settings.lease_seconds
-        with self._catalog.write() as session:
+        lease_seconds = self.settings.lease_seconds
+        with self.catalog.write() as session:
             jobs = claim_jobs(
                 session,
-                worker=self._worker,
+                worker=self.worker,
                 limit=limit,
                 lease_seconds=lease_seconds,
-                kinds=self._kinds,
+                kinds=self.kinds,
                 min_priority=min_priority,
                 alone=alone,
                 started=started,
@@ -192,71 +177,65 @@ class JobRunner:
         if not jobs:
             return None
         claimed = ClaimedJobs(jobs, contextlib.ExitStack())
-        claimed.lease.enter_context(maintain_lease(self._catalog, claimed.token, lease_seconds))
+        claimed.lease.enter_context(maintain_lease(self.catalog, claimed.token, lease_seconds))
         return claimed
 
     def release(self, claimed: ClaimedJobs) -> None:
         """Return the jobs to the queue because the worker stops, without counting an attempt."""
-        self._update(claimed, release_job)
-        self._on_outcome(claimed.kind, StepOutcome.INTERRUPTED, len(claimed.jobs))
+        self._update(claimed, lambda _session, job: release_job(job))
+        self.on_outcome(claimed.kind, StepOutcome.INTERRUPTED, len(claimed.jobs))
 
     @contextlib.contextmanager
-    def step(self, claimed: ClaimedJobs, name: str) -> Iterator[JobStep]:
+    def step(self, claimed: ClaimedJobs, name: str) -> Iterator[None]:
         """Context manager that traces a step of the jobs and handles its exceptions.
 
         The jobs are updated as the module's table says. Only an error of that update is raised.
         """
-        step = JobStep()
-        jobs = f"{len(claimed.jobs)} {claimed.kind} jobs (first: {claimed.jobs[0].id})"
+        outcome, together = StepOutcome.DONE, len(claimed.jobs)
+        jobs = f"{together} {claimed.kind} jobs (first: {claimed.jobs[0].id})"
         with job_trace_context(claimed.jobs, name):
             try:
-                yield step
+                yield
             except JobInterrupted:
-                step.outcome = StepOutcome.INTERRUPTED
+                outcome = StepOutcome.INTERRUPTED
                 log.info("%s: interrupted", jobs)
-                self._update(claimed, release_job)
+                self._update(claimed, lambda _session, job: release_job(job))
             except (Unavailable, OSError, SQLAlchemyError) as error:
-                step.outcome = StepOutcome.PAUSED
-                log.warning("%s: retried in %g s: %s", jobs, UNAVAILABLE_RETRY_SECONDS, error)
+                outcome, delay = StepOutcome.PAUSED, UNAVAILABLE_RETRY_SECONDS
+                log.warning("%s: retried in %g s: %s", jobs, delay, error)
                 problem = error.as_problem() if isinstance(error, PlacewiseError) else None
                 self._update(
                     claimed,
-                    lambda job: release_job(
-                        job, after_seconds=UNAVAILABLE_RETRY_SECONDS, problem=problem
-                    ),
+                    lambda _session, job: release_job(job, after_seconds=delay, problem=problem),
                 )
             except PlacewiseError as error:
-                step.outcome = StepOutcome.FAILED
+                outcome, refusal = StepOutcome.FAILED, error.as_problem()
                 log.error("%s: %s", jobs, error.detail)
-                step.failed = self._fail_or_defer(claimed, error.as_problem())
+                updated = self._update(
+                    claimed, lambda session, job: _fail_or_defer(session, job, refusal)
+                )
+                claimed.failed = sum(job.state == JobState.FAILED for job in updated)
             except Exception as error:
-                step.outcome = StepOutcome.CRASHED
+                outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
                 log.exception("%s: crashed", jobs)
-                self._record_crash(claimed, type(error).__name__)
-            self._on_outcome(claimed.kind, step.outcome, len(claimed.jobs))
+                max_attempts = self.settings.max_attempts
+                self._update(
+                    claimed,
+                    lambda session, job: _retry_after_crash(
+                        session, job, max_attempts, together, event
+                    ),
+                )
+            self.on_outcome(claimed.kind, outcome, together)
 
-    def _update(self, claimed: ClaimedJobs, transition: Callable[[Job], None]) -> None:
-        with self._catalog.write() as session:
-            for job in lock_leased_jobs(session, claimed.token, claimed.jobs):
-                transition(job)
-
-    def _fail_or_defer(self, claimed: ClaimedJobs, problem: dict[str, Any]) -> int:
-        """Fail the jobs, except stored photos; return the number of failed ones."""
-        failed = 0
-        with self._catalog.write() as session:
-            for job in lock_leased_jobs(session, claimed.token, claimed.jobs):
-                if job.kind in (JobKind.INDEX, JobKind.REINDEX):
-                    release_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
-                else:
-                    _fail_for_good(session, job, problem)
-                    failed += 1
-        return failed
-
-    def _record_crash(self, claimed: ClaimedJobs, cause: str) -> None:
-        with self._catalog.write() as session:
-            for job in lock_leased_jobs(session, claimed.token, claimed.jobs):
-                job.claimed_together = len(claimed.jobs)
-                _retry_after_crash(session, job, self._settings.max_attempts, cause)
+    def _update(
+        self, claimed: ClaimedJobs, transition: Callable[[Session, Job], None]
+    ) -> list[Job]:
+        """Apply the transition to the jobs that are still under the lease, and return them."""
+        with self.catalog.write() as session:
+            jobs = lock_leased_jobs(session, claimed.token, claimed.jobs)
+            for job in jobs:
+                transition(session, job)
+        return jobs
 
 
 def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: bool = False) -> int:
@@ -277,27 +256,39 @@ def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: b
         expired = expired.where(Job.lease_until < db_now())
     jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
     for job in jobs:
-        _retry_after_crash(session, job, max_attempts, cause=None)
+        _retry_after_crash(session, job, max_attempts, job.claimed_together, "died")
     return len(jobs)
 
 
-def _retry_after_crash(session: Session, job: Job, max_attempts: int, cause: str | None) -> None:
-    """Retry or fail a job whose worker died (`cause` is None) or raised an exception (its name).
+def _retry_after_crash(
+    session: Session, job: Job, max_attempts: int, together: int, event: str
+) -> None:
+    """Retry or fail a job whose worker died or raised an exception (`event`).
 
-    A job that was in a batch of several is retried alone without counting an attempt, to isolate
-    the job that crashed the worker. A job that ran alone fails after `max_attempts`.
+    A job that ran `together` with others is retried alone without counting an attempt, to isolate
+    the job that crashed the worker. A job that ran alone fails after `max_attempts`. A job that had
+    not started (0) can't be the cause.
     """
-    if job.claimed_together == 0:  # not started: the job can't be the cause
-        release_job(job)
-        return
-    ran_alone = job.claimed_together == 1
-    job.attempts += ran_alone
+    job.attempts += together == 1
     # An upload batch continues without the photo that may be the cause: see BatchWorker.
-    if job.attempts >= max_attempts and not has_batch_items(job):
-        _fail_for_good(session, job, _worker_crash_problem(job, cause))
+    if together == 1 and job.attempts >= max_attempts and not has_batch_items(job):
+        error = PlacewiseError(
+            "worker_fell",
+            f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "
+            "If the photo is valid, check the worker's log and memory, then retry the job.",
+        )
+        _fail_for_good(session, job, error.as_problem())
         return
-    job.alone = job.alone or not ran_alone
+    job.alone = job.alone or together > 1
     release_job(job)
+
+
+def _fail_or_defer(session: Session, job: Job, problem: dict[str, Any]) -> None:
+    """Fail the job; a stored photo is retried instead, because an operator can remove the cause."""
+    if job.kind in (JobKind.INDEX, JobKind.REINDEX):
+        release_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
+    else:
+        _fail_for_good(session, job, problem)
 
 
 def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
@@ -305,17 +296,3 @@ def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
     fail_job(job, problem)
     abandon_generation(session, job)
     cancel_batch_items(session, job)
-
-
-def _worker_crash_problem(job: Job, cause: str | None) -> dict[str, Any]:
-    event = f"crashed ({cause})" if cause else "died"
-    return {
-        "type": "urn:placewise:problem:worker_fell",
-        "title": "The worker crashed",
-        "status": 500,
-        "code": "worker_fell",
-        "detail": (
-            f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "
-            "If the photo is valid, check the worker's log and memory, then retry the job."
-        ),
-    }

@@ -85,9 +85,9 @@ def test_the_jobs_of_a_crashed_batch_are_retried_alone_until_the_cause_fails(
     good, bad = queue(catalog, JobKind.INDEX, 2)
     claimed = recorder.runner.claim(limit=2)
     assert claimed is not None
-    with claimed.lease, recorder.runner.step(claimed, "describe") as step:
+    with claimed.lease, recorder.runner.step(claimed, "describe"):
         raise RuntimeError("one of the two photos")
-    assert (step.outcome, step.failed) == (StepOutcome.CRASHED, 0)
+    assert recorder.outcomes == [(JobKind.INDEX, StepOutcome.CRASHED, 2)]
     assert all(read_job(catalog, job_id).alone for job_id in (good, bad))
     assert [read_job(catalog, job_id).attempts for job_id in (good, bad)] == [0, 0]
 
@@ -139,7 +139,7 @@ def test_the_loop_outlasts_an_outage_of_the_catalog(
             raise OperationalError("the catalog is away", None, Exception())
         return call == "job"
 
-    def wait() -> None:
+    def wait(_seconds: float) -> None:
         waits.append("waited")
         stop.set()
 

@@ -261,7 +261,7 @@ class BatchWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run batches until `stop` is set."""
-        self._runner.run(lambda: self.run_next(stop), stop)
+        self._runner.run(lambda: self.run_next(stop), stop, stop.wait)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run a slice of the next batch; False when there is none."""
