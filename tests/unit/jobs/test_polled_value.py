@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -26,11 +27,11 @@ def test_a_value_is_polled_once_per_interval() -> None:
 
 
 def test_a_failed_poll_raises_and_is_repeated() -> None:
-    results = iter([ZeroDivisionError(), 7])
+    results: Iterator[int | ZeroDivisionError] = iter([ZeroDivisionError(), 7])
 
     def poll() -> int:
         result = next(results)
-        if isinstance(result, Exception):
+        if isinstance(result, ZeroDivisionError):
             raise result
         return result
 
