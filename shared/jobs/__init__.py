@@ -1,4 +1,4 @@
-"""The job queue: claims, leases, state transitions and wake-ups.
+"""The job queue: claims, leases, the job runner, state transitions and wake-ups.
 
 The `jobs` table is the queue and the only source of truth. A wake-up (`shared.jobs.wakeups`), also
 called a hint, only makes a worker look at the table sooner.
