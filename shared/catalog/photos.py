@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any, ClassVar
 from uuid import UUID
 
@@ -44,13 +43,9 @@ from shared.catalog.base import (
     filename_trigrams,
     partial_index,
 )
+from shared.catalog.photo_role import PhotoRole as PhotoRole
 from shared.errors import Gone, NotFound
 from shared.ids import new_id
-
-
-class PhotoRole(StrEnum):
-    DATABASE = "database"  # indexed and searchable
-    QUERY = "query"  # a labelled query for evaluations: described, but never a search result
 
 
 class Photo(Journaled, Base):
