@@ -60,7 +60,7 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
                 time.sleep(0.01)
             with Client(running.url, map_name, running.local_key) as client:
                 yield client
-        except PlacewiseError as error:
+        except Exception as error:
             if running.error is not None:  # why the server has stopped
                 raise running.error from error
             raise
