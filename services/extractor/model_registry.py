@@ -97,7 +97,7 @@ class ModelRegistry:
         with self._lock:
             if recipe.name not in self._extractors:
                 self._extractors[recipe.name] = self._load(recipe, precision)
-            return self._extractors[recipe.name].at(precision)
+            return self._extractors[recipe.name].with_precision(precision)
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
         """Return the generation's extractor in the precision that the generation was created with.

@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -34,10 +32,9 @@ from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ingest.store_photo import PhotoQuota
-from shared.jobs.queue_depth import QueueDepth, measure_queue_depth
+from shared.jobs.queue_depth import PolledValue, QueueDepth, measure_queue_depth
 
 ADMISSION_POLL_SECONDS = 1.0
-POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
 RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share of its limit
 MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
@@ -125,9 +122,7 @@ class AdmissionControl:
         self._catalog = catalog
         self._settings = settings
         self.disk = DiskSpace(settings)
-        self._refresh_lock = threading.Lock()
-        self._queue_depth: QueueDepth | None = None
-        self._next_refresh = 0.0
+        self._queue_depth = PolledValue(self._measure_queue_depth, ADMISSION_POLL_SECONDS)
         self._admitted: Counter[str | None] = Counter()  # since the last poll; None: queries
         self._active_uploads = {
             kind: ConcurrencyLimit(
@@ -203,26 +198,13 @@ class AdmissionControl:
 
     def queue_depth(self) -> QueueDepth:
         """Returns the depth of the queue, at most about a second old."""
-        # While another thread polls, the previous result is used.
-        due = self._queue_depth is None or time.monotonic() >= self._next_refresh
-        if due and self._refresh_lock.acquire(blocking=self._queue_depth is None):
-            try:
-                self._refresh()
-            finally:
-                self._refresh_lock.release()
-        assert self._queue_depth is not None
-        return self._queue_depth
+        return self._queue_depth.get()
 
-    def _refresh(self) -> None:
-        started = time.monotonic()
-        if self._queue_depth is not None and started < self._next_refresh:
-            return  # another thread has polled while this one waited for the lock
+    def _measure_queue_depth(self) -> QueueDepth:
         limit = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
         self._admitted.clear()  # before the poll: a job may be counted twice, but is never missed
         with self._catalog.read() as session:
-            self._queue_depth = measure_queue_depth(session, limit)
-        elapsed = time.monotonic() - started
-        self._next_refresh = started + max(ADMISSION_POLL_SECONDS, POLL_COST_DIVISOR * elapsed)
+            return measure_queue_depth(session, limit)
 
 
 def get_admission_control(request: Request) -> AdmissionControl:

@@ -134,7 +134,7 @@ class Scheduler:
         reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
         self._journal = PeriodicTask("write journal", 2.0, JournalTask(catalog, store, metrics))
         self.tasks = [
-            *([PeriodicTask("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
+            *([PeriodicTask("keep disk reserve", 5.0, reserve.maintain)] if reserve else []),
             PeriodicTask(
                 "free leases",
                 1.0,

@@ -19,10 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from alembic import command
-from alembic.config import Config
-from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
+from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from shared.catalog.database_errors import DAMAGED, get_sqlstate, reason_of, to_unavailable
@@ -82,9 +79,8 @@ def check_schema(catalog: Catalog) -> None:
         Misconfigured: `schema_outdated`: the schema is older than this release needs.
             `schema_too_new`: a later release has changed it incompatibly; additions are compatible.
     """
-    scripts = ScriptDirectory.from_config(_config())
-    known = {script.revision for script in scripts.walk_revisions()}
-    head = scripts.get_current_head()
+    known = _known_revisions()
+    head = known[-1]
     present, understood_from = _read_schema_revision(catalog)
     if present == head:
         return
@@ -155,10 +151,10 @@ def _migrate_sqlite(catalog: Catalog) -> None:
         file = Path(catalog.url.database)
         make_private_folder(file.parent)
         file.touch(FILE_MODE)  # SQLite gives its -wal and -shm files the same mode
+    if _read_schema_revision(catalog)[0] == _known_revisions()[-1]:
+        return
     with catalog.engine.execution_options(placewise_write=True).begin() as connection:
-        config = _config()
-        config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+        _upgrade(connection)
 
 
 def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
@@ -167,9 +163,7 @@ def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
         while True:
             try:
                 with engine.connect() as connection:
-                    config = _config()
-                    config.attributes["connection"] = connection
-                    command.upgrade(config, "head")
+                    _upgrade(connection)
                 return
             except DBAPIError as error:
                 is_retryable = get_sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
@@ -203,10 +197,20 @@ def _migration_lock(catalog: Catalog, deadline: float) -> Iterator[None]:
         time.sleep(SCHEMA_POLL_SECONDS)
 
 
-def _config() -> Config:
+def _upgrade(connection: Connection) -> None:
+    # Imported here: most starts find the current schema, and loading Alembic takes a while.
+    from alembic import command
+    from alembic.config import Config
+
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS))
-    return config
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+def _known_revisions() -> list[str]:
+    """Return the revisions of the migrations, oldest first: a file's name begins with its own."""
+    return sorted(path.name.partition("_")[0] for path in MIGRATIONS.glob("versions/[0-9]*.py"))
 
 
 # Only `placewise doctor` checks larger catalogs: the check reads the whole file, at about 1 GB/s.

@@ -61,7 +61,6 @@ from shared.ingest.validation import (
 )
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
-from shared.storage.s3 import S3Store
 
 router = APIRouter(tags=["photos"])
 
@@ -289,7 +288,7 @@ def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
 
 
 def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:
-    if isinstance(gateway.store, S3Store):
+    if isinstance(gateway.store, PresigningStore):
         return gateway.store
     raise Conflict(
         "no_direct_uploads",

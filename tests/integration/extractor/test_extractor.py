@@ -358,7 +358,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
             raise OperationalError("the catalog is away", None, Exception())
         return claim_jobs(*arguments, **options)
 
-    monkeypatch.setattr(worker_module, "claim_jobs", claim_or_fail)
+    monkeypatch.setattr("shared.jobs.runner.claim_jobs", claim_or_fail)
     with pytest.raises(OperationalError):
         averages.drain()
     gc.collect()

@@ -65,7 +65,7 @@ def test_pass_that_does_not_fit_is_halved_and_that_is_remembered() -> None:
     )
     backbone.passes.clear()
     made.describe(many, None)
-    made.at("bfloat16").describe(many[:3], None)
+    made.with_precision("bfloat16").describe(many[:3], None)
     assert backbone.passes == [2] * 5 + [2, 1]
 
 
