@@ -20,7 +20,7 @@ from services.trainer.checkpointing import seed_everything
 from services.trainer.grid import GridPlan, PlannedRun, RunFunctions, run_grid
 from services.trainer.leaderboard import leaderboard
 from services.trainer.model_describer import ModelDescriber
-from services.trainer.module import make_model
+from services.trainer.model_factory import make_model
 from services.trainer.resolve import Device
 from services.trainer.run_control import NullDisplay, StopRequest
 from shared.datasets.dataset import EvaluationSet

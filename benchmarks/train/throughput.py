@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,17 +14,19 @@ from PIL import Image
 
 from services.trainer.arguments import build_arguments
 from services.trainer.data import (
+    Batch,
     PlaceBatchSampler,
     PlaceDataset,
-    ResumableDataLoader,
     apply_randaugment,
+    load_batches,
     to_tensor,
 )
 from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
-from services.trainer.module import make_model, make_optimizer
+from services.trainer.model_factory import make_model
 from services.trainer.resolve import Device
 from services.trainer.run_control import NullDisplay
+from services.trainer.training_loop import make_optimizer
 from shared.datasets.dataset import TrainingPlace
 from shared.imaging.decode import decode_resized
 
@@ -109,19 +112,18 @@ def _decode_draft(path: Path) -> None:
     to_tensor(apply_randaugment(decode_resized(path, (IMAGE_PIXELS, IMAGE_PIXELS)), 0))
 
 
-def _batches(places: list[TrainingPlace], workers: int, device: Device) -> ResumableDataLoader:
+def _batches(places: list[TrainingPlace], workers: int, device: Device) -> Iterator[Batch]:
     sampler = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
     dataset = PlaceDataset(sampler, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
     pin_memory = device.accelerator == "gpu"
-    return ResumableDataLoader(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
+    return load_batches(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
 
 
-def _measure_reading(batches: ResumableDataLoader) -> float:
-    iterator = iter(batches)
+def _measure_reading(batches: Iterator[Batch]) -> float:
     for _ in range(WARM_UP_BATCHES):
-        next(iterator)
+        next(batches)
     started_at, count = time.perf_counter(), 0
-    for batch in iterator:
+    for batch in batches:
         count += len(batch.photos)
     return count / (time.perf_counter() - started_at)
 
@@ -147,25 +149,24 @@ def _measure_training(
         value.backward()
         optimizer.step()
 
-    iterator = iter(batches)
     for _ in range(WARM_UP_BATCHES):
-        batch = next(iterator)
+        batch = next(batches)
         step(batch.photos, batch.labels)
-    repeats = max(2, (len(batches) - WARM_UP_BATCHES) // 2)
+    repeats = max(2, (len(places) // PLACES_PER_BATCH - WARM_UP_BATCHES) // 2)
     _synchronise(device)
     started_at = time.perf_counter()
     for _ in range(repeats):
         step(batch.photos, batch.labels)
     _synchronise(device)
     network = repeats * len(batch.photos) / (time.perf_counter() - started_at)
-    iterator = iter(_batches(places, workers, device))
+    batches = _batches(places, workers, device)
     for _ in range(WARM_UP_BATCHES):
-        batch = next(iterator)
+        batch = next(batches)
         step(batch.photos, batch.labels)
     count, waited = 0, 0.0
     _synchronise(device)
     started_at = wait_started_at = time.perf_counter()
-    for batch in iterator:
+    for batch in batches:
         waited += time.perf_counter() - wait_started_at
         step(batch.photos, batch.labels)
         count += len(batch.photos)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,40 +17,55 @@ from services.trainer.checkpointing import (
     restore_rng_state,
     rng_state,
 )
-from services.trainer.module import learning_rate, make_optimizer
 from services.trainer.resolve import check_loggers, resolve_device
+from services.trainer.training_loop import make_lr_scheduler, make_optimizer
 from shared.errors import InvalidRequest, Misconfigured
 
+STEPS_PER_EPOCH = 626
 
-def rate(step: int, epoch: int, warmup_steps: int = 600) -> float:
-    return learning_rate(
-        step, epoch, lr=2e-4, warmup_steps=warmup_steps, milestones=(5, 10, 15, 25), lr_mult=0.3
-    )
+
+def scheduled(step: int, **values: Any) -> float:
+    """The learning rate of a run that continues at this step."""
+    arguments = TrainingArguments(**values)
+    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))], arguments)
+    make_lr_scheduler(optimizer, arguments, STEPS_PER_EPOCH, step)
+    return float(optimizer.param_groups[0]["lr"])
 
 
 @pytest.mark.parametrize(
-    ("step", "epoch", "expected"),
+    ("step", "expected"),
     [
-        (0, 0, 2e-4 / 600),
-        (299, 0, 1e-4),
-        (599, 0, 2e-4),
-        (600, 0, 2e-4),
-        (3000, 4, 2e-4),
-        (3130, 5, 6e-5),
-        (6260, 10, 1.8e-5),
-        (9390, 15, 5.4e-6),
-        (15650, 25, 1.62e-6),
-        (18780, 29, 1.62e-6),
+        (0, 2e-4 / 600),
+        (299, 1e-4),
+        (599, 2e-4),
+        (600, 2e-4),
+        (3129, 2e-4),
+        (3130, 6e-5),
+        (6260, 1.8e-5),
+        (9390, 5.4e-6),
+        (15650, 1.62e-6),
+        (18780, 1.62e-6),
     ],
 )
 def test_the_rate_rises_over_the_warm_up_and_falls_at_milestones(
-    step: int, epoch: int, expected: float
+    step: int, expected: float
 ) -> None:
-    assert rate(step, epoch) == pytest.approx(expected)
+    assert scheduled(step) == pytest.approx(expected)
 
 
 def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
-    assert rate(0, 0, warmup_steps=0) == pytest.approx(2e-4)
+    assert scheduled(0, warmpup_steps=0) == pytest.approx(2e-4)
+
+
+def test_a_resumed_schedule_follows_the_arguments_and_not_the_stored_optimizer() -> None:
+    before = TrainingArguments(lr=0.1, warmpup_steps=0)
+    after = TrainingArguments(lr=0.5, warmpup_steps=0)
+    stored = make_optimizer([torch.nn.Parameter(torch.zeros(1))], before)
+    make_lr_scheduler(stored, before, STEPS_PER_EPOCH)
+    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))], after)
+    optimizer.load_state_dict(stored.state_dict())
+    make_lr_scheduler(optimizer, after, STEPS_PER_EPOCH, step=9)
+    assert optimizer.param_groups[0]["lr"] == 0.5
 
 
 @pytest.mark.parametrize(
