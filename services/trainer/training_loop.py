@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from lightning.fabric import Fabric
 from lightning.pytorch.loggers import Logger
-from torch.optim.lr_scheduler import LambdaLR
 
 from services.trainer.arguments import TrainingArguments
 from services.trainer.checkpointing import TopKCheckpoints, restore_rng_state, rng_state
@@ -50,29 +49,14 @@ def make_optimizer(
     return torch.optim.Adam(trainable, lr, weight_decay=decay)
 
 
-def make_lr_scheduler(
-    optimizer: torch.optim.Optimizer,
-    arguments: TrainingArguments,
-    steps_per_epoch: int,
-    step: int = 0,
-) -> LambdaLR:
-    """Create the learning-rate schedule: linear warm-up times step decay at the milestones.
+def learning_rate(step: int, steps_per_epoch: int, arguments: TrainingArguments) -> float:
+    """Return the learning rate of a step, from 0: linear warm-up times step decay.
 
-    Args:
-        optimizer: its learning rate is set to that of `step`.
-        arguments: `lr`, `warmpup_steps`, `milestones` (epochs) and `lr_mult`.
-        steps_per_epoch: number of batches.
-        step: number of completed steps, from 0.
+    It depends on the step alone, so that a resumed run needs no scheduler state.
     """
-
-    def factor(step: int) -> float:
-        warmup = min(1.0, (step + 1) / max(1, arguments.warmpup_steps))
-        passed = sum(step // steps_per_epoch >= milestone for milestone in arguments.milestones)
-        return warmup * float(arguments.lr_mult**passed)
-
-    for group in optimizer.param_groups:
-        group["initial_lr"] = arguments.lr  # not that of a loaded state: --resume may change it
-    return LambdaLR(optimizer, factor, last_epoch=step - 1)
+    warmup = min(1.0, (step + 1) / max(1, arguments.warmpup_steps))
+    passed = sum(step // steps_per_epoch >= milestone for milestone in arguments.milestones)
+    return arguments.lr * warmup * float(arguments.lr_mult**passed)
 
 
 @dataclass
@@ -134,7 +118,6 @@ class TrainingLoop:
         self._network, self._optimizer = self._fabric.setup(
             run.model, make_optimizer(run.model.parameters(), arguments)
         )
-        self._scheduler = make_lr_scheduler(self._optimizer, arguments, len(self._sampler))
         last_step = arguments.max_epochs * len(self._sampler)
         self._last_step = min(last_step, arguments.max_steps or last_step)
         self._step = 0  # number of completed steps
@@ -153,9 +136,6 @@ class TrainingLoop:
         self._optimizer.load_state_dict(stored["optimizer_states"][0])
         self._precision.load_state_dict(stored.get("MixedPrecision", {}))
         self._step = self._last_saved_step = stored["global_step"]
-        self._scheduler = make_lr_scheduler(
-            self._optimizer, self._arguments, len(self._sampler), self._step
-        )
         self._last_loss = stored["last_loss"]
         # Runs that Lightning's Trainer began have the state of a callback.
         restore_rng_state(stored.get("rng_state") or stored["callbacks"]["TrainingCallback"])
@@ -240,15 +220,17 @@ class TrainingLoop:
                 f"The loss of step {self._step} is {self._last_loss}: training has diverged. "
                 "Try a smaller --lr, more --warmpup_steps or --precision 32.",
             )
+        lr = learning_rate(self._step, len(self._sampler), self._arguments)
+        for group in self._optimizer.param_groups:
+            group["lr"] = lr
         self._optimizer.zero_grad()
         self._fabric.backward(loss)
         self._optimizer.step()
-        metrics = {"loss": self._last_loss, "lr": self._scheduler.get_last_lr()[0]}
+        self._step += 1
+        metrics = {"loss": self._last_loss, "lr": lr}
         accuracy = batch_accuracy(self._loss, self._miner, mined, len(rows))
         if accuracy is not None:
             metrics["b_acc"] = accuracy
-        self._scheduler.step()
-        self._step += 1
         return metrics
 
     @property

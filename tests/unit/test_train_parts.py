@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,18 +17,10 @@ from services.trainer.checkpointing import (
     rng_state,
 )
 from services.trainer.resolve import check_loggers, resolve_device
-from services.trainer.training_loop import make_lr_scheduler, make_optimizer
+from services.trainer.training_loop import learning_rate, make_optimizer
 from shared.errors import InvalidRequest, Misconfigured
 
 STEPS_PER_EPOCH = 626
-
-
-def scheduled(step: int, **values: Any) -> float:
-    """The learning rate of a run that continues at this step."""
-    arguments = TrainingArguments(**values)
-    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))], arguments)
-    make_lr_scheduler(optimizer, arguments, STEPS_PER_EPOCH, step)
-    return float(optimizer.param_groups[0]["lr"])
 
 
 @pytest.mark.parametrize(
@@ -50,22 +41,12 @@ def scheduled(step: int, **values: Any) -> float:
 def test_the_rate_rises_over_the_warm_up_and_falls_at_milestones(
     step: int, expected: float
 ) -> None:
-    assert scheduled(step) == pytest.approx(expected)
+    assert learning_rate(step, STEPS_PER_EPOCH, TrainingArguments()) == pytest.approx(expected)
 
 
 def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
-    assert scheduled(0, warmpup_steps=0) == pytest.approx(2e-4)
-
-
-def test_a_resumed_schedule_follows_the_arguments_and_not_the_stored_optimizer() -> None:
-    before = TrainingArguments(lr=0.1, warmpup_steps=0)
-    after = TrainingArguments(lr=0.5, warmpup_steps=0)
-    stored = make_optimizer([torch.nn.Parameter(torch.zeros(1))], before)
-    make_lr_scheduler(stored, before, STEPS_PER_EPOCH)
-    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))], after)
-    optimizer.load_state_dict(stored.state_dict())
-    make_lr_scheduler(optimizer, after, STEPS_PER_EPOCH, step=9)
-    assert optimizer.param_groups[0]["lr"] == 0.5
+    arguments = TrainingArguments(warmpup_steps=0)
+    assert learning_rate(0, STEPS_PER_EPOCH, arguments) == pytest.approx(2e-4)
 
 
 @pytest.mark.parametrize(
