@@ -27,7 +27,7 @@ from rich.table import Column, Table
 from services.cli.environment import require_packages
 from services.cli.output import JsonOption, console, err_console, print_json, report_errors
 from services.cli.training.options import given_options, with_training_options
-from services.trainer.arguments import build_arguments, load_yaml, resolve_keys
+from services.trainer.arguments import build_arguments, load_yaml
 from shared.errors import InvalidRequest
 
 Json = dict[str, Any]
@@ -167,9 +167,7 @@ def train(
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
-        report = _run_training(
-            config, resume, resolve_keys(given_options(arguments), "the command line")
-        )
+        report = _run_training(config, resume, given_options(arguments))
     if as_json:
         print_json(report)
     else:
@@ -214,8 +212,7 @@ def grid(
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
-        overrides = resolve_keys(given_options(arguments), "the command line")
-        failed = _run_grid_command(file, out, dry_run, as_json, overrides)
+        failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
     if failed:
         raise typer.Exit(1)
 
