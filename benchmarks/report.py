@@ -12,26 +12,26 @@ from shared.client import Json
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A measured value. `wanted` is its bound: a minimum if `at_least`, else a maximum."""
+    """A measured value. `limit` is a minimum if `at_least`, else a maximum."""
 
     what: str
     measured: float
     unit: str = ""
-    wanted: float | None = None
+    limit: float | None = None
     at_least: bool = False
 
     @property
     def missed(self) -> bool:
-        if self.wanted is None:
+        if self.limit is None:
             return False
-        return self.measured < self.wanted if self.at_least else self.measured > self.wanted
+        return self.measured < self.limit if self.at_least else self.measured > self.limit
 
     @property
     def bound(self) -> str:
-        if self.wanted is None:
+        if self.limit is None:
             return ""
         return (
-            f"at {'least' if self.at_least else 'most'} {_format_number(self.wanted)} "
+            f"at {'least' if self.at_least else 'most'} {_format_number(self.limit)} "
             f"{self.unit}".strip()
         )
 
@@ -56,8 +56,8 @@ class Report:
         at_most: float | None = None,
         at_least: float | None = None,
     ) -> None:
-        wanted = at_most if at_least is None else at_least
-        self.figures.append(Figure(what, measured, unit, wanted, at_least is not None))
+        limit = at_most if at_least is None else at_least
+        self.figures.append(Figure(what, measured, unit, limit, at_least is not None))
 
     @property
     def missed(self) -> bool:
@@ -73,7 +73,7 @@ class Report:
                     "what": figure.what,
                     "measured": figure.measured,
                     "unit": figure.unit,
-                    "wanted": figure.bound or None,
+                    "limit": figure.bound or None,
                     "missed": figure.missed,
                 }
                 for figure in self.figures
@@ -82,9 +82,9 @@ class Report:
         }
 
     def table(self) -> Table:
-        table = Table("what", "measured", "wanted", "", title=self.title)
+        table = Table("what", "measured", "limit", "", title=self.title)
         for figure in self.figures:
-            verdict = "" if figure.wanted is None else "missed" if figure.missed else "met"
+            verdict = "" if figure.limit is None else "missed" if figure.missed else "met"
             measured = f"{_format_number(figure.measured)} {figure.unit}".strip()
             table.add_row(
                 figure.what, measured, figure.bound, verdict, style="red" if figure.missed else None

@@ -21,6 +21,7 @@ from torchvision import transforms as tv
 
 from shared.datasets.open_dataset import TrainingPlace
 from shared.errors import Unprocessable
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.decode import decode_resized
 
 ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # keep the random streams independent
@@ -106,8 +107,6 @@ class PlaceBatchSampler:
 
 RANDAUGMENT_OPERATIONS = 3
 RANDAUGMENT_MAGNITUDE = 9
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 
 _randaugment = tv.RandAugment(
     num_ops=RANDAUGMENT_OPERATIONS,

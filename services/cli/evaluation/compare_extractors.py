@@ -20,7 +20,7 @@ from rich.table import Column, Table
 
 from services.cli.environment import read_settings
 from services.cli.evaluation.data_sets import progress_bars
-from services.cli.evaluation.describers import Describer, checkpoint_describer, extractor_describer
+from services.cli.evaluation.describers import checkpoint_describer, extractor_describer
 from services.cli.output import console, print_json, printable_path, progress_bar
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
@@ -240,7 +240,13 @@ def _evaluate_entry(
     faiss_gpu: bool,
     progress: Progress,
 ) -> tuple[dict[str, Any], RetrievalMetrics]:
-    describer = _make_describer(entry, evaluation_set, settings, progress)
+    describer = (
+        checkpoint_describer(Path(entry.name), "same", settings)
+        if entry.name.endswith(".ckpt")
+        else extractor_describer(
+            entry.name, None, evaluation_set, settings, progress, fit=entry.fit
+        )
+    )
     on_progress = progress_bars(progress, entry.spec_text)
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
@@ -278,16 +284,6 @@ def _evaluate_entry(
         "fingerprint": describer.fingerprint,
         "device": str(describer.about.get("device", "")),
     }, measured
-
-
-def _make_describer(
-    entry: ComparisonEntry, evaluation_set: EvaluationSet, settings: Settings, progress: Progress
-) -> Describer:
-    if entry.name.endswith(".ckpt"):
-        return checkpoint_describer(Path(entry.name), "same", settings)
-    recipe = get_extractor_config(entry.name, allow_test_extractors=settings.allow_test_extractors)
-    database = [photo.path for photo in evaluation_set.database]
-    return extractor_describer(recipe, None, database, settings, progress, fit=entry.fit)
 
 
 def _comparison_as_json(

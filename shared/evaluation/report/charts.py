@@ -148,9 +148,10 @@ def positions_chart(result: EvaluationResult) -> tuple[str, str] | None:
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="metres east", ylabel="metres north")
     shown = database[~np.isnan(database[:, 0])]
-    axes.scatter(*shown[:: -(-len(shown) // MAX_DATABASE_POINTS)].T, s=4, color=GREY)
+    shown = shown[:: -(-len(shown) // MAX_DATABASE_POINTS)]
+    axes.scatter(shown[:, 0], shown[:, 1], s=4, color=GREY)
     axes.add_collection(LineCollection(list(segments), colors=colours[has_match], linewidths=0.8))
-    axes.scatter(*starts.T, s=12, c=colours, zorder=3)
+    axes.scatter(starts[:, 0], starts[:, 1], s=12, c=colours, zorder=3)
     caption = f"{len(located)} of {len(queries)} queries, UTM zone {zone or 'unknown'}"
     return render_chart(figure, "Map of queries and their first matches"), caption
 
