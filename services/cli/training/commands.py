@@ -125,19 +125,14 @@ def print_summary(report: Json) -> None:
 
 
 def _summary_rows(report: Json) -> list[tuple[str, str, Json]]:
+    from services.trainer.leaderboard import best_epoch
+
     rows = []
     if report.get("epochs"):
-        monitor = report["monitor"]
-        best_epoch = max(
-            report["epochs"],
-            key=lambda epoch: (
-                epoch["figures"].get(monitor, 0.0)
-                * (1 if report["arguments"]["mode"] == "max" else -1)
-            ),
-        )
+        best = best_epoch(report)
         for name in report["arguments"]["val_set_names"]:
-            recall = {k: best_epoch["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
-            rows.append((name, f"validation, epoch {best_epoch['number'] + 1}", recall))
+            recall = {k: best["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
+            rows.append((name, f"validation, epoch {best['number'] + 1}", recall))
     rows += [(name, "test", result["recall"]) for name, result in report["test"].items()]
     return rows
 

@@ -61,10 +61,8 @@ class ComparedExtractor:
         if self.difference is None:
             return ""
         mean = f"{100 * self.difference.mean:+.1f}"
-        if self.difference.low is None or self.difference.high is None:
-            return mean
-        low, high = 100 * self.difference.low, 100 * self.difference.high
-        return f"{mean} ({low:+.1f} to {high:+.1f})"
+        interval = self.difference.interval_in_points()
+        return mean if interval is None else f"{mean} ({interval})"
 
     def as_json(self) -> dict[str, Any]:
         metrics = self.measured.as_json()
@@ -124,9 +122,7 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
 def _table_row(extractor: ComparedExtractor) -> str:
     values = [f"{100 * recall:.1f}" for recall in extractor.measured.recalls.recall_all.values()]
     interval = extractor.measured.recall_intervals
-    values.append(
-        f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-"
-    )
+    values.append(interval[0].as_percent() if interval else "-")
     milliseconds = extractor.milliseconds_a_photo
     values += [
         "-" if milliseconds is None else f"{milliseconds:.1f}",
