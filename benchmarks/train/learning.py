@@ -17,7 +17,7 @@ from rich.table import Table
 from services.trainer import run
 from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything
-from services.trainer.grid import GridPlan, PlannedRun, RunFunctions, run_grid
+from services.trainer.grid import GridPlan, PlannedRun, run_grid
 from services.trainer.leaderboard import leaderboard
 from services.trainer.model_describer import ModelDescriber
 from services.trainer.model_factory import make_model
@@ -172,9 +172,8 @@ def measure_grid(
         ),
         {},
     )
-    trainer = RunFunctions(run.run, run.resume)
     outcomes = run_grid(
-        plan, folder / "grid", trainer, BarDisplay(progress), StopRequest(), lambda done: None
+        plan, folder / "grid", BarDisplay(progress), StopRequest(), lambda done: None
     )
     rows = leaderboard(plan, outcomes)
     table = Table(*rows[0], title="six settings, other streets")

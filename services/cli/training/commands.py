@@ -215,9 +215,7 @@ def grid(
 def _run_grid_command(
     file: Path, out: Path, dry_run: bool, as_json: bool, overrides: dict[str, Any]
 ) -> int:
-    from services.trainer import run
     from services.trainer.grid import (
-        RunFunctions,
         RunOutcome,
         RunState,
         load_grid_plan,
@@ -240,8 +238,7 @@ def _run_grid_command(
 
     with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
-            trainer = RunFunctions(run.run, run.resume)
-            outcomes = run_grid(plan, out, trainer, display, stop, write)
+            outcomes = run_grid(plan, out, display, stop, write)
         except RunStopped as stopped:
             err_console.print(
                 "Stopped. Run the same command again to continue the grid.", soft_wrap=True
