@@ -13,16 +13,17 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image, ImageDraw, ImageFont
 
+from placewise.answers import Estimate
+from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
-from shared.client import Client, Json
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
 from shared.synthetic_city.plan import CityOptions, make_plan
@@ -44,7 +45,7 @@ class QueryOutcome:
     best: str
     """File name of the most similar photo."""
     best_is_correct: bool
-    estimate: Json
+    estimate: Estimate
     error_m: float | None
     """Distance of the estimate from the ground truth; None without an estimated location."""
 
@@ -58,35 +59,35 @@ def query_with_photo(
 ) -> QueryOutcome:
     """Query with a photo that is not stored, and compare the result with its ground truth."""
     truth = _location(query.fields)
-    answer = client.similar_to_file(query.path, top_k=1)
-    best, estimate = answer["similar_images"][0], answer["estimate"]
+    answer = client.similar(query.path, top_k=1)
+    best, estimate = answer.similar_images[0], answer.estimate
     return QueryOutcome(
         query=query.path,
         in_map=any(_is_near(truth, _location(photo.fields)) for photo in database),
-        best=best["original_filename"],
-        best_is_correct=_is_near(truth, _location(best)),
+        best=best.original_filename,
+        best_is_correct=_is_near(truth, _location(dict(best))),
         estimate=estimate,
-        error_m=distance_between_m(truth, _location(estimate)),
+        error_m=distance_between_m(truth, _location(dict(estimate))),
     )
 
 
-def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
+def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
     """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
     inside = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
-    accepted = [a for a in outcomes if a.estimate["in_map"]]
+    accepted = [a for a in outcomes if a.estimate.in_map]
     errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    confidences = [a.estimate["confidence"] for a in outcomes]
+    confidences = [a.estimate.confidence for a in outcomes if a.estimate.confidence is not None]
     # Without an estimated location, the best photo decides whether the result is correct.
-    right = [a.right or (a.estimate["in_map"] is False and a.best_is_correct) for a in outcomes]
-    is_calibrated = None not in confidences
+    right = [a.right or (a.estimate.in_map is False and a.best_is_correct) for a in outcomes]
+    is_calibrated = len(confidences) == len(outcomes)
     return {
         "queries": len(outcomes),
         "out_of_map": len(outside),
         "R@1": _ratio(sum(a.best_is_correct for a in inside), len(inside)),
         "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
-        "accepted_in_map": _ratio(sum(bool(a.estimate["in_map"]) for a in inside), len(inside)),
-        "false_accepts": _ratio(sum(bool(a.estimate["in_map"]) for a in outside), len(outside)),
+        "accepted_in_map": _ratio(sum(bool(a.estimate.in_map) for a in inside), len(inside)),
+        "false_accepts": _ratio(sum(bool(a.estimate.in_map) for a in outside), len(outside)),
         "median_error_m": median(errors) if errors else None,
         "calibration_error": (
             expected_calibration_error(confidences, right) if is_calibrated else None
@@ -98,7 +99,7 @@ def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
     }
 
 
-def _location(fields: Json) -> PhotoLocation:
+def _location(fields: Mapping[str, Any]) -> PhotoLocation:
     latitude, longitude = fields.get("latitude"), fields.get("longitude")
     if latitude is None or longitude is None:
         return PhotoLocation(None, None, None)
@@ -137,7 +138,7 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
     for number, answer in enumerate(chosen):
         left = GAP + number % COLUMNS * (CELL[0] + GAP)
         top = GAP + number // COLUMNS * block
-        frame = OUT_OF_MAP_COLOUR if answer.estimate["in_map"] is False else WRONG_COLOUR
+        frame = OUT_OF_MAP_COLOUR if answer.estimate.in_map is False else WRONG_COLOUR
         frame = CORRECT_COLOUR if answer.best_is_correct and frame == WRONG_COLOUR else frame
         _paste(sheet, answer.query, left, top)
         pen.text((left, top + CELL[1] + 2), "asked", fill="black", font=font)
@@ -152,10 +153,10 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
     """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
-    given = [a for a in outcomes if a.estimate["in_map"]]
+    given = [a for a in outcomes if a.estimate.in_map]
     right = [a for a in given if a.best_is_correct]
     wrong = [a for a in given if not a.best_is_correct]
-    refused = [a for a in outcomes if a.estimate["in_map"] is False]
+    refused = [a for a in outcomes if a.estimate.in_map is False]
     strangers = [a for a in refused if not a.in_map]
     missed = [a for a in refused if a.in_map]
     return [
@@ -172,9 +173,9 @@ def _evenly_spaced(found: Sequence[QueryOutcome], count: int) -> list[QueryOutco
 
 
 def _caption(answer: QueryOutcome) -> str:
-    if answer.estimate["in_map"] is False:
+    if answer.estimate.in_map is False:
         return "not in this map" + (" (it is)" if answer.in_map else "")
-    sure = answer.estimate["confidence"]
+    sure = answer.estimate.confidence
     error = f"{answer.error_m:.0f} m off" if answer.error_m is not None else "no place"
     return error if sure is None else f"{error}, {sure:.0%} sure"
 
@@ -253,8 +254,8 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     for vocabulary in ("foreign", "own"):
         if vocabulary == "own":
             fit_and_wait(client, {}, progress)
-        job = wait_for_job(client, client.evaluate()["job_id"], progress, "evaluating")
-        found = job["result"]["labelled_queries"]
+        job = wait_for_job(client, client.evaluate(), progress, "evaluating")
+        found = (job.result or {})["labelled_queries"]
         shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
         print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
     bar = progress.add_task("querying", total=len(queries[1::2]))

@@ -77,7 +77,7 @@ class BenchmarkedExtractor:
             Misconfigured: the extractor or the device is not available.
         """
         settings = read_settings()
-        recipe = settings.recipe(extractor)
+        recipe = settings.extractor_config(extractor)
         weights, random = settings.dino_weights, False
         if recipe.depth is not None:
             size = recipe.backbone.removeprefix("dinov2-")

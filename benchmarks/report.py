@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from statistics import median
+from typing import Any
 
 from rich.table import Table
-
-from shared.client import Json
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,7 @@ class Report:
 
     title: str
     figures: list[Figure] = field(default_factory=list)
-    details: Json = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
     """What else a program may want to read; not shown in the table."""
     tables: list[Table] = field(default_factory=list)
     """Shown before that of the figures."""
@@ -64,7 +63,7 @@ class Report:
         """Whether any value violates its bound."""
         return any(figure.missed for figure in self.figures)
 
-    def as_json(self) -> Json:
+    def as_json(self) -> dict[str, Any]:
         return {
             "title": self.title,
             "missed": self.missed,

@@ -29,7 +29,7 @@ from urllib.parse import urlsplit
 
 from benchmarks.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from benchmarks.report import LatencySummary, Report
-from shared.client import Client
+from placewise.client import Client
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
 
@@ -96,7 +96,7 @@ def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, strea
             assert port is not None
             with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
                 ours, slow, *watching = (
-                    client.create_key(f"{number}", ["read", "write"])["key"]
+                    client.create_key(f"{number}", ["read", "write"]).key
                     for number in range(2 + CALLERS)
                 )
             jobs = tuple(_upload(port, ours, photo) for _ in range(WATCHED_JOBS))

@@ -10,16 +10,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from PIL import Image
 
 from benchmarks.report import Report
-from shared.client import Client, Json
+from placewise.client import Client
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 START_TIMEOUT_SECONDS = 60.0
+
+Answer = TypeVar("Answer")
 
 
 def measure(progress: Progress, *, photos: int, queries: int) -> Report:
@@ -68,10 +71,12 @@ def _start_server(home: Path) -> Iterator[RunningServer]:
             server.terminate()
 
 
-def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress: Progress) -> Json:
+def _run_timed_calls(
+    client: Client, photos: list[Path], queries: int, progress: Progress
+) -> dict[str, Any]:
     bar = progress.add_task("photos", total=len(photos) + 2 * queries)
 
-    def timed(call) -> tuple[float, Json]:  # type: ignore[no-untyped-def]
+    def timed(call: Callable[[], Answer]) -> tuple[float, Answer]:
         started = time.perf_counter()
         answer = call()
         progress.advance(bar)
@@ -79,15 +84,13 @@ def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress:
 
     started_at = time.perf_counter()
     with ThreadPoolExecutor(4) as pool:
-        uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
+        uploads = list(pool.map(lambda photo: timed(partial(client.upload, photo)), photos))
     uploaded = time.perf_counter() - started_at
     for _, answer in uploads:
-        client.wait_for(answer["job_id"])
+        client.wait(answer)
     searchable = time.perf_counter() - started_at
-    stored = [
-        timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
-    ]
-    new = [timed(lambda p=photo: client.similar_to_file(p)) for photo in photos[:queries]]
+    stored = [timed(partial(client.similar, answer.file_id)) for _, answer in uploads[:queries]]
+    new = [timed(partial(client.similar, photo)) for photo in photos[:queries]]
     return {
         "photos": len(photos),
         "searchable_after_seconds": searchable,
@@ -99,7 +102,7 @@ def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress:
     }
 
 
-def _timing_summary(seconds: list[float], wall_seconds: float | None = None) -> Json:
+def _timing_summary(seconds: list[float], wall_seconds: float | None = None) -> dict[str, Any]:
     ordered = sorted(seconds)
     return {
         "median_ms": statistics.median(ordered) * 1000,

@@ -11,7 +11,7 @@ from benchmarks.scale.inputs import Inputs, Width
 from benchmarks.scale.limits import limits
 from benchmarks.scale.plan import Plan
 from benchmarks.scale.replacements import scans
-from shared.client import Json
+from services.cli.output import Json
 from shared.errors import Misconfigured
 
 PHOTOS = (10_000, 1_000_000, 100_000_000)

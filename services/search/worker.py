@@ -11,12 +11,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
+from cachetools import LRUCache
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.search.catalog_sync import (
@@ -67,7 +67,7 @@ class QueryRowReader:
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._cache: OrderedDict[tuple[str, int], Row] = OrderedDict()
+        self._cache: LRUCache[tuple[str, int], Row] = LRUCache(CACHED_ROWS)
 
     def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
         """Return the (dimension,) row that a request refers to.
@@ -91,7 +91,6 @@ class QueryRowReader:
         with self._lock:
             cached = self._cache.get(cache_key)
             if cached is not None:
-                self._cache.move_to_end(cache_key)
                 return cached
         try:
             loaded = read_row(self._store, object_key, row)
@@ -107,8 +106,6 @@ class QueryRowReader:
             raise _unreadable_error(object_key)
         with self._lock:
             self._cache[cache_key] = loaded
-            while len(self._cache) > CACHED_ROWS:
-                self._cache.popitem(last=False)
         return loaded
 
 

@@ -25,7 +25,7 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.storage import OwnedStore
-from shared.storage.folder import OWNER_MARK
+from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import BucketLocation, bucket_location, check_free, claim_store
 

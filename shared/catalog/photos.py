@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any, ClassVar
 from uuid import UUID
 
@@ -44,13 +43,9 @@ from shared.catalog.base import (
     filename_trigrams,
     partial_index,
 )
+from shared.catalog.photo_role import PhotoRole as PhotoRole
 from shared.errors import Gone, NotFound
 from shared.ids import new_id
-
-
-class PhotoRole(StrEnum):
-    DATABASE = "database"  # indexed and searchable
-    QUERY = "query"  # a labelled query for evaluations: described, but never a search result
 
 
 class Photo(Journaled, Base):
@@ -270,7 +265,7 @@ class PresignedUpload(Base):
     filename: Mapped[str] = mapped_column(Text)
     size_bytes: Mapped[int] = mapped_column(BigInteger)
     sha256: Mapped[str] = mapped_column(String(64))
-    said: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    photo_fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
     status: Mapped[int | None] = mapped_column(Integer)
     answer: Mapped[str | None] = mapped_column(Text)  # JSON, as it was sent
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())

@@ -17,8 +17,8 @@ from shared.config.private_files import make_private_folder, write_private
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.storage.folder import OWNER_MARK, FolderStore
-from shared.storage.keys import ORIGINALS, check_import_prefix
+from shared.storage.folder import FolderStore
+from shared.storage.keys import ORIGINALS, OWNER_MARK, check_import_prefix
 from shared.storage.protocol import OwnedStore
 from shared.storage.s3 import Bucket, S3Store
 

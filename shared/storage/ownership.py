@@ -14,8 +14,8 @@ from typing import TypedDict
 from uuid import UUID
 
 from shared.errors import Misconfigured
-from shared.storage.folder import OWNER_MARK, PARTIAL_SUFFIX, FolderStore
-from shared.storage.keys import ORIGINALS, QUERIES, WORK, is_original_key
+from shared.storage.folder import PARTIAL_FOLDER, FolderStore
+from shared.storage.keys import ORIGINALS, OWNER_MARK, QUERIES, WORK, is_original_key
 from shared.storage.protocol import OwnedStore
 from shared.storage.s3 import S3Store
 
@@ -166,7 +166,7 @@ def _display_name(store: OwnedStore) -> str:
 
 def _check_no_objects(folder: Path) -> None:
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != OWNER_MARK)
-    if any(PARTIAL_SUFFIX not in path.parts for path in files):
+    if any(PARTIAL_FOLDER not in path.parts for path in files):
         raise Misconfigured(
             "object_store_changed",
             f"There are objects in {folder}, which would be missing with a bucket. Unset "

@@ -24,6 +24,7 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_result,
     progress_bar,
     report_errors,
 )
@@ -151,13 +152,11 @@ def restore(
             progress,
             store_owner=read_owner(open_store(settings, exclusive=False)),
         )
-    if as_json:
-        print_json(asdict(restored))
-        return
-    console.print(
+    print_result(
+        asdict(restored),
+        as_json,
         f"Restored {restored.rows} rows and {restored.objects} objects as of {manifest.made_at}"
         + (f"; cancelled {restored.cancelled_jobs} jobs" if restored.cancelled_jobs else ""),
-        soft_wrap=True,
     )
 
 

@@ -109,7 +109,7 @@ def create_new_map(
     """Create an empty map; 409 if the name exists already."""
     settings = gateway.settings
     try:
-        config = settings.recipe(body.extractor or settings.new_map_extractor)
+        config = settings.extractor_config(body.extractor or settings.new_map_extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
     with gateway.catalog.write() as session:

@@ -261,7 +261,7 @@ def _validate_new_extractor(
             "pca", "is fitted on existing descriptors: switch to the extractor first"
         )
     try:
-        config = settings.recipe(body.extractor)
+        config = settings.extractor_config(body.extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
     if config.needs_vocabulary:

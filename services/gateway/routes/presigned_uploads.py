@@ -12,7 +12,6 @@ copy is validated, described and acknowledged.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from contextlib import AbstractContextManager
 from datetime import datetime
@@ -51,7 +50,6 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
 from shared.ids import new_id
-from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
 from shared.ingest.store_photo import StoreResult, store_photo
@@ -68,7 +66,6 @@ from shared.storage.s3 import S3Store
 
 router = APIRouter(tags=["photos"])
 
-HASH_READ_BYTES = 256 * 1024
 FILE_FIELDS = ("filename", "file_size", "sha256")
 
 
@@ -136,7 +133,7 @@ def create_presigned_upload(
             filename=base_name(body.filename),
             size_bytes=body.file_size,
             sha256=body.sha256,
-            said=fields,
+            photo_fields=fields,
             expires_at=db_now_plus(seconds),
         )
         session.add(upload)
@@ -231,7 +228,7 @@ def _complete_upload(
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = ValidatedPhoto(
-            received, media_type, header, _parse_photo_fields(upload.said), key_id
+            received, media_type, header, _parse_photo_fields(upload.photo_fields), key_id
         )
         with quota:
             stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
@@ -250,20 +247,14 @@ def _verify_copied_object(
     store: PresigningStore, key: str, upload: PresignedUpload
 ) -> StoredUpload:
     """Reads and hashes the copied object; Unprocessable (`sha256_differs`) for another file."""
-    digest, begin, size = hashlib.sha256(), b"", 0
-    with store.open(key) as file:
-        while block := file.read(HASH_READ_BYTES):
-            if not size:
-                begin = block[:PHOTO_SIGNATURE_BYTES]
-            digest.update(block)
-            size += len(block)
-    if digest.hexdigest() != upload.sha256:
+    received = StoredUpload.read(store, key, upload.filename)
+    if received.sha256 != upload.sha256:
         raise Unprocessable(
             "sha256_differs",
-            f"The file that was sent has the SHA-256 {digest.hexdigest()}, not {upload.sha256}. "
+            f"The file that was sent has the SHA-256 {received.sha256}, not {upload.sha256}. "
             "Send the announced file again to the same URL, or start a new upload.",
         )
-    return StoredUpload(key, upload.filename, size, upload.sha256, begin)
+    return received
 
 
 def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:

@@ -68,11 +68,12 @@ def check_comparison_supported(
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-    recipe = gateway.settings.recipe(generation.extractor if generation else map_.extractor)
+    extractor = generation.extractor if generation else map_.extractor
+    config = gateway.settings.extractor_config(extractor)
     if search_params.rerank is not None:
-        check_rerankable(recipe)
+        check_rerankable(config)
     if search_params.explain:
-        check_explainable(recipe, generation.spec if generation else None)
+        check_explainable(config, generation.spec if generation else None)
 
 
 def start_comparison_of_stored_photo(

@@ -14,12 +14,12 @@ import contextlib
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import Any
 from uuid import UUID
 
+from cachetools import LRUCache
 from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
@@ -82,16 +82,13 @@ class BatchItemImporter:
         self._hints = hints
         self._settings = settings
         self._quota = PhotoQuota(catalog)
-        self._archives: OrderedDict[UUID, Archive] = OrderedDict()
+        self._archives: LRUCache[UUID, Archive] = LRUCache(MAX_OPEN_ARCHIVES)
 
     def open_batch_archive(self, job: Job) -> Archive:
         """Return the batch's archive, opened once. Raises as `open_archive` does."""
         if job.id not in self._archives:
             limits = ArchiveLimits(self._settings.max_batch_photos, self._settings.max_archive_size)
             self._archives[job.id] = open_archive(self._store, job.params["object_key"], limits)
-        self._archives.move_to_end(job.id)
-        while len(self._archives) > MAX_OPEN_ARCHIVES:
-            self._archives.popitem(last=False)
         return self._archives[job.id]
 
     def close_archive(self, job: Job) -> None:

@@ -1,4 +1,4 @@
-"""Parts shared by the asynchronous and the synchronous client: retry policy, errors and files."""
+"""What both forms of the client share: retry policy, error responses and request bodies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import httpx2
 
@@ -25,7 +25,6 @@ from shared.errors import (
 
 API = "/api/v1"
 IDEMPOTENCY_KEY = "Idempotency-Key"
-FINISHED = ("succeeded", "failed", "cancelled")
 POLL_SECONDS = 20.0  # duration of a long poll
 TIMEOUT_SECONDS = 90.0  # per call; exceeds the longest long poll that a server allows
 CHUNK_BYTES = 256 * 1024
@@ -36,12 +35,6 @@ MAX_RETRY_AFTER_SECONDS = 300.0  # upper limit for Retry-After
 Json = dict[str, Any]
 OnWait = Callable[[PlacewiseError, float], object]
 """Called before each wait with the error and the number of seconds."""
-
-
-class Seekable(Protocol):
-    """A request body that can be rewound for another attempt."""
-
-    def seek(self, offset: int, whence: int = ..., /) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +126,8 @@ def printable_name(file: Path) -> str:
 
 def size_and_sha256(file: BinaryIO) -> tuple[int, str]:
     """Size in bytes and hexadecimal SHA-256 of a file."""
-    digest, size = hashlib.sha256(), 0
-    while chunk := file.read(CHUNK_BYTES):
-        digest.update(chunk)
-        size += len(chunk)
-    return size, digest.hexdigest()
+    sha256 = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+    return file.tell(), sha256
 
 
 def drop_none(**params: Any) -> Json:

@@ -1,6 +1,6 @@
 """HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
 
-Generated from `async_wire.py` by `make client`. Edit that file.
+Generated from `async_transport.py` by `make client`. Edit that file.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Self, TypeVar
 
 import httpx2
 
-from shared.client.sending import (
+from placewise.protocol import (
     API,
     CHUNK_BYTES,
     IDEMPOTENCY_KEY,
@@ -22,7 +22,6 @@ from shared.client.sending import (
     Json,
     OnWait,
     RetryPolicy,
-    Seekable,
     drop_none,
     open_file,
     printable_name,
@@ -38,7 +37,7 @@ Answer = TypeVar("Answer")
 
 
 class Transport:
-    """Transport to one server and one map; close it, or use it as a context manager."""
+    """Connections to one server and one map; close it, or use it as a context manager."""
 
     def __init__(
         self,
@@ -50,7 +49,7 @@ class Transport:
         on_wait: OnWait = lambda error, seconds: None,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Create a transport. No request is sent yet.
+        """Create a client. No request is sent yet.
 
         Args:
             url: URL of the server.
@@ -59,7 +58,7 @@ class Transport:
             patience_seconds: How long calls are retried, with exponential backoff, while the
                 server is unreachable or unavailable (503, 507). A busy server (429) is retried as
                 its Retry-After says, without a limit. 0 disables retries.
-            on_wait: Called before each wait with the error and the seconds.
+            on_wait: Called before each wait with the error and the number of seconds.
             timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
 
         Raises:
@@ -90,41 +89,47 @@ class Transport:
         """Close all connections."""
         self._http.close()
 
-    def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
-        """A copy with another retry policy that shares the connections."""
+    def with_patience(self, patience_seconds: float, on_wait: OnWait) -> Self:
+        """Return a client that shares the connections and retries calls for another period.
+
+        Args:
+            patience_seconds: How long calls are retried; see `connect`.
+            on_wait: Called before each wait with the error and the number of seconds.
+        """
         other = copy.copy(self)
         other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
-    def _send_file(
-        self, path: str, file: Path, filename: str | None = None, **options: Any
-    ) -> Json:
+    def _send_file(self, path: str, file: Path, filename: str | None = None, **options: Any) -> Any:
+        """POST a file as the form field `file`, streamed."""
         with open_file(file) as stream:
             files = {"file": (filename or printable_name(file), stream)}
-            return self._call("POST", path, stream, files=files, **options)
+            return self._call("POST", path, files=files, **options)
 
-    def _call(self, method: str, path: str, body: Seekable | None = None, **options: Any) -> Json:
-        """Send a request with retries; `body` is rewound before each attempt."""
+    def _call(self, method: str, path: str, **options: Any) -> Any:
+        """Send a request with retries and return the JSON of its response.
+
+        `options` are those of the HTTP library, which rewinds `files` before each attempt. All
+        attempts of a POST have the same Idempotency-Key.
+        """
         if method == "POST" and self._patience.seconds:
             key = {IDEMPOTENCY_KEY: str(new_id())}
             options["headers"] = {**options.get("headers", {}), **key}
 
-        def attempt() -> Json:
-            if body is not None:
-                body.seek(0)
-            response = self._request(self._http, method, f"{API}{path}", **options)
-            result: Json = response.json()
-            return result
+        def attempt() -> Any:
+            return (self._request(self._http, method, f"{API}{path}", **options)).json()
 
         return self._retry(attempt)
 
     def _get_bytes(self, path: str) -> bytes:
+        """GET a response that is not JSON."""
+
         def attempt() -> bytes:
             return (self._request(self._http, "GET", f"{API}{path}")).content
 
         return self._retry(attempt)
 
-    def each(self, path: str, field: str, **params: Any) -> Iterator[Json]:
+    def _iterate(self, path: str, field: str, **params: Any) -> Iterator[Json]:
         """Iterate over all records of a paginated list; pages are fetched on demand."""
         cursor: str | None = None
         while True:
@@ -135,7 +140,7 @@ class Transport:
             if cursor is None:
                 return
 
-    def _fetch(self, path: str, file: BinaryIO, on_received: Callable[[int], object]) -> None:
+    def _download(self, path: str, file: BinaryIO, on_received: Callable[[int], object]) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
         def attempt() -> None:
@@ -156,7 +161,7 @@ class Transport:
 
         self._retry(attempt)
 
-    def _put(self, upload: Json, file: BinaryIO) -> None:
+    def _put_presigned(self, upload: Json, file: BinaryIO) -> None:
         """Send a file to a presigned URL, without the API key."""
 
         def attempt() -> None:

@@ -1,6 +1,6 @@
 """HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
 
-`wire.py` is generated from this file by `make client`. Edit this file.
+`transport.py` is generated from this file by `make client`. Edit this file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Self, TypeVar
 
 import httpx2
 
-from shared.client.sending import (
+from placewise.protocol import (
     API,
     CHUNK_BYTES,
     IDEMPOTENCY_KEY,
@@ -23,7 +23,6 @@ from shared.client.sending import (
     Json,
     OnWait,
     RetryPolicy,
-    Seekable,
     drop_none,
     open_file,
     printable_name,
@@ -39,7 +38,7 @@ Answer = TypeVar("Answer")
 
 
 class AsyncTransport:
-    """Transport to one server and one map; close it, or use it as a context manager."""
+    """Connections to one server and one map; close it, or use it as a context manager."""
 
     def __init__(
         self,
@@ -51,7 +50,7 @@ class AsyncTransport:
         on_wait: OnWait = lambda error, seconds: None,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Create a transport. No request is sent yet.
+        """Create a client. No request is sent yet.
 
         Args:
             url: URL of the server.
@@ -60,7 +59,7 @@ class AsyncTransport:
             patience_seconds: How long calls are retried, with exponential backoff, while the
                 server is unreachable or unavailable (503, 507). A busy server (429) is retried as
                 its Retry-After says, without a limit. 0 disables retries.
-            on_wait: Called before each wait with the error and the seconds.
+            on_wait: Called before each wait with the error and the number of seconds.
             timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
 
         Raises:
@@ -91,43 +90,49 @@ class AsyncTransport:
         """Close all connections."""
         await self._http.aclose()
 
-    def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
-        """A copy with another retry policy that shares the connections."""
+    def with_patience(self, patience_seconds: float, on_wait: OnWait) -> Self:
+        """Return a client that shares the connections and retries calls for another period.
+
+        Args:
+            patience_seconds: How long calls are retried; see `connect`.
+            on_wait: Called before each wait with the error and the number of seconds.
+        """
         other = copy.copy(self)
         other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
     async def _send_file(
         self, path: str, file: Path, filename: str | None = None, **options: Any
-    ) -> Json:
+    ) -> Any:
+        """POST a file as the form field `file`, streamed."""
         with open_file(file) as stream:
             files = {"file": (filename or printable_name(file), stream)}
-            return await self._call("POST", path, stream, files=files, **options)
+            return await self._call("POST", path, files=files, **options)
 
-    async def _call(
-        self, method: str, path: str, body: Seekable | None = None, **options: Any
-    ) -> Json:
-        """Send a request with retries; `body` is rewound before each attempt."""
+    async def _call(self, method: str, path: str, **options: Any) -> Any:
+        """Send a request with retries and return the JSON of its response.
+
+        `options` are those of the HTTP library, which rewinds `files` before each attempt. All
+        attempts of a POST have the same Idempotency-Key.
+        """
         if method == "POST" and self._patience.seconds:
             key = {IDEMPOTENCY_KEY: str(new_id())}
             options["headers"] = {**options.get("headers", {}), **key}
 
-        async def attempt() -> Json:
-            if body is not None:
-                body.seek(0)
-            response = await self._request(self._http, method, f"{API}{path}", **options)
-            result: Json = response.json()
-            return result
+        async def attempt() -> Any:
+            return (await self._request(self._http, method, f"{API}{path}", **options)).json()
 
         return await self._retry(attempt)
 
     async def _get_bytes(self, path: str) -> bytes:
+        """GET a response that is not JSON."""
+
         async def attempt() -> bytes:
             return (await self._request(self._http, "GET", f"{API}{path}")).content
 
         return await self._retry(attempt)
 
-    async def each(self, path: str, field: str, **params: Any) -> AsyncIterator[Json]:
+    async def _iterate(self, path: str, field: str, **params: Any) -> AsyncIterator[Json]:
         """Iterate over all records of a paginated list; pages are fetched on demand."""
         cursor: str | None = None
         while True:
@@ -139,7 +144,9 @@ class AsyncTransport:
             if cursor is None:
                 return
 
-    async def _fetch(self, path: str, file: BinaryIO, on_received: Callable[[int], object]) -> None:
+    async def _download(
+        self, path: str, file: BinaryIO, on_received: Callable[[int], object]
+    ) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
         async def attempt() -> None:
@@ -160,7 +167,7 @@ class AsyncTransport:
 
         await self._retry(attempt)
 
-    async def _put(self, upload: Json, file: BinaryIO) -> None:
+    async def _put_presigned(self, upload: Json, file: BinaryIO) -> None:
         """Send a file to a presigned URL, without the API key."""
 
         async def attempt() -> None:
