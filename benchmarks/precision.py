@@ -52,7 +52,7 @@ def measure(
             photos = [load_pixels(single, file) for file in files[begin : begin + batch]]
             features: list[torch.Tensor] = []
             for precision in PRECISIONS:
-                made = single.at(precision)
+                made = single.with_precision(precision)
                 features.append(torch.stack(made.local_features(photos)))
                 rows[precision].append(made.describe(photos, centres))
             cosines.append((features[0] * features[1]).sum(dim=-1).flatten().numpy())

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,16 +30,17 @@ from services.trainer.data import (
     Batch,
     PlaceBatchSampler,
     PlaceDataset,
-    ResumableDataLoader,
     apply_randaugment,
+    load_batches,
     to_tensor,
 )
 from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
 from services.trainer.model_describer import ModelDescriber
-from services.trainer.module import make_model, make_optimizer
+from services.trainer.model_factory import make_model
 from services.trainer.resolve import Device, resolve_device
 from services.trainer.run_control import NullDisplay, StopRequest
+from services.trainer.training_loop import make_optimizer
 from shared.datasets.dataset import EvaluationSet, TrainingPlace
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
@@ -278,8 +279,9 @@ def measure_throughput(
     reading["with its workers"], _ = _time_batches(batches, lambda batch: None, device)
     progress.advance(bar)
     step = _make_training_step(device)
-    batch = next(iter(_batches(places, workers, device)))
-    network, _ = _time_batches([batch] * (len(batches) // 2 + WARM_UP_BATCHES), step, device)
+    batch = next(_batches(places, workers, device))
+    repeats = max(2, len(places) // PLACES_PER_BATCH // 2)
+    network, _ = _time_batches([batch] * (repeats + WARM_UP_BATCHES), step, device)
     progress.advance(bar)
     training, waiting = _time_batches(_batches(places, workers, device), step, device)
     progress.advance(bar)
@@ -312,11 +314,11 @@ def _decode_draft(path: Path) -> None:
     to_tensor(apply_randaugment(decode_resized(path, (IMAGE_PIXELS, IMAGE_PIXELS)), 0))
 
 
-def _batches(places: list[TrainingPlace], workers: int, device: Device) -> ResumableDataLoader:
+def _batches(places: list[TrainingPlace], workers: int, device: Device) -> Iterator[Batch]:
     sampler = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
     dataset = PlaceDataset(sampler, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
     pin_memory = device.accelerator == "gpu"
-    return ResumableDataLoader(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
+    return load_batches(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
 
 
 def _make_training_step(device: Device) -> Callable[[Batch], None]:

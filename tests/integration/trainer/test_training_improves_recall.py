@@ -8,7 +8,7 @@ from benchmarks.train import measure_gain
 from services.trainer import run
 from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything
-from services.trainer.module import make_model
+from services.trainer.model_factory import make_model
 from services.trainer.resolve import resolve_device
 from services.trainer.run_control import NullDisplay, StopRequest
 from shared.datasets.open_dataset import open_evaluation_set
