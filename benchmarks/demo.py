@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image, ImageDraw, ImageFont
 
+from benchmarks.generated_city import generate_city
 from placewise.answers import Estimate
 from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
-from shared.synthetic_city.plan import CityOptions, make_plan
-from shared.synthetic_city.write import NOT_COMPARABLE, write_city
+from shared.synthetic_city.plan import CityOptions
+from shared.synthetic_city.write import NOT_COMPARABLE
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -141,7 +142,7 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
         frame = OUT_OF_MAP_COLOUR if answer.estimate.in_map is False else WRONG_COLOUR
         frame = CORRECT_COLOUR if answer.best_is_correct and frame == WRONG_COLOUR else frame
         _paste(sheet, answer.query, left, top)
-        pen.text((left, top + CELL[1] + 2), "asked", fill="black", font=font)
+        pen.text((left, top + CELL[1] + 2), "query", fill="black", font=font)
         below = top + CELL[1] + CAPTION
         right, bottom = left + CELL[0], below + CELL[1]
         pen.rectangle((left - EDGE, below - EDGE, right + EDGE, bottom + EDGE), frame)
@@ -152,24 +153,17 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
-    """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
-    given = [a for a in outcomes if a.estimate.in_map]
-    right = [a for a in given if a.best_is_correct]
-    wrong = [a for a in given if not a.best_is_correct]
-    refused = [a for a in outcomes if a.estimate.in_map is False]
-    strangers = [a for a in refused if not a.in_map]
-    missed = [a for a in refused if a.in_map]
-    return [
-        *_evenly_spaced(right, COLUMNS + 1),
-        *_evenly_spaced(wrong, 1),
-        *_evenly_spaced(missed, 1),
-        *_evenly_spaced(strangers, 3),
-    ][: 2 * COLUMNS]
-
-
-def _evenly_spaced(found: Sequence[QueryOutcome], count: int) -> list[QueryOutcome]:
-    step = max(1, len(found) // count) if count else 1
-    return list(found[::step][:count])
+    """Choose two rows: mostly accepted and correct, then wrong, then rejected queries."""
+    accepted = [a for a in outcomes if a.estimate.in_map]
+    rejected = [a for a in outcomes if a.estimate.in_map is False]
+    groups = (
+        ([a for a in accepted if a.best_is_correct], COLUMNS + 1),
+        ([a for a in accepted if not a.best_is_correct], 1),
+        ([a for a in rejected if a.in_map], 1),
+        ([a for a in rejected if not a.in_map], 3),
+    )
+    chosen = [group[:: max(1, len(group) // count)][:count] for group, count in groups]
+    return [outcome for group in chosen for outcome in group][: 2 * COLUMNS]
 
 
 def _caption(answer: QueryOutcome) -> str:
@@ -196,7 +190,21 @@ def main() -> None:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo evaluates when it wants to print
         city = Path(folder, "city")
-        _draw_city(options, city, progress)
+        generate_city(
+            CityOptions(
+                options.places,
+                options.views,
+                options.queries,
+                options.seed,
+                0,
+                options.out_of_map,
+                320,
+                240,
+                train=False,
+            ),
+            city,
+            progress,
+        )
         with connect(None, None) as client:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
@@ -218,24 +226,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--picture", type=Path, help="JPEG file of queries and matches to write")
     return parser.parse_args()
-
-
-def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> None:
-    plan = make_plan(
-        CityOptions(
-            places=options.places,
-            views=options.views,
-            queries=options.queries,
-            seed=options.seed,
-            catalogue_seed=0,
-            out_of_map=options.out_of_map,
-            width=320,
-            height=240,
-            train=False,
-        )
-    )
-    bar = progress.add_task("drawing the city", total=len(plan.photos))
-    write_city(plan, city, lambda count: progress.advance(bar, count))
 
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
@@ -268,27 +258,19 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
 
 def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
     summary = summarise_outcomes(outcomes)
-    right_of_accepted = _format_percent(summary["right_of_accepted"])
     print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
-    print(f"  R@1 of queries in the map                 {summary['R@1']:.1%}")
-    print(f"  precision of the accepted estimates       {right_of_accepted}")
-    print(
-        f"  accepted queries in the map               {_format_percent(summary['accepted_in_map'])}"
-    )
-    print(
-        f"  false accepts from outside the map        {_format_percent(summary['false_accepts'])}"
-    )
-    print(f"  median error of the correct estimates     {summary['median_error_m']:.1f} m")
-    if summary["calibration_error"] is not None:
-        print(f"  calibration error (ECE)                   {summary['calibration_error']:.3f}")
-        print(f"  AUROC                                     {summary['auroc']:.3f}")
-        print(
-            f"  recall at 99 % precision                  {summary['recall_at_99_precision']:.1%}"
-        )
-
-
-def _format_percent(share: float | None) -> str:
-    return "-" if share is None else f"{share:.1%}"
+    for name, label, style in (
+        ("R@1", "R@1 of queries in the map", ".1%"),
+        ("right_of_accepted", "precision of the accepted estimates", ".1%"),
+        ("accepted_in_map", "accepted queries in the map", ".1%"),
+        ("false_accepts", "false accepts from outside the map", ".1%"),
+        ("median_error_m", "median error of the correct estimates, m", ".1f"),
+        ("calibration_error", "calibration error (ECE)", ".3f"),
+        ("auroc", "AUROC", ".3f"),
+        ("recall_at_99_precision", "recall at 99 % precision", ".1%"),
+    ):
+        value = summary[name]
+        print(f"  {label:42s}{'-' if value is None else format(value, style)}")
 
 
 if __name__ == "__main__":

@@ -126,11 +126,8 @@ def printable_name(file: Path) -> str:
 
 def size_and_sha256(file: BinaryIO) -> tuple[int, str]:
     """Size in bytes and hexadecimal SHA-256 of a file."""
-    digest, size = hashlib.sha256(), 0
-    while chunk := file.read(CHUNK_BYTES):
-        digest.update(chunk)
-        size += len(chunk)
-    return size, digest.hexdigest()
+    sha256 = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+    return file.tell(), sha256
 
 
 def drop_none(**params: Any) -> Json:

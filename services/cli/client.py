@@ -39,13 +39,14 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
-    # Imported here: loading torch takes seconds, and clients of a running server don't need it.
-    from services.standalone import run_standalone
+    from services.standalone import run_standalone  # clients of a running server don't need it
 
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
-    with run_standalone(embedded_settings) as running:
+    with run_standalone(embedded_settings, lazy_extractor=True) as running:
         # In a thread: in the main thread, uvicorn would install its own signal handlers.
-        serving = threading.Thread(target=running.serve, name="http")
+        serving = threading.Thread(
+            target=running.server.run, kwargs={"sockets": [running.listener]}, name="http"
+        )
         serving.start()
         try:
             deadline = time.monotonic() + START_TIMEOUT_SECONDS
@@ -59,6 +60,10 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
                 time.sleep(0.01)
             with Client(running.url, map_name, running.local_key) as client:
                 yield client
+        except Exception as error:
+            if running.error is not None:  # why the server has stopped
+                raise running.error from error
+            raise
         finally:
             running.server.should_exit = True
             serving.join()

@@ -19,8 +19,8 @@ from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import (
     Generation,
+    GenerationState,
     active_generation,
-    building_generation,
 )
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.photos import Photo
@@ -161,7 +161,12 @@ class Workplace:
 
     def building(self) -> Generation | None:
         with self.catalog.read() as session:
-            return building_generation(session, self.map_id)
+            return session.scalar(
+                select(Generation).where(
+                    Generation.map_id == self.map_id,
+                    Generation.state == GenerationState.BUILDING,
+                )
+            )
 
     def generation(self, generation_id: UUID) -> Generation:
         with self.catalog.read() as session:

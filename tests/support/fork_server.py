@@ -40,7 +40,10 @@ MODULES = (
     "shared.storage.open_store",
     "shared.descriptors.extractor",
     "shared.descriptors.vocabulary_file",
-    # What libraries import at their first use.
+    # What is imported at its first use.
+    "alembic.command",
+    "shared.catalog.postgres",
+    "shared.storage.s3",
     "PIL.JpegImagePlugin",
     "anyio._backends._asyncio",
     "httpcore2",

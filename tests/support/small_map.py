@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -16,10 +15,9 @@ from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import PhotoFilter
-from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
+from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import ObjectStore
 from shared.storage.chunks import encode_rows
 from tests.support.catalog_rows import add_chunk, add_generation, add_map, delete, made_up_photo
@@ -43,9 +41,6 @@ class SmallMap:
 
     `rows` holds the expected state: every live photo with its descriptor.
     """
-
-    mode = Mode.AUTO
-    """Search mode of its requests."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
         self.catalog = catalog
@@ -132,7 +127,6 @@ class SmallMap:
             photos=PhotoFilter(**photos),
             min_score=min_score,
             exclude=exclude,
-            mode=self.mode,
         )
 
     def brute_force(
@@ -157,14 +151,3 @@ def damaged(whole: bytes, damage: str) -> bytes:
     if damage == "truncated":
         return whole[:-5]
     return whole[:-1] + bytes([whole[-1] ^ 1])
-
-
-def search_when_built(search: SearchBackend, request: SearchRequest) -> SearchResponse:
-    for _ in range(1000):
-        try:
-            return search.search(request)
-        except Unavailable as error:
-            if error.code != "codes_being_made":
-                raise
-            time.sleep(0.01)
-    raise AssertionError("the codes never came")

@@ -42,7 +42,6 @@ from shared.evaluation.ranking import (
     refused_photos_error,
 )
 from shared.evaluation.results import EvaluationResult, EvaluationRun
-from shared.extractor_config.configs import get_extractor_config
 
 Result = TypeVar("Result")
 
@@ -259,7 +258,17 @@ def evaluate_sets(
     with progress_bar() as progress:
         for evaluation_set in evaluation_sets:
             if target.checkpoint is None and target.extractor is None:
-                result, run = _evaluate_on_server(evaluation_set, target, options, progress)
+                ranked, run, figures = evaluate_server(
+                    evaluation_set,
+                    target.server,
+                    target.map_name,
+                    target.key,
+                    options.depth,
+                    progress,
+                )
+                result = evaluate_rankings(
+                    evaluation_set, ranked, options, has_scores=True, about=figures
+                )
             else:
                 describer = _make_describer(evaluation_set, target, settings, progress)
                 result = _evaluate_describer(evaluation_set, describer, options, progress)
@@ -275,13 +284,10 @@ def _make_describer(
     if target.checkpoint is not None:
         return checkpoint_describer(target.checkpoint, target.image_size, settings)
     assert target.extractor is not None
-    recipe = get_extractor_config(
-        target.extractor, allow_test_extractors=settings.allow_test_extractors
-    )
     return extractor_describer(
-        recipe,
+        target.extractor,
         target.vocabulary,
-        [photo.path for photo in evaluation_set.database],
+        evaluation_set,
         settings,
         progress,
         fit=target.fit_vocabulary,
@@ -308,18 +314,6 @@ def _evaluate_describer(
         "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
     }
     return evaluate_rankings(evaluation_set, result.ranked, options, has_scores=True, about=figures)
-
-
-def _evaluate_on_server(
-    evaluation_set: EvaluationSet,
-    target: EvaluationTarget,
-    options: ReportOptions,
-    progress: Progress,
-) -> tuple[EvaluationResult, EvaluationRun]:
-    ranked, run, figures = evaluate_server(
-        evaluation_set, target.server, target.map_name, target.key, options.depth, progress
-    )
-    return evaluate_rankings(evaluation_set, ranked, options, has_scores=True, about=figures), run
 
 
 def progress_bars(progress: Progress, name: str) -> ProgressCallback:

@@ -32,9 +32,8 @@ from shared.backup.create import create_backup
 from shared.backup.folder import BackupProgress, open_backup
 from shared.backup.restore import restore_backup
 from shared.catalog.database_errors import to_unavailable
-from shared.catalog.file_checks import opening
 from shared.catalog.installation import get_or_create_installation, open_installation_store
-from shared.catalog.schema import check_schema, migrate
+from shared.catalog.schema import check_schema, migrate, opening
 from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import lock_home

@@ -38,9 +38,8 @@ from services.cli.operations.deployment_checks import (
 from services.cli.operations.store_checks import collection_check, permissions_check
 from services.cli.output import JsonOption, KeyOption, ServerOption, console, print_json
 from shared.catalog.database_errors import to_unavailable
-from shared.catalog.file_checks import check_pages
 from shared.catalog.photos import Photo
-from shared.catalog.schema import check_schema
+from shared.catalog.schema import check_pages, check_schema
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server
 from shared.config.settings import Settings, memory_limit_bytes
@@ -165,7 +164,7 @@ def _check_dinov2(recipe: ExtractorConfig, weights: Path | None) -> str:
 
 
 def _default_recipe(settings: Settings) -> ExtractorConfig:
-    return settings.recipe(settings.new_map_extractor)
+    return settings.extractor_config(settings.new_map_extractor)
 
 
 MIN_FREE_DISK_BYTES = 1_000_000_000

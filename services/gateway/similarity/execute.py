@@ -86,9 +86,7 @@ def select_ranking_weights(
 class SimilarityQuery:
     """The descriptor to search with, the generation to search in, and fields of the response."""
 
-    map_id: UUID
-    map_name: str
-    min_version: int
+    map: Map
     generation: Generation
     vocabulary: str
     object_key: str
@@ -128,9 +126,7 @@ def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> 
             raise _not_searchable_error(session, photo, map_name)
         descriptor, chunk = located
         return SimilarityQuery(
-            map_id=map_.id,
-            map_name=map_.name,
-            min_version=map_.version,
+            map=map_,
             generation=generation,
             vocabulary=vocabulary_standing(session, generation),
             object_key=chunk.object_key,
@@ -152,13 +148,10 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
         generation = session.get(Generation, UUID(result["generation_id"]))
         if generation is None:
             raise Gone(
-                "query_expired",
-                "The generation of the query was deleted. Send the photo again.",
+                "query_expired", "The generation of the query was deleted. Send the photo again."
             )
         return SimilarityQuery(
-            map_id=map_.id,
-            map_name=map_.name,
-            min_version=map_.version,
+            map=map_,
             generation=generation,
             vocabulary=vocabulary_standing(session, generation),
             object_key=result["object_key"],
@@ -188,7 +181,7 @@ def find_similar(
         SimilarPhotoResponse(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
-            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map_name),
+            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map.name),
         )
         for hit in result.hits
     )
@@ -240,7 +233,7 @@ def run_similarity_search(
         missing=list(response.missing),
     )
     history = Search(
-        map_id=query.map_id,
+        map_id=query.map.id,
         generation_id=query.generation.id,
         query_photo_id=query.photo_id,
         query_filename=query.filename,
@@ -252,11 +245,7 @@ def run_similarity_search(
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
     return SimilarityResult(
-        response_without_photos,
-        similar,
-        photos,
-        weights.values if weighted else (),
-        history,
+        response_without_photos, similar, photos, weights.values if weighted else (), history
     )
 
 
@@ -281,11 +270,11 @@ def _search_live_photos(
     while True:
         response = gateway.search.search(
             SearchRequest(
-                map_id=query.map_id,
+                map_id=query.map.id,
                 generation_id=query.generation.id,
                 object_key=query.object_key,
                 row=query.row,
-                min_version=query.min_version,
+                min_version=query.map.version,
                 k=k,
                 photos=photos,
                 min_score=min_score,

@@ -1,18 +1,18 @@
 """Query parameters of the searches: photo filters and the ranking parameters.
 
-`FilterDep` parses the filters of the similarity searches and of the metadata search;
-`SearchParamsDep` adds the ranking parameters of the similarity searches.
+`FilterParams` are those of the similarity searches and of the metadata search; `SimilarityParams`
+adds the ranking parameters of the similarity searches.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from datetime import datetime
 from uuid import UUID
 
-from fastapi import Depends, Query
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
+from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -24,52 +24,49 @@ MAX_IDS = 1000
 MAX_IDS_CHARACTERS = 40_000
 
 
-def parse_photo_filter(
-    near: Annotated[
-        str | None,
-        Query(description="LAT,LON,RADIUS_M: photos taken within RADIUS_M metres of the point"),
-    ] = None,
-    box: Annotated[
-        str | None,
-        Query(description="S,W,N,E in degrees; W greater than E crosses the antimeridian"),
-    ] = None,
-    captured_after: Annotated[
-        str | None, Query(description="ISO 8601; no offset means UTC")
-    ] = None,
-    captured_before: Annotated[
-        str | None, Query(description="ISO 8601; no offset means UTC")
-    ] = None,
-    place: Annotated[
-        str | None,
-        Query(max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"),
-    ] = None,
-    tags: Annotated[
-        str | None, Query(max_length=5000, description="separated by commas; photos must have all")
-    ] = None,
-    ids: Annotated[
-        str | None,
-        Query(max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"),
-    ] = None,
-) -> PhotoFilter:
-    """Parses the filter from the query parameters.
+class FilterParams(MapParams):
+    """Query parameters that filter photos."""
 
-    Raises:
-        Unprocessable: `invalid_field`, with the name of the invalid parameter.
-    """
-    if place is not None and "\0" in place:
-        raise invalid_field_error("place", "contains a NUL character")
-    return PhotoFilter(
-        near=_parse_circle(near) if near is not None else None,
-        box=_parse_box(box) if box is not None else None,
-        captured_after=parse_time("captured_after", captured_after) if captured_after else None,
-        captured_before=parse_time("captured_before", captured_before) if captured_before else None,
-        place=place or None,
-        tags=tuple(parse_tags(tags.split(","))) if tags else (),
-        ids=_parse_ids(ids) if ids is not None else None,
+    near: str | None = Field(
+        None, description="LAT,LON,RADIUS_M: photos taken within RADIUS_M metres of the point"
+    )
+    box: str | None = Field(
+        None, description="S,W,N,E in degrees; W greater than E crosses the antimeridian"
+    )
+    captured_after: str | None = Field(None, description=TIME)
+    captured_before: str | None = Field(None, description=TIME)
+    place: str | None = Field(
+        None, max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"
+    )
+    tags: str | None = Field(
+        None, max_length=5000, description="separated by commas; photos must have all"
+    )
+    ids: str | None = Field(
+        None, max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"
     )
 
+    def photo_filter(self) -> PhotoFilter:
+        """Parses the filter.
 
-FilterDep = Annotated[PhotoFilter, Depends(parse_photo_filter)]
+        Raises:
+            Unprocessable: `invalid_field`, with the name of the invalid parameter.
+        """
+        if self.place is not None and "\0" in self.place:
+            raise invalid_field_error("place", "contains a NUL character")
+        return PhotoFilter(
+            near=_parse_circle(self.near) if self.near is not None else None,
+            box=_parse_box(self.box) if self.box is not None else None,
+            captured_after=parse_optional_time("captured_after", self.captured_after),
+            captured_before=parse_optional_time("captured_before", self.captured_before),
+            place=self.place or None,
+            tags=tuple(parse_tags(self.tags.split(","))) if self.tags else (),
+            ids=_parse_ids(self.ids) if self.ids is not None else None,
+        )
+
+
+def parse_optional_time(field: str, text: str | None) -> datetime | None:
+    """Parses a time; None if it is omitted or empty."""
+    return parse_time(field, text) if text else None
 
 
 def _parse_circle(text: str) -> Circle:
@@ -121,23 +118,40 @@ def _parse_ids(text: str) -> tuple[UUID, ...]:
     return tuple(ids)
 
 
-class SearchParams(BaseModel):
-    """Parameters of a similarity search.
-
-    Stored as JSON in the job of a query photo, which is described before the search runs.
-    """
+class RankingParams(BaseModel):
+    """Number of results of a similarity search, ranking, and limits of its cost."""
 
     model_config = ConfigDict(frozen=True)
 
-    top_k: int
-    min_score: float | None = None
-    photos: PhotoFilter = NO_FILTER
-    word_weights: bool = True
-    rerank: int | None = None
-    explain: bool = False
-    mode: Mode = Mode.AUTO
-    most_rows: int | None = None
-    most_seconds: float | None = None
+    top_k: int = Field(10, ge=1, le=100, description="Maximum number of photos to return.")
+    min_score: float | None = Field(
+        None, ge=-1, le=1, description="Minimum cosine similarity of the returned photos."
+    )
+    word_weights: bool = Field(
+        True, description="Rank by the word weights of the map, if it has any."
+    )
+    rerank: int | None = Field(
+        None,
+        ge=1,
+        le=MAX_RERANK_CANDIDATES,
+        description="Compare the first N photos with the query patch by patch, and rerank them.",
+    )
+    explain: bool = Field(
+        False, description="Return the clusters and patches that contribute to each similarity."
+    )
+    mode: Mode = Field(
+        Mode.AUTO,
+        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
+        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
+    )
+    most_rows: int | None = Field(
+        None,
+        ge=0,
+        description="Stop the search after reading this many rows; `certificate` reports it.",
+    )
+    most_seconds: float | None = Field(
+        None, gt=0, description="Stop the search after this many seconds; `certificate` reports it."
+    )
 
     @property
     def needs_comparison(self) -> bool:
@@ -145,73 +159,19 @@ class SearchParams(BaseModel):
         return self.rerank is not None or self.explain
 
 
-TopK = Annotated[int, Query(ge=1, le=100, description="Maximum number of photos to return.")]
-MinScore = Annotated[
-    float | None,
-    Query(ge=-1, le=1, description="Minimum cosine similarity of the returned photos."),
-]
-ModeParam = Annotated[
-    Mode,
-    Query(
-        alias="mode",
-        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
-        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
-    ),
-]
-MaxRows = Annotated[
-    int | None,
-    Query(
-        ge=0, description="Stop the search after reading this many rows; `certificate` reports it."
-    ),
-]
-MaxSeconds = Annotated[
-    float | None,
-    Query(gt=0, description="Stop the search after this many seconds; `certificate` reports it."),
-]
-UseWordWeights = Annotated[
-    bool,
-    Query(
-        alias="word_weights",
-        description="Rank by the word weights of the map, if it has any.",
-    ),
-]
-Rerank = Annotated[
-    int | None,
-    Query(
-        ge=1,
-        le=MAX_RERANK_CANDIDATES,
-        description="Compare the first N photos with the query patch by patch, and rerank them.",
-    ),
-]
-Explain = Annotated[
-    bool,
-    Query(description="Return the clusters and patches that contribute to each similarity."),
-]
+class SearchParams(RankingParams):
+    """Parameters of a similarity search.
+
+    Stored as JSON in the job of a query photo, which is described before the search runs.
+    """
+
+    photos: PhotoFilter = NO_FILTER
 
 
-def parse_search_params(
-    photos: FilterDep,
-    top_k: TopK = 10,
-    min_score: MinScore = None,
-    word_weights: UseWordWeights = True,
-    rerank: Rerank = None,
-    explain: Explain = False,
-    mode: ModeParam = Mode.AUTO,
-    most_rows: MaxRows = None,
-    most_seconds: MaxSeconds = None,
-) -> SearchParams:
-    """Dependency that collects the query parameters of a similarity search."""
-    return SearchParams(
-        top_k=top_k,
-        min_score=min_score,
-        photos=photos,
-        word_weights=word_weights,
-        rerank=rerank,
-        explain=explain,
-        mode=mode,
-        most_rows=most_rows,
-        most_seconds=most_seconds,
-    )
+class SimilarityParams(RankingParams, FilterParams):
+    """Query parameters of the similarity searches."""
 
-
-SearchParamsDep = Annotated[SearchParams, Depends(parse_search_params)]
+    def search_params(self) -> SearchParams:
+        """Parses the filter; raises as `photo_filter`."""
+        ranking = self.model_dump(include=set(RankingParams.model_fields))
+        return SearchParams(photos=self.photo_filter(), **ranking)

@@ -18,9 +18,3 @@ def always_by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every search of more than nothing goes through int8 codes, as that of middle dimensions."""
     monkeypatch.setattr(catalog_sync, "MIN_CODED_BYTES", 0)
     monkeypatch.setattr(executor, "int8_codes_pay_off", lambda selected, k, dimension: selected > 0)
-
-
-def int8_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same of long rows: the codes are made once `Mode.DETERMINISTIC` is asked for."""
-    always_by_int8(monkeypatch)
-    monkeypatch.setattr(catalog_sync, "CODED_DIMENSION", 1)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import threading
 from typing import BinaryIO
 
 import pytest
@@ -12,24 +10,21 @@ import torch
 
 from services.search import executor, gpu
 from services.search import worker as worker_module
-from services.search.chunk_loader import ChunkLoader, StoredChunk
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.session import Catalog
-from shared.codes.int8_codes import Int8Codes
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
-from shared.errors import Unavailable
-from shared.search_api.protocol import Mode, SearchBackend
+from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
-from tests.contract.search.search_methods import always_by_codes, always_by_int8, int8_on_demand
+from tests.contract.search.search_methods import always_by_codes, always_by_int8
 from tests.contract.search.test_search_backend import (
     OpenPort,
     SearchPortContract,
     whatever_the_catalog,
 )
-from tests.support.small_map import SmallMap, assert_answers, damaged, search_when_built, unit_rows
+from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
 
 
 class TestSearchWorker(SearchPortContract):
@@ -195,96 +190,20 @@ class TestSearchWorkerByInt8(TestSearchWorker):
 
 
 @whatever_the_catalog
-class TestSearchWorkerDeterministic(TestSearchWorker):
-    """The same promises of `mode=deterministic`, whose codes are made when they are asked for."""
-
-    certificate = "bound"
-
-    @pytest.fixture(autouse=True)
-    def deterministic(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        int8_on_demand(monkeypatch)
-        monkeypatch.setattr(SmallMap, "mode", Mode.DETERMINISTIC)
-
-    def test_codes_are_made_once_asked_for_and_counted(
-        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        places.add(unit_rows(1, 30))
-        search = port()
-        reference = places.query(unit_rows(2, 1)[0])
-        with monkeypatch.context() as patch:
-            patch.setattr(SmallMap, "mode", Mode.DENSE)
-            dense = search.search(places.request(reference))
-        assert dense.certificate == "exhaustive"
-        before = search.status().resident_bytes
-        found = search.search(places.request(reference))
-        assert found.certificate == "bound"
-        assert found.hits == dense.hits
-        assert search.status().resident_bytes == before + 30 * 64  # 12 numbers are padded to 64
-
-    def test_codes_that_take_long_refuse_with_progress_and_come(
-        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        go_on = threading.Event()
-        make = ChunkLoader.load_int8_codes
-
-        def slowly(self: ChunkLoader, object_key: str, stored: StoredChunk) -> Int8Codes:
-            assert go_on.wait(60)
-            return make(self, object_key, stored)
-
-        monkeypatch.setattr(ChunkLoader, "load_int8_codes", slowly)
-        places.add(unit_rows(1, 30))
-        vector = unit_rows(2, 1)[0]
-        request = places.request(places.query(vector))
-        search = port(search_wait_seconds=0.01)
-        for _ in range(2):
-            with pytest.raises(Unavailable) as caught:
-                search.search(request)
-            assert caught.value.code == "codes_being_made"
-            assert caught.value.extra["retry_after_seconds"] >= 1
-            assert (caught.value.extra["done"], caught.value.extra["rows"]) == (0, 30)
-        auto = search.search(request.model_copy(update={"mode": Mode.AUTO}))
-        assert_answers(auto, places.brute_force(vector))
-        go_on.set()
-        response = search_when_built(search, request)
-        assert_answers(response, places.brute_force(vector))
-        assert response.certificate == "bound"
-
-    def test_codes_that_can_not_be_kept_are_refused_and_tried_again(
-        self, places: SmallMap, port: OpenPort, settings: Settings
-    ) -> None:
-        places.add(unit_rows(1, 30))
-        vector = unit_rows(2, 1)[0]
-        request = places.request(places.query(vector))
-        search = port()
-        search.search(request.model_copy(update={"mode": Mode.AUTO}))
-        folder = settings.search_cache_folder(SINGLE_SHARD)
-        shutil.rmtree(folder)
-        folder.write_text("no folder can be here")
-        with pytest.raises(Unavailable) as caught:
-            search.search(request)
-        assert caught.value.code == "codes_not_made"
-        folder.unlink()
-        assert_answers(search.search(request), places.brute_force(vector))
-
-
-@whatever_the_catalog
 class TestSearchWorkerOnADevice(TestSearchWorker):
     """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
 
     certificate = "bound"
 
-    @pytest.fixture(params=["float16", "int8"])
+    @pytest.fixture
     def port(
         self,
-        request: pytest.FixtureRequest,
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
         monkeypatch: pytest.MonkeyPatch,
     ) -> OpenPort:
-        always_by_int8(monkeypatch)
         monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-        monkeypatch.setattr(gpu, "ROW_FORMATS", (request.param,))
 
         def open_port(**changes: object) -> SearchBackend:
             device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)

@@ -13,8 +13,7 @@ import pytest
 
 from shared.errors import NotFound, StorageFull
 from shared.storage import FolderStore, ObjectStore, OwnedStore
-from shared.storage.folder import OWNER_MARK
-from shared.storage.keys import trash_key
+from shared.storage.keys import OWNER_MARK, trash_key
 from shared.storage.s3 import S3Store
 from tests.support.servers import S3Server, start_moto
 

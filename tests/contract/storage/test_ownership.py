@@ -26,7 +26,8 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.folder import OWNER_MARK, FolderStore
+from shared.storage.folder import FolderStore
+from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 from shared.storage.s3 import Bucket, S3Store

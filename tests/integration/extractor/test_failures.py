@@ -16,7 +16,6 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
 
 from services.extractor import publish as publish_module
-from services.extractor import worker as worker_module
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.tasks.orphans import collect_orphans
@@ -153,7 +152,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
             raise OperationalError("the catalog is away", None, Exception())
         return claim_jobs(*arguments, **options)
 
-    monkeypatch.setattr(worker_module, "claim_jobs", claim_or_fail)
+    monkeypatch.setattr("shared.jobs.runner.claim_jobs", claim_or_fail)
     with pytest.raises(OperationalError):
         averages.drain()
     gc.collect()

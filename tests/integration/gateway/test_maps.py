@@ -135,7 +135,7 @@ def live_in(service: Service, name: str) -> None:
                 filename="sent.jpg",
                 size_bytes=1,
                 sha256="0" * 64,
-                said={},
+                photo_fields={},
                 expires_at=db_now_plus(3600),
             )
         )

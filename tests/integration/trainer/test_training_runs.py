@@ -146,6 +146,24 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     assert_same_weights(Path(report["best"]["path"]), Path(resumed["best"]["path"]))
 
 
+def test_a_run_that_an_earlier_release_began_goes_on(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    """Lightning's Trainer wrote its checkpoint: random numbers in the state of a callback."""
+    stop = StopRequest()
+    with pytest.raises(RunStopped):
+        run.run(
+            build_arguments(run_arguments(places, tmp_path)), StopAfter(stop, "epoch 1", 2), stop
+        )
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    stored = torch.load(last, weights_only=True)
+    stored["callbacks"] = {"TrainingCallback": stored.pop("rng_state")}
+    del stored["MixedPrecision"]  # written with 16-mixed only
+    torch.save(stored, last)
+    resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
+    assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(resumed["last"]))
+
+
 def test_a_finished_run_learns_longer(whole: tuple[Path, Json], tmp_path: Path) -> None:
     folder, _ = whole
     copy = Path(shutil.copytree(folder, tmp_path / "run"))

@@ -197,10 +197,10 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
         )
         measure_growth(report, progress, sizes=[3000])
     figures = {figure.what: figure.measured for figure in report.figures}
-    assert figures["60 x 7,168: our answers that differ"] == 0
-    assert figures["load: wrong answers"] == figures["load: errors"] == 0
-    assert figures["load: answers"] > 0
-    assert figures["growth: scan of 3,000 codes, median"] > 0
+    assert figures["60 x 7,168: wrong results of Placewise"] == 0
+    assert figures["load: wrong results"] == figures["load: errors"] == 0
+    assert figures["load: results"] > 0
+    assert figures["growth: scan of 3,000 codes, p50"] > 0
     (comparison,) = report.details["comparisons"]
     assert len(comparison["rows"]) == 5 * 6
     exact = [row for row in comparison["rows"] if "Binary" not in row["method"]]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.search import executor
 from services.search.chunk_loader import LoadedChunk
-from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult
+from services.search.executor import SCORE_DECIMALS, SearchOptions
 from services.search.photo_columns import PhotoColumns
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
@@ -21,6 +21,7 @@ from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.codes.int8_codes import int8_codes
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
+from shared.search_api.protocol import SearchResponse
 
 DIMENSION = 7168
 
@@ -64,12 +65,12 @@ def brute_force(
 
 def answer(
     snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], question: SearchOptions
-) -> SearchResult:
+) -> SearchResponse:
     """Of a query that comes alone."""
     return executor.execute_query(snapshot, query, selected, question, QueryBatcher())
 
 
-def hits_of(found: SearchResult) -> list[tuple[UUID, float]]:
+def hits_of(found: SearchResponse) -> list[tuple[UUID, float]]:
     return [(hit.photo_id, hit.score) for hit in found.hits]
 
 

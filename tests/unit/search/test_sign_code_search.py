@@ -12,13 +12,13 @@ from hypothesis import given, settings
 
 from services.search import executor, kernels, sign_code_search
 from services.search.chunk_loader import LoadedChunk
-from services.search.executor import SearchOptions, SearchResult
+from services.search.executor import SearchOptions
 from services.search.query_batcher import QueryBatcher
 from services.search.sign_code_search import scan_first_level
 from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
-from shared.search_api.protocol import Mode
+from shared.search_api.protocol import Mode, SearchResponse
 from tests.support.servers.handle import wait_until
 from tests.unit.search.search_rows import (
     Case,
@@ -172,7 +172,7 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
 
     monkeypatch.setattr(sign_code_search, "scan_first_level", first_waits)
 
-    def ask(number: int) -> SearchResult:
+    def ask(number: int) -> SearchResponse:
         return executor.execute_query(
             snapshot, queries[number], requests[number], questions[number], glances
         )

@@ -8,6 +8,21 @@ from torch.nn.functional import normalize
 from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 
 
+class InMemoryPoints:
+    """A PointSource in memory."""
+
+    def __init__(self, points: torch.Tensor) -> None:
+        """`points`: (n, D) float32 on the CPU."""
+        self._points = points
+        self.width = points.shape[1]
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def read(self, begin: int, end: int) -> torch.Tensor:
+        return self._points[begin:end]
+
+
 def unit_points(seed: int, count: int, width: int) -> torch.Tensor:
     """(count, width) random directions."""
     generator = torch.Generator().manual_seed(seed)

@@ -1,6 +1,6 @@
-"""Minimal FastAPI upload server, the baseline of `bench pipeline`: stores a form's file in S3.
+"""Minimal FastAPI upload server, the baseline of `placewise bench pipeline`: stores a file in S3.
 
-    python -m benchmarks.bare_upload PORT    (with the S3_ settings in the environment)
+    python -m benchmarks.fleet.bare_upload PORT    (with the S3_ settings in the environment)
 
 It does not validate, count, hash or record anything.
 """

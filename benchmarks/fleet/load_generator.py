@@ -16,7 +16,6 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from http.client import HTTPConnection, HTTPException
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 from uuid import UUID
@@ -64,12 +63,7 @@ class HttpCaller:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -146,6 +140,11 @@ def multipart_form(photo: bytes, filename: str = "photo.jpg") -> bytes:
             f"\r\n--{BOUNDARY}--\r\n".encode(),
         )
     )
+
+
+def multipart_forms(photos: Sequence[bytes], count: int) -> list[bytes]:
+    """Build `count` forms; the photos are repeated."""
+    return [multipart_form(photos[number % len(photos)]) for number in range(count)]
 
 
 def upload_all(
