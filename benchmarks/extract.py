@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 class BenchmarkedExtractor:
     """An extractor with its weights."""
 
-    recipe: ExtractorConfig
+    config: ExtractorConfig
     device: torch.device
     settings: Settings
     dino_weights: Path | None
@@ -80,10 +80,10 @@ class BenchmarkedExtractor:
             Misconfigured: the extractor or the device is not available.
         """
         settings = read_settings()
-        recipe = settings.extractor_config(extractor)
+        config = settings.extractor_config(extractor)
         weights, random = settings.dino_weights, False
-        if recipe.depth is not None:
-            size = recipe.backbone.removeprefix("dinov2-")
+        if config.depth is not None:
+            size = config.backbone.removeprefix("dinov2-")
             try:
                 weights = find_local_weights(size, weights)
             except Misconfigured as error:
@@ -91,11 +91,11 @@ class BenchmarkedExtractor:
                     raise
                 weights = save(random_weights(SHAPES[size]), folder / f"{size}.safetensors")
                 random = True
-        return cls(recipe, choose_device(device), settings, weights, random)
+        return cls(config, choose_device(device), settings, weights, random)
 
     def load(self, precision: Precision) -> Extractor:
         return Extractor(
-            self.recipe, self.device, precision=precision, dino_weights=self.dino_weights
+            self.config, self.device, precision=precision, dino_weights=self.dino_weights
         )
 
     @property
@@ -105,37 +105,37 @@ class BenchmarkedExtractor:
             if self.device.type == "cuda"
             else f"{torch.get_num_threads()} CPU threads"
         )
-        return f"{self.recipe.name}{', random weights' if self.random else ''}, {name}"
+        return f"{self.config.name}{', random weights' if self.random else ''}, {name}"
 
 
 def fit_or_load_centres(extractor: Extractor, photos: list[Pixels]) -> ClusterCentres | None:
     """Return the shipped cluster centres, or fit them on the photos if the extractor needs some."""
-    if not extractor.recipe.needs_vocabulary:
+    if not extractor.config.needs_vocabulary:
         return None
     shipped = extractor.shipped_vocabulary()
     if shipped is not None:
         return shipped[0]
-    clusters = extractor.recipe.clusters
+    clusters = extractor.config.clusters
     return fit_vocabulary(extractor, [photos], len(photos), clusters=clusters, seed=0).centres
 
 
 class ReferenceAnyLoc:
     def __init__(self, measured: BenchmarkedExtractor, centres: NDArray[np.float32]) -> None:
-        """(K, width) centres. The recipe is one of the `anyloc-` ones, with hard VLAD."""
-        recipe, device = measured.recipe, measured.device
-        assert recipe.layer is not None
-        assert recipe.preprocessing is not None
-        size = recipe.backbone.removeprefix("dinov2-")
+        """(K, width) centres. The extractor is one of the `anyloc-` ones, with hard VLAD."""
+        config, device = measured.config, measured.device
+        assert config.layer is not None
+        assert config.preprocessing is not None
+        size = config.backbone.removeprefix("dinov2-")
         self._device = device
-        self._preprocessing = get_preprocessing(recipe.preprocessing)
+        self._preprocessing = get_preprocessing(config.preprocessing)
         self._centres = torch.from_numpy(centres).to(device)
         whole = SHAPES[size].depth - 1
         self._network = Dinov2(size, whole, "token", device, measured.dino_weights)
-        self._third = None if recipe.facet == "token" else FACETS.index(recipe.facet or "value")
+        self._third = None if config.facet == "token" else FACETS.index(config.facet or "value")
         blocks: Any = self._network._vit.blocks
         for block in blocks:
             block.attn.fused_attn = device.type == "cuda"
-        hooked = blocks[recipe.layer]
+        hooked = blocks[config.layer]
         (hooked if self._third is None else hooked.attn.qkv).register_forward_hook(
             self._store_output
         )
@@ -201,7 +201,7 @@ def measure(
     files = [textures[number % len(textures)] for number in range(photos)]
     with tempfile.TemporaryDirectory() as folder:
         measured = BenchmarkedExtractor.of(extractor, device, Path(folder))
-        chosen = choose_precision(precision, measured.recipe, measured.device)
+        chosen = choose_precision(precision, measured.config, measured.device)
         report = Report(f"{measured.title}, {chosen}")
         with _open_pipeline(measured, chosen, batch, made[:FIT_PHOTOS]) as pipeline:
             _run_rounds(report, progress, measured, pipeline, files, rounds)
@@ -228,7 +228,7 @@ def _run_rounds(
     pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
     ours, published = RoundTimings(), RoundTimings()
     reference, expected = None, None
-    if measured.recipe.depth is not None and measured.recipe.aggregator == "vlad":
+    if measured.config.depth is not None and measured.config.aggregator == "vlad":
         assert pipeline.centres is not None
         reference = ReferenceAnyLoc(measured, pipeline.centres.array)
         reference.describe(files[:1])

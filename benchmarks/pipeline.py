@@ -128,8 +128,8 @@ def _upload_and_wait(
 
 def _model_milliseconds(width: int, batch: int) -> float:
     """Return the CPU time per photo of the fake backbone, which only samples pixels."""
-    recipe = get_extractor_config(_test_extractor(width), allow_test_extractors=True)
-    extractor = Extractor(recipe, torch.device("cpu"))
+    config = get_extractor_config(_test_extractor(width), allow_test_extractors=True)
+    extractor = Extractor(config, torch.device("cpu"))
     pixels = np.zeros((batch, 224, 224, 3), np.uint8)
     extractor.describe(pixels, None)
     started_at = time.process_time()

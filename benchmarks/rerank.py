@@ -96,7 +96,7 @@ def _describe_city(
         extractor,
         _batches(extractor, [database[number] for number in chosen]),
         len(chosen),
-        clusters=extractor.recipe.clusters,
+        clusters=extractor.config.clusters,
         seed=SEED,
     )
     shipped = extractor.shipped_vocabulary()

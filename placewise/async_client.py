@@ -268,7 +268,10 @@ class AsyncClient(AsyncTransport):
         return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
     async def retry(self, work: Work) -> Job:
-        """Queue a failed job again; for a batch, its failed items."""
+        """Queue a failed or cancelled job again.
+
+        For a batch: its failed and cancelled items whose bytes are still stored.
+        """
         return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
     async def photo(self, file_id: Id) -> OnePhoto:

@@ -69,7 +69,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Creates the limits from the settings, capped by the file limit of the process."""
+        """Create the limits from the settings, capped by the file limit of the process."""
         files = raise_file_limit()
         total = min(settings.max_connections, files - min(RESERVED_FILES, files // 2))
         if total < settings.max_connections:
@@ -89,7 +89,7 @@ class ConnectionLimits:
         )
 
     def of_address(self, address: str) -> int:
-        """Returns the maximum number of connections of an address; 0 if it is unlimited."""
+        """Return the maximum number of connections of an address; 0 if it is unlimited."""
         trusted = address and any(ip_address(address) in net for net in self.trusted_proxies)
         return 0 if trusted else self.per_address
 
@@ -116,7 +116,7 @@ class Connections:
         return len(self._open)
 
     def add(self, connection: LimitedProtocol) -> PlacewiseError | None:
-        """Adds a new connection; closes an idle one if a limit is reached.
+        """Add a new connection; close an idle one if a limit is reached.
 
         Returns:
             The error to respond with if no connection is idle; else None.
@@ -152,7 +152,7 @@ class Connections:
         return None
 
     def remove(self, connection: LimitedProtocol) -> None:
-        """Removes a connection that is closed or about to be closed. Idempotent."""
+        """Remove a connection that is closed or about to be closed. Idempotent."""
         if connection not in self._open:
             return
         del self._open[connection]
@@ -162,19 +162,19 @@ class Connections:
             del self._count_by_group[connection.group]
 
     def mark_idle(self, connection: LimitedProtocol) -> None:
-        """Marks a connection without a request in flight: it may be closed for a new one."""
+        """Mark a connection without a request in flight: it may be closed for a new one."""
         if connection in self._open:
             self._idle[connection.group].setdefault(connection)
 
     def mark_busy(self, connection: LimitedProtocol) -> None:
-        """Marks a connection with a request in flight."""
+        """Mark a connection with a request in flight."""
         idle = self._idle.get(connection.group, {})
         idle.pop(connection, None)
         if not idle:
             self._idle.pop(connection.group, None)
 
     def check(self) -> None:
-        """Closes connections of slow clients and logs the counts; called about once a second."""
+        """Close connections of slow clients and log the counts; called about once a second."""
         now = time.monotonic()
         for connection in list(self._open):
             connection.check(now)
@@ -205,7 +205,7 @@ class Connections:
             loop.default_exception_handler(context)
 
     def _close_idle(self, group: str, reason: Reason) -> bool:
-        """Closes the longest idle connection of the group; False if none is idle."""
+        """Close the longest idle connection of the group; False if none is idle."""
         oldest = next(iter(self._idle.get(group, ())), None)
         if oldest is None:
             return False
@@ -273,7 +273,7 @@ class LimitedProtocol(H11Protocol):
             self._paused |= self.flow.read_paused
 
     def check(self, now: float) -> None:
-        """Closes the connection if its client is too slow."""
+        """Close the connection if its client is too slow."""
         limits = self._connections.limits
         unsent = self.transport.get_write_buffer_size()
         if unsent == 0 or unsent < self._unsent_bytes:
@@ -312,7 +312,7 @@ class LimitedProtocol(H11Protocol):
                 self._begin_window(now)
 
     def close(self) -> None:
-        """Aborts the connection at once."""
+        """Abort the connection at once."""
         self._connections.remove(self)
         self.transport.abort()
 
@@ -321,7 +321,7 @@ class LimitedProtocol(H11Protocol):
         self._paused = self.flow.read_paused
 
     def _refuse(self, error: PlacewiseError) -> None:
-        """Sends the problem, unless a response has started, and closes the connection."""
+        """Send the problem, unless a response has started, and close the connection."""
         self._connections.remove(self)
         self._head_since = self._window_since = None
         in_flight = self.cycle is not None and not self.cycle.response_complete
@@ -335,7 +335,7 @@ class LimitedProtocol(H11Protocol):
 
 
 def address_group(address: str) -> str:
-    """Returns the key that limits count as one address: the IPv4 address, or the IPv6 /64 network.
+    """Return the key that limits count as one address: the IPv4 address, or the IPv6 /64 network.
 
     One customer or machine usually has a whole /64.
     """
@@ -351,7 +351,7 @@ def address_group(address: str) -> str:
 
 
 def raise_file_limit() -> int:
-    """Raises the soft limit of open files to the hard limit, at most MAX_OPEN_FILES.
+    """Raise the soft limit of open files to the hard limit, at most MAX_OPEN_FILES.
 
     Returns:
         The limit that is in effect.

@@ -78,14 +78,14 @@ class Standalone:
     """Why a service thread could not continue: the process must end with this error."""
 
     def stop(self, error: PlacewiseError | None = None) -> None:
-        """Stops the server because a service thread has failed; by default, with `part_died`."""
+        """Stop the server because a service thread has failed; by default, with `part_died`."""
         self.error = error or Misconfigured(
             "part_died", "A service thread crashed. Its exception is in the log above."
         )
         self.server.should_exit = True
 
     def serve(self) -> None:
-        """Serves HTTP until the process is stopped by a signal.
+        """Serve HTTP until the process is stopped by a signal.
 
         Raises:
             Misconfigured: `part_died`, if a service thread has crashed; also as the extractor's
@@ -131,7 +131,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)
-        hints = InProcessWakeups()
+        wakeups = InProcessWakeups()
         with catalog.write() as session:
             get_or_create_default_map(session, settings.new_map_extractor)
             # The lock proves that no other worker is alive: rows are left from a killed process.
@@ -150,13 +150,13 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         name = f"embedded-{os.getpid()}"
         heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
-        steward = Scheduler(catalog, store, hints, settings, steward_metrics)
+        steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
         evaluator = EvaluationWorker(catalog, store, search, settings, name, steward_metrics)
         webhooks = WebhookDispatcher(catalog, settings)
-        batches = BatchWorker(catalog, store, hints, settings, name, steward_metrics)
+        batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
         gateway = GatewayContext(
-            requests, store, hints, metered_search, settings, authenticator, registry
+            requests, store, wakeups, metered_search, settings, authenticator, registry
         )
         server = http_server(
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
@@ -166,7 +166,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
 
         def run_extractor(stop: threading.Event) -> None:
             if lazy_extractor:
-                _wait_for_extractor_jobs(catalog, settings, hints, stop)
+                _wait_for_extractor_jobs(catalog, settings, wakeups, stop)
             if stop.is_set():
                 return
             from services.extractor.worker import ExtractorWorker
@@ -179,7 +179,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 running.stop(error)
                 return
             with contextlib.closing(extractor):
-                extractor.run(stop, hints)
+                extractor.run(stop, wakeups)
 
         stop = threading.Event()
         threads = [
@@ -199,23 +199,23 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             yield running
         finally:
             stop.set()
-            hints.send()
+            wakeups.send()
             for thread in threads:
                 thread.join()
 
 
 def _wait_for_extractor_jobs(
-    catalog: Catalog, settings: Settings, hints: InProcessWakeups, stop: threading.Event
+    catalog: Catalog, settings: Settings, wakeups: InProcessWakeups, stop: threading.Event
 ) -> None:
     runner = JobRunner(catalog, settings, "extractor", EXTRACTOR_JOBS, lambda *_: None)
     while not stop.is_set() and not runner.run_once(runner.has_jobs, stop):
-        hints.wait(IDLE_POLL_SECONDS)
+        wakeups.wait(IDLE_POLL_SECONDS)
 
 
 def _create_authenticator(
     settings: Settings, host: str, catalog: Catalog
 ) -> tuple[Authenticator, str | None, str | None]:
-    """Returns the authenticator, the first admin key if it is created now, and the local key."""
+    """Return the authenticator, the first admin key if it is created now, and the local key."""
     # Both the configured name and the address it resolves to, which can change.
     if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
         return LocalhostAuthenticator(settings.allowed_origins), None, None

@@ -76,7 +76,7 @@ class BruteForce:
 
 
 def same_ranking(found: Ranking, expected: Ranking) -> bool:
-    """Return whether photos, order and scores are the same."""
+    """Return whether photos and order are equal and scores differ by at most TOLERANCE."""
     return len(found) == len(expected) and all(
         ours[0] == truth[0] and abs(ours[1] - truth[1]) <= TOLERANCE
         for ours, truth in zip(found, expected, strict=True)

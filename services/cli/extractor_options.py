@@ -17,9 +17,9 @@ from shared.extractor_config.configs import (
 
 # Keyed by the publisher's names, such as `dinov2_vits14`.
 BACKBONES = {
-    recipe.backbone.replace("dinov2-", "dinov2_"): name
-    for name, recipe in EXTRACTOR_CONFIGS.items()
-    if not recipe.for_tests
+    config.backbone.replace("dinov2-", "dinov2_"): name
+    for name, config in EXTRACTOR_CONFIGS.items()
+    if not config.for_tests
 }
 
 PreprocessingOption = Annotated[

@@ -190,9 +190,9 @@ class ComparisonRunner:
         target = resolve_generation(self._catalog, self._store, self._models, job)
         assert target is not None, "a compare job names an existing generation"
         if request.rerank:
-            check_rerankable(target.extractor.recipe)
+            check_rerankable(target.extractor.config)
         if request.explain:
-            check_explainable(target.extractor.recipe, target.generation.spec)
+            check_explainable(target.extractor.config, target.generation.spec)
         data = self._read_query(job, request)
         (query,) = self._decoders.decode([data], target.extractor.preprocessing)
         if isinstance(query, PlacewiseError):
@@ -290,7 +290,7 @@ class ComparisonRunner:
             )
         rows = np.stack(list(stored.values()))
         shares = explain_similarities(
-            target.extractor.recipe, features, target.centres, rows, word_weights
+            target.extractor.config, features, target.centres, rows, word_weights
         )
         return dict(zip(stored, shares, strict=True))
 

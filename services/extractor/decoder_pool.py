@@ -113,7 +113,10 @@ class DecoderPool:
         raise AssertionError("the last attempt returns")
 
     def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:
-        """Return the future's result; Unavailable if the pool broke and no result will come."""
+        """Wait for the future's result.
+
+        Raises Unavailable if the pool stopped, because no result will come then.
+        """
         while True:
             done, _ = wait([future], timeout=POOL_POLL_SECONDS)
             if done:

@@ -103,7 +103,7 @@ def _create_first_generation(
     worker has created it meanwhile.
     """
     shipped = extractor.shipped_vocabulary()
-    if extractor.recipe.needs_vocabulary and shipped is None:
+    if extractor.config.needs_vocabulary and shipped is None:
         return None
     key = new_vocabulary_key()
     if shipped is not None:
@@ -143,7 +143,7 @@ def _create_first_generation(
         session.flush()
         wake_vocabulary_waiters(session, map_id)
         increment_map_version(session, map_id)
-    log.info("generation %s created with extractor %s", generation.id, extractor.recipe.name)
+    log.info("generation %s created with extractor %s", generation.id, extractor.config.name)
     return generation, vocabulary
 
 

@@ -70,10 +70,10 @@ class VocabularyFitJob:
     def run_step(self, job: Job) -> None:
         """Run the next step of the job's stage; PlacewiseError if it can't continue."""
         extractor = map_extractor(self._catalog, self._models, job)
-        if not extractor.recipe.needs_vocabulary:
+        if not extractor.config.needs_vocabulary:
             raise Unprocessable(
                 "vocabulary_unfit",
-                f"The extractor {extractor.recipe.name} uses no vocabulary: "
+                f"The extractor {extractor.config.name} uses no vocabulary: "
                 "there is nothing to fit.",
             )
         if job.stage is None:
@@ -105,7 +105,7 @@ class VocabularyFitJob:
         )
         plan = [str(photo_ids[number]) for number in chosen]
         self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
-        clusters = job.params["clusters"] or extractor.recipe.clusters
+        clusters = job.params["clusters"] or extractor.config.clusters
         checkpoint_and_release(
             self._catalog,
             job,
@@ -230,8 +230,8 @@ class VocabularySwitchJob:
         vocabulary that it ships with.
 
         Raises:
-            Unprocessable: `vocabulary_unfit` if the extractor can't use the vocabulary, or needs
-                one.
+            Unprocessable: `vocabulary_unfit` if the extractor can't use the vocabulary, or if it
+                needs one and None was given.
         """
         if job.params.get("extractor") is None:
             extractor = map_extractor(self._catalog, self._models, job)
@@ -251,10 +251,10 @@ class VocabularySwitchJob:
                     shipped[1],
                 )
                 return
-            if extractor.recipe.needs_vocabulary:
+            if extractor.config.needs_vocabulary:
                 raise Unprocessable(
                     "vocabulary_unfit",
-                    f"The extractor {extractor.recipe.name} needs a vocabulary. Choose one with "
+                    f"The extractor {extractor.config.name} needs a vocabulary. Choose one with "
                     "`vocabulary_id`.",
                 )
             self._start_generation(job, extractor, None, None)

@@ -91,13 +91,13 @@ class ModelRegistry:
             precision: Precision of an existing generation (see `extractor_of_generation`); by
                 default that of new generations, PRECISION.
         """
-        recipe = self._settings.extractor_config(name)
+        config = self._settings.extractor_config(name)
         if precision is None:
-            precision = choose_precision(self._settings.precision, recipe, self._device)
+            precision = choose_precision(self._settings.precision, config, self._device)
         with self._lock:
-            if recipe.name not in self._extractors:
-                self._extractors[recipe.name] = self._load(recipe, precision)
-            return self._extractors[recipe.name].with_precision(precision)
+            if config.name not in self._extractors:
+                self._extractors[config.name] = self._load(config, precision)
+            return self._extractors[config.name].with_precision(precision)
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
         """Return the generation's extractor in the precision that the generation was created with.
@@ -118,24 +118,24 @@ class ModelRegistry:
             )
         return self.extractor(generation.extractor, precision)
 
-    def _load(self, recipe: ExtractorConfig, precision: Precision) -> Extractor:
-        limit = self._pass_limits[recipe.local_features]
-        shared_backbone = self._backbones.get(recipe.local_features)
+    def _load(self, config: ExtractorConfig, precision: Precision) -> Extractor:
+        limit = self._pass_limits[config.local_features]
+        shared_backbone = self._backbones.get(config.local_features)
         if shared_backbone is not None:
             return Extractor(
-                recipe, self._device, precision=precision, backbone=shared_backbone, limit=limit
+                config, self._device, precision=precision, backbone=shared_backbone, limit=limit
             )
-        added = recipe.trained.registered if recipe.trained else None
+        added = config.trained.registered if config.trained else None
         started = time.perf_counter()
         extractor = Extractor(
-            recipe,
+            config,
             self._device,
             precision=precision,
             dino_weights=self._settings.dino_weights,
             backbone=self._load_added(added, self._device) if added else None,
             limit=limit,
         )
-        self._backbones[recipe.local_features] = extractor.backbone
+        self._backbones[config.local_features] = extractor.backbone
         if self._device.type == "cuda":
             extractor.warm_up(self._settings.batch_photos)
         self._on_load(time.perf_counter() - started)
@@ -200,7 +200,7 @@ def ensure_model_row(session: Session, extractor: Extractor) -> Model:
         Misconfigured: `model_missing` if an added model has been removed meanwhile.
     """
     backbone = extractor.backbone
-    trained = extractor.recipe.trained
+    trained = extractor.config.trained
     if trained is not None and trained.registered is not None:
         # Locked, because a generation that uses it is created in this transaction.
         return get_model_for_loading(session, trained.registered, lock=True)
@@ -218,7 +218,7 @@ def generation_spec_columns(
     """Return the columns of a generation row that define how its descriptors are computed."""
     spec = pipeline.spec
     return {
-        "extractor": pipeline.extractor.recipe.name,
+        "extractor": pipeline.extractor.config.name,
         "spec": spec,
         "spec_fingerprint": spec_fingerprint(spec),
         "dimension": spec["dimension"],

@@ -125,7 +125,7 @@ class ExtractorWorker:
         if self._only_worker:
             reindex_outdated_generations(self._catalog, self._models)
 
-    def run(self, stop: threading.Event, hints: InProcessWakeups) -> None:
+    def run(self, stop: threading.Event, wakeups: InProcessWakeups) -> None:
         """Drain whenever there is work, until `stop` is set; used by the embedded worker."""
         self.warm_up()
 
@@ -135,7 +135,7 @@ class ExtractorWorker:
                 log.info("drained: %s", result.as_dict())
             return result.claimed > 0
 
-        self._runner.run(drain, stop, hints.wait)
+        self._runner.run(drain, stop, wakeups.wait)
 
     def drain_once(self, stop: threading.Event, seconds: float) -> DrainStats | None:
         """Drain as `drain` does; pause and return None if the catalog was unavailable."""

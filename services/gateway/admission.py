@@ -47,7 +47,7 @@ class ConcurrencyLimit:
     def __init__(
         self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
     ) -> None:
-        """Creates the limit.
+        """Create the limit.
 
         Args:
             what: Names the requests, and the settings of both limits, in error messages.
@@ -66,7 +66,7 @@ class ConcurrencyLimit:
 
     @contextlib.contextmanager
     def hold(self, request: Request) -> Iterator[None]:
-        """Counts the request while the block runs.
+        """Count the request while the block runs.
 
         Raises:
             TooManyRequests: The total limit or the limit of the caller is reached.
@@ -143,7 +143,7 @@ class AdmissionControl:
         )
 
     def admit_job(self, map_name: str) -> None:
-        """Admits a job of the map, and the data that it stores.
+        """Admit a job of the map, and the data that it stores.
 
         Raises:
             TooManyRequests: `queue_full`.
@@ -165,7 +165,7 @@ class AdmissionControl:
         self._admitted[map_name] += 1
 
     def admit_query(self) -> None:
-        """Admits a query photo.
+        """Admit a query photo.
 
         Queries are admitted until less than QUERY_SHARE of MIN_FREE_BYTES is free, so they still
         work while uploads are refused because the disk is full.
@@ -193,11 +193,11 @@ class AdmissionControl:
         return self._active_uploads[kind].hold(request)
 
     def active_uploads(self, kind: UploadKind) -> int:
-        """Returns the number of uploads that are being received."""
+        """Return the number of uploads that are being received."""
         return self._active_uploads[kind].count
 
     def queue_depth(self) -> QueueDepth:
-        """Returns the depth of the queue, at most about a second old."""
+        """Return the depth of the queue, at most about a second old."""
         return self._queue_depth.get()
 
     def _measure_queue_depth(self) -> QueueDepth:
@@ -231,7 +231,7 @@ def _check_photo_quota(request: Request, gateway: GatewayDep) -> None:
 
 
 def reserve_photo_quota(request: Request, settings: Settings) -> AbstractContextManager[None]:
-    """Returns a context manager in which a photo of the caller is stored.
+    """Return a context manager in which a photo of the caller is stored.
 
     Entering it raises TooManyRequests (`photo_quota_reached`) if the quota of the key is used up.
     """
@@ -241,7 +241,7 @@ def reserve_photo_quota(request: Request, settings: Settings) -> AbstractContext
 
 
 def get_photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:
-    """Returns the caller's key and its maximum number of photos; None if it is unlimited."""
+    """Return the caller's key and its maximum number of photos; None if it is unlimited."""
     limit = caller.limits.max_photos or settings.key_max_photos
     return None if caller.key_id is None or limit is None else (caller.key_id, limit)
 

@@ -59,7 +59,7 @@ CORS_EXPOSED_HEADERS = (
 
 
 def create_app(gateway: GatewayContext) -> FastAPI:
-    """Creates the FastAPI application that uses the stores and clients of `gateway`."""
+    """Create the FastAPI application that uses the stores and clients of `gateway`."""
     app = FastAPI(
         title="Placewise",
         version=health.VERSION,

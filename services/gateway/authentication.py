@@ -70,7 +70,7 @@ class Authenticator(Protocol):
     """Authenticates requests before they are routed."""
 
     async def authenticate(self, headers: Headers) -> Caller:
-        """Returns the caller of a request.
+        """Return the caller of a request.
 
         Raises:
             Unauthorized: `key_missing`, `key_unknown`, `key_revoked` or `key_expired`.
@@ -178,7 +178,7 @@ class ApiKeyAuthenticator:
         )
 
     async def record_use(self, caller: Caller) -> None:
-        """Updates `last_used_at` at most once a minute per key; errors are only logged."""
+        """Update `last_used_at` at most once a minute per key; errors are only logged."""
         key_id = caller.key_id
         if key_id is None or key_id in self._recently_recorded:
             return
@@ -196,7 +196,7 @@ class ApiKeyAuthenticator:
 
 
 def parse_bearer(authorization: str | None) -> str:
-    """Returns the key of an `Authorization: Bearer` header.
+    """Return the key of an `Authorization: Bearer` header.
 
     Raises:
         Unauthorized: `key_missing`, if the header is missing or malformed.
@@ -253,7 +253,7 @@ def _is_public(path: str) -> bool:
 
 
 def get_caller(request: Request) -> Caller:
-    """Returns the authenticated caller of a request."""
+    """Return the authenticated caller of a request."""
     caller: Caller = request.state.caller
     return caller
 
@@ -280,7 +280,7 @@ ADMIN = Security(_require_scope, scopes=[KeyScope.ADMIN.value])
 
 
 def check_declared_scopes(router: APIRouter) -> None:
-    """Checks that every route declares exactly one scope.
+    """Check that every route declares exactly one scope.
 
     Raises:
         AssertionError: A route declares none or several.

@@ -83,7 +83,7 @@ class JobNotifier:
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
-        """Releases the waiting requests before the server stops.
+        """Release the waiting requests before the server stops.
 
         Those that wait for a change are released now, those that wait for the end of a job after
         SHUTDOWN_WAIT_SECONDS at the latest.
@@ -92,7 +92,7 @@ class JobNotifier:
         _release(waiter for waiter in self._waiters if waiter.last_seen is not None)
 
     async def wait_until_finished(self, job_id: UUID, seconds: float) -> None:
-        """Waits until the job has ended or been deleted, at most `seconds`.
+        """Wait until the job has ended or been deleted, at most `seconds`.
 
         Raises:
             SQLAlchemyError: The catalog can't be reached.
@@ -106,7 +106,7 @@ class JobNotifier:
     async def wait_for_change(
         self, job_id: UUID, last_seen: WatchedState, seconds: float
     ) -> Change | None:
-        """Waits until the state of the job differs from `last_seen`.
+        """Wait until the state of the job differs from `last_seen`.
 
         Returns:
             The changed job; None if it was deleted or the server is stopping.
@@ -146,7 +146,7 @@ class JobNotifier:
             self._poll_task = None
 
     async def _poll(self, now: float) -> None:
-        """Wakes the waiters whose jobs have ended or changed."""
+        """Wake the waiters whose jobs have ended or changed."""
         due = set(self._waiters)
         if now >= self._next_change_poll:
             self._next_change_poll = now + CHANGE_POLL_SECONDS
@@ -218,7 +218,7 @@ class GatewayContext:
 
     catalog: Catalog
     store: ObjectStore
-    hints: Wakeups
+    wakeups: Wakeups
     search: SearchBackend
     settings: Settings
     authenticator: Authenticator
@@ -282,18 +282,18 @@ class PageParams(MapParams):
             raise invalid_cursor_error() from None
 
     def split(self, rows: list[Row]) -> tuple[list[Row], str | None]:
-        """Splits up to `limit + 1` rows into the page and the cursor of the next one, if any."""
+        """Split up to `limit + 1` rows into the page and the cursor of the next one, if any."""
         page = rows[: self.limit]
         return page, str(page[-1].id) if len(rows) > self.limit else None
 
 
 def invalid_cursor_error() -> PlacewiseError:
-    """Builds the 422 error for a malformed cursor."""
+    """Build the 422 error for a malformed cursor."""
     return invalid_field_error("cursor", "is not a cursor that this endpoint returned")
 
 
 def get_map_name(request: Request) -> str:
-    """Returns the name of the request's map, for dependencies; routes declare `MapParams`."""
+    """Return the name of the request's map, for dependencies; routes declare `MapParams`."""
     return request.query_params.get("map", DEFAULT_MAP)
 
 
@@ -321,12 +321,12 @@ def parse_prefer_wait(request: Request, max_seconds: int) -> float:
 
 
 def load_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
-    """Loads a job; None if it does not exist."""
+    """Load a job; None if it does not exist."""
     with gateway.catalog.read() as session:
         return session.get(Job, job_id)
 
 
 async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
-    """Waits at most `seconds` for the end of the job; returns None if the job was deleted."""
+    """Wait at most `seconds` for the end of the job; return None if the job was deleted."""
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
     return await run_in_threadpool(load_job, gateway, job_id)

@@ -107,7 +107,7 @@ class IdempotentRequest:
     async def claim_form(
         self, store: ObjectStore, received: StoredUpload, *, life_seconds: float | None = None
     ) -> None:
-        """Claims the key for the content of a form.
+        """Claim the key for the content of a form.
 
         Deletes the received file from `store` if the request is refused or was already executed.
         """
@@ -120,7 +120,7 @@ class IdempotentRequest:
         await run_in_threadpool(claim)
 
     def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
-        """Claims the key: from here on only this request is executed under it.
+        """Claim the key: from here on only this request is executed under it.
 
         Args:
             content: The content of the request, serializable as JSON.
@@ -158,7 +158,7 @@ class IdempotentRequest:
     def store_response(
         self, session: Session, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
-        """Stores the response, in the transaction that executes the request.
+        """Store the response, in the transaction that executes the request.
 
         A response that was stored before is replaced.
         """
@@ -168,7 +168,7 @@ class IdempotentRequest:
             self._response_stored = True
 
     def store_job_response(self, session: Session, job: Job) -> JobAcceptedResponse:
-        """Adds a job to the transaction, and stores and returns its 202 response."""
+        """Add a job to the transaction, and store and return its 202 response."""
         session.add(job)
         session.flush()
         accepted = to_job_accepted(job, get_map_name(self._request))
@@ -184,13 +184,13 @@ class IdempotentRequest:
     def replace_response(
         self, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
-        """Replaces the stored response in a transaction of its own."""
+        """Replace the stored response in a transaction of its own."""
         if self._token is not None:
             with self._gateway.catalog.write() as session:
                 self.store_response(session, status, body, headers)
 
     def store_refusal(self, error: PlacewiseError) -> None:
-        """Stores the refusal of a request, unless a repetition might succeed."""
+        """Store the refusal of a request, unless a repetition might succeed."""
         if (
             self._token is None
             or self._response_stored
@@ -206,7 +206,7 @@ class IdempotentRequest:
             self._response_stored = True
 
     def release_key(self) -> None:
-        """Releases the key if no response was stored under it."""
+        """Release the key if no response was stored under it."""
         if self._token is not None and not self._response_stored:
             with self._gateway.catalog.write() as session:
                 release_idempotency_key(session, self._token)
@@ -214,7 +214,7 @@ class IdempotentRequest:
 
 @contextlib.contextmanager
 def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
-    """Deletes a received object if the block refuses the request, or replays a response.
+    """Delete a received object if the block refuses the request, or replays a response.
 
     Not for other exceptions: after a lost connection the row may have been committed.
     """

@@ -46,7 +46,7 @@ class JobCount:
 
 
 def count_jobs(session: Session) -> list[JobCount]:
-    """Counts the jobs of all maps by kind and state.
+    """Count the jobs of all maps by kind and state.
 
     Succeeded jobs, by far the most, are excluded, so that the index on (map, state) is used.
     """
@@ -117,11 +117,11 @@ class GatewayMetrics:
         registry.register(_ConnectionCollector(gateway.connections, admission))
 
     def on_request_start(self) -> None:
-        """Counts a request in flight."""
+        """Count a request in flight."""
         self._in_flight.inc()
 
     def on_request_end(self, record: RequestRecord) -> None:
-        """Records a finished request."""
+        """Record a finished request."""
         self._in_flight.dec()
         self._requests.labels(record.method, record.route, str(record.status)).inc()
         if record.first_byte_seconds is not None:
@@ -139,7 +139,7 @@ class _LoadCollector(Collector):
         self._admission = admission
 
     def _count_jobs(self) -> Sequence[JobCount] | None:
-        """Counts the jobs; None while the catalog is unreachable."""
+        """Count the jobs; None while the catalog is unreachable."""
         try:
             with self._catalog.read() as session:
                 return count_jobs(session)

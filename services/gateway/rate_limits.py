@@ -56,7 +56,7 @@ class RateLimiter:
         self._redis_retry_at = 0.0
 
     def count_request(self, caller: Caller) -> dict[str, str]:
-        """Counts a request against the limit per minute.
+        """Count a request against the limit per minute.
 
         Returns:
             The RateLimit headers of the response; empty without a limit.
@@ -76,7 +76,7 @@ class RateLimiter:
         return self._hit(caller, quota, 1)
 
     def count_upload_bytes(self, caller: Caller, size_bytes: int) -> dict[str, str]:
-        """Counts bytes that are about to be sent against the daily quota.
+        """Count bytes that are about to be sent against the daily quota.
 
         Returns:
             The RateLimit headers of the response; empty without a quota.
@@ -96,7 +96,7 @@ class RateLimiter:
         return self._hit(caller, quota, size_bytes)
 
     def daily_upload_bytes(self, caller: Caller) -> int | None:
-        """Returns the daily quota of the caller in bytes; None if it is unlimited."""
+        """Return the daily quota of the caller in bytes; None if it is unlimited."""
         if caller.key_id is None:
             return None
         return caller.limits.upload_bytes_per_day or self._settings.key_upload_bytes_per_day

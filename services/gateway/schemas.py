@@ -55,7 +55,7 @@ class PhotoResponse(ResponseModel):
 
     @classmethod
     def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
-        """Returns the values of the fields for `photo`, for the constructors of subclasses."""
+        """Return the values of the fields for `photo`, for the constructors of subclasses."""
         image_url = url_in_map(f"/uploads/{photo.id}/image", map_name)
         return {
             "image_id": photo.id,
@@ -190,7 +190,7 @@ class SimilarityResponse(ResponseModel):
     )
 
     def with_photos(self, photos: Iterable[SimilarPhotoResponse]) -> SimilarityResponse:
-        """Returns a copy of the response with these photos."""
+        """Return a copy of the response with these photos."""
         images = list(photos)
         return self.model_copy(update={"similar_images": images, "total_similar": len(images)})
 
@@ -343,19 +343,19 @@ class GenerationResponse(ResponseModel):
 
 
 def url_in_map(path: str, map_name: str) -> str:
-    """Returns the URL path of an endpoint, with `?map=` unless the map is the default one."""
+    """Return the URL path of an endpoint, with `?map=` unless the map is the default one."""
     return f"{API_PREFIX}{path}" + (
         "" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}"
     )
 
 
 def job_url(job_id: UUID, map_name: str, suffix: str = "") -> str:
-    """Returns the URL path of a job, or of one of its subresources such as `/result`."""
+    """Return the URL path of a job, or of one of its subresources such as `/result`."""
     return url_in_map(f"/jobs/{job_id}{suffix}", map_name)
 
 
 def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
-    """Builds the body of the 202 response for a job."""
+    """Build the body of the 202 response for a job."""
     return JobAcceptedResponse(
         job_id=job.id,
         status=JobState(job.state),
@@ -365,5 +365,5 @@ def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
 
 
 def accepted_headers(status_url: str) -> dict[str, str]:
-    """Builds the headers of a 202 response."""
+    """Build the headers of a 202 response."""
     return {"Location": status_url, "Retry-After": "1"}

@@ -55,12 +55,12 @@ class StaticAsset:
 
     @classmethod
     def from_bytes(cls, suffix: str, body: bytes) -> StaticAsset:
-        """Creates an asset; raises KeyError for a suffix that is not in MEDIA_TYPES."""
+        """Create an asset; raises KeyError for a suffix that is not in MEDIA_TYPES."""
         zipped = gzip.compress(body, 9, mtime=0) if suffix in COMPRESSIBLE_SUFFIXES else None
         return cls(MEDIA_TYPES[suffix], body, zipped, hashlib.sha256(body).hexdigest()[:32])
 
     def to_response(self, request: Request, headers: dict[str, str]) -> Response:
-        """Builds the response: 200, or 304 if the browser has the same content."""
+        """Build the response: 200, or 304 if the browser has the same content."""
         zipped = self.gzipped_body if _accepts_gzip(request) else None
         tag = f'"{self.digest}{"-gzip" if zipped else ""}"'
         all_headers = {
@@ -77,7 +77,7 @@ class StaticAsset:
 
 
 def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
-    """Yields the files below `folder` with a suffix in MEDIA_TYPES, with their relative paths."""
+    """Yield the files below `folder` with a suffix in MEDIA_TYPES, with their relative paths."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in MEDIA_TYPES:
             yield (
@@ -108,7 +108,7 @@ API_DOCS_CSP = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 
 
 def create_web_page_router(settings: Settings) -> APIRouter:
-    """Creates the routes of the web page, the API documentation and the assets."""
+    """Create the routes of the web page, the API documentation and the assets."""
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
     assets["settings.json"] = StaticAsset.from_bytes(

@@ -45,7 +45,7 @@ class StewardMetrics:
         )
         self.hints_resent = Counter(
             f"{METRIC_PREFIX}_hints_resent",
-            "Wake-ups sent again for waiting jobs.",
+            "Wakeups sent again for waiting jobs.",
             registry=registry,
         )
         self.slots_merged = Counter(

@@ -27,7 +27,7 @@ from services.steward.tasks.maintenance import (
     delete_old_jobs,
     delete_old_searches,
     release_expired_leases,
-    resend_hints,
+    resend_wakeups,
     update_statistics_of_large_maps,
 )
 from services.steward.tasks.model_changes import (
@@ -117,7 +117,7 @@ class Scheduler:
         self,
         catalog: Catalog,
         store: OwnedStore,
-        hints: Wakeups,
+        wakeups: Wakeups,
         settings: Settings,
         metrics: StewardMetrics | None = None,
     ) -> None:
@@ -143,12 +143,14 @@ class Scheduler:
                 ),
             ),
             PeriodicTask(
-                "resend hints", 2.0, lambda: metrics.hints_resent.inc(resend_hints(catalog, hints))
+                "resend hints",
+                2.0,
+                lambda: metrics.hints_resent.inc(resend_wakeups(catalog, wakeups)),
             ),
             PeriodicTask(
                 "advance model changes",
                 0.5,
-                lambda: advance_model_changes(catalog, hints),
+                lambda: advance_model_changes(catalog, wakeups),
             ),
             PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
@@ -158,7 +160,7 @@ class Scheduler:
             PeriodicTask(
                 "fit maps that wait",
                 2.0,
-                lambda: auto_fit_vocabularies(catalog, hints, settings.auto_fit_photos),
+                lambda: auto_fit_vocabularies(catalog, wakeups, settings.auto_fit_photos),
             ),
             PeriodicTask(
                 "count large maps", 10.0, lambda: update_statistics_of_large_maps(catalog)

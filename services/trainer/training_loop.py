@@ -61,7 +61,11 @@ def learning_rate(step: int, steps_per_epoch: int, arguments: TrainingArguments)
 
 @dataclass
 class TrainingRun:
-    """What a run needs before its first step."""
+    """Inputs of a training run.
+
+    Arguments, data sets, model, device, run folder, and the history and checkpoints that a resumed
+    run continues.
+    """
 
     arguments: TrainingArguments
     device: Device

@@ -1,7 +1,7 @@
 """Model registry: the models that have described photos, and trained models that users added.
 
 The name of an added model is permanent: descriptors, manifests and caches refer to it as
-`gsv:NAME`, so NAME is never given to other weights, not even after the model was removed.
+`gsv:NAME`, so NAME is never reused for other weights, even after the model is removed.
 """
 
 from __future__ import annotations
@@ -158,10 +158,10 @@ def get_registered_model(session: Session, name: str) -> Model:
     return model
 
 
-def check_model_registered(session: Session, recipe: ExtractorConfig) -> None:
+def check_model_registered(session: Session, config: ExtractorConfig) -> None:
     """Raise NotFound (`model_missing`) if the extractor uses a model that was not added."""
-    if recipe.trained is not None and recipe.trained.registered is not None:
-        get_registered_model(session, recipe.trained.registered)
+    if config.trained is not None and config.trained.registered is not None:
+        get_registered_model(session, config.trained.registered)
 
 
 def get_model_for_loading(session: Session, name: str, *, lock: bool = False) -> Model:

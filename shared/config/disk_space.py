@@ -92,7 +92,10 @@ class DiskSpace:
             self._folders.append(settings.placewise_home)
 
     def free_bytes(self) -> int | None:
-        """Return the free space of the fullest disk; None where nothing is written to any."""
+        """Return the smallest free space among the disks, in bytes.
+
+        None if this process writes to none of them.
+        """
         return min(
             (shutil.disk_usage(_existing_parent(f)).free for f in self._folders), default=None
         )

@@ -56,7 +56,7 @@ def read_integer_lists(path: Path) -> list[Indices]:
                 raise ValueError(f"it contains {dtype}, expected lists of integers")
             return [_row(value, path) for value in _unpickle(file, shape)]
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise _bad_list_error(path, str(error)) from error
+        raise _bad_ground_truth_error(path, str(error)) from error
     except (
         TypeError,
         AttributeError,
@@ -66,7 +66,9 @@ def read_integer_lists(path: Path) -> list[Indices]:
         MemoryError,
     ) as error:
         # Raised by the unpickler for damaged and malicious pickles.
-        raise _bad_list_error(path, f"its pickle is broken ({type(error).__name__})") from error
+        raise _bad_ground_truth_error(
+            path, f"its pickle is broken ({type(error).__name__})"
+        ) from error
 
 
 def read_names(path: Path) -> list[str]:
@@ -111,11 +113,16 @@ def _row(value: Any, path: Path) -> Indices:
         value = [value]
     indices = [item.value() if isinstance(item, _Scalar) else item for item in value]
     if not all(isinstance(index, int | np.integer) and index >= 0 for index in indices):
-        raise _bad_list_error(path, "a row contains values that are not indices from 0")
+        raise _bad_ground_truth_error(path, "a row contains values that are not indices from 0")
     return np.unique(np.array(indices, np.int64))
 
 
 def _unpickle(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
+    """Unpickle an object array of the shape that its header declares; return its rows.
+
+    Instead of arrays and scalars, the restricted unpickler makes `_Array` and `_Scalar`. Raises
+    ValueError for another object or number of values.
+    """
     array = _Unpickler(file, encoding="latin1").load()
     if not isinstance(array, _Array) or array.fortran or len(shape) not in (1, 2):
         raise ValueError(f"it is not a list of lists; its shape is {shape}")
@@ -128,7 +135,7 @@ def _unpickle(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
     return [values[start : start + shape[1]] for start in range(0, len(values), shape[1] or 1)]
 
 
-def _bad_list_error(path: Path, reason: str) -> InvalidRequest:
+def _bad_ground_truth_error(path: Path, reason: str) -> InvalidRequest:
     return InvalidRequest(
         "bad_ground_truth",
         f"{path} is not a ground truth: {reason}. Use an array of lists of database indices, as "

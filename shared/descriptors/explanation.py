@@ -48,7 +48,7 @@ class SimilarityShares:
 
 
 def explain_similarities(
-    recipe: ExtractorConfig,
+    config: ExtractorConfig,
     features: torch.Tensor,
     centres: ClusterCentres | None,
     rows: NDArray[np.float32],
@@ -57,7 +57,7 @@ def explain_similarities(
     """Split each candidate's similarity to the query into shares of patches and clusters.
 
     Args:
-        recipe: The extractor's configuration.
+        config: The extractor's configuration.
         features: (Q, D) local features of the query.
         centres: The vocabulary; required for VLAD.
         rows: (n, dimension) descriptors of the candidates, as they are stored.
@@ -67,7 +67,7 @@ def explain_similarities(
         ValueError: The aggregator is not a sum over patches; call `check_explainable` first.
     """
     x = features.double()
-    match recipe.aggregator:
+    match config.aggregator:
         case "avg":
             return [
                 SimilarityShares(share, None) for share in _mean_shares(x, torch.from_numpy(rows))
@@ -78,8 +78,8 @@ def explain_similarities(
             # In the precision of the descriptor, so that ties go to the same cluster.
             weights = (
                 hard_assignment(features, c)
-                if recipe.aggregator == "vlad"
-                else soft_assignment(features, c, recipe.temperature)
+                if config.aggregator == "vlad"
+                else soft_assignment(features, c, config.temperature)
             )
             cluster_weights = torch.tensor(word_weights or [1.0] * len(c), dtype=torch.float64)
             return _vlad_shares(

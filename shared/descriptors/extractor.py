@@ -45,33 +45,33 @@ from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessin
 SHIPPED_VOCABULARIES = Path(__file__).parent / "vocabularies"
 
 
-def _dinov2(recipe: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
-    assert recipe.layer is not None
-    assert recipe.facet is not None
-    size = recipe.backbone.removeprefix("dinov2-")
-    return Dinov2(size, recipe.layer, recipe.facet, device, weights)
+def _dinov2(config: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
+    assert config.layer is not None
+    assert config.facet is not None
+    size = config.backbone.removeprefix("dinov2-")
+    return Dinov2(size, config.layer, config.facet, device, weights)
 
 
-def _slow(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
-    assert recipe.width is not None
-    return SlowBackbone(recipe.width, recipe.milliseconds / 1000, device)
+def _slow(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+    assert config.width is not None
+    return SlowBackbone(config.width, config.milliseconds / 1000, device)
 
 
-def _torchhub(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
-    assert recipe.hub is not None
-    return TorchHubBackbone(recipe.hub, device)
+def _torchhub(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+    assert config.hub is not None
+    return TorchHubBackbone(config.hub, device)
 
 
-def _trained(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
-    assert recipe.trained is not None
-    assert recipe.trained.file is not None, "a registered model is loaded through the catalog"
-    return TrainedBackbone.from_checkpoint(recipe.name, Path(recipe.trained.file), device)
+def _trained(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+    assert config.trained is not None
+    assert config.trained.file is not None, "a registered model is loaded through the catalog"
+    return TrainedBackbone.from_checkpoint(config.name, Path(config.trained.file), device)
 
 
 BACKBONES: dict[str, Callable[[ExtractorConfig, torch.device, Path | None], Backbone]] = {
-    "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
+    "efficientnet-lite0": lambda _config, device, _weights: EfficientNetLite0(device),
     SLOW_TEST_BACKBONE: _slow,
-    "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
+    "test-tiny": lambda _config, device, _weights: TinyBackbone(device),
     TORCHHUB_BACKBONE: _torchhub,
     TRAINED_BACKBONE: _trained,
     **{f"dinov2-{size}": _dinov2 for size in SHAPES},
@@ -99,7 +99,7 @@ class Extractor:
 
     def __init__(
         self,
-        recipe: ExtractorConfig,
+        config: ExtractorConfig,
         device: torch.device,
         *,
         precision: Precision = "float32",
@@ -110,12 +110,12 @@ class Extractor:
         """Load the backbone's weights, unless `backbone` is given.
 
         Args:
-            recipe: The configuration of the extractor.
+            config: The configuration of the extractor.
             device: The device that the backbone runs on.
             precision: The precision that the backbone computes in.
             dino_weights: The setting DINO_WEIGHTS, for DINOv2 backbones; None means timm's weights
                 from the Hugging Face hub.
-            backbone: A loaded backbone with the same `recipe.local_features`. Required for a
+            backbone: A loaded backbone with the same `config.local_features`. Required for a
                 registered model.
             limit: The batch size limit that was measured for `backbone`.
 
@@ -123,19 +123,19 @@ class Extractor:
             Misconfigured: `weights_missing`, `weights_unfit`, `torchhub_unfit`.
             PlacewiseError: For a checkpoint, as `TrainedBackbone.from_checkpoint` raises.
         """
-        self.recipe = recipe
+        self.config = config
         self.precision: Precision = precision
         self.limit = limit or BatchSizeLimit()
-        self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
-        self.preprocessing: Preprocessing = _preprocessing(recipe, self.backbone)
-        assert recipe.width in (None, self.backbone.width), "recipe.width must match the backbone"
+        self.backbone = backbone or BACKBONES[config.backbone](config, device, dino_weights)
+        self.preprocessing: Preprocessing = _preprocessing(config, self.backbone)
+        assert config.width in (None, self.backbone.width), "config.width must match the backbone"
 
     def with_precision(self, precision: Precision) -> Extractor:
         """Return an extractor with the same weights that computes in `precision`."""
         if precision == self.precision:
             return self
         return Extractor(
-            self.recipe,
+            self.config,
             self.backbone.device,
             precision=precision,
             backbone=self.backbone,
@@ -147,9 +147,9 @@ class Extractor:
 
         Raises Misconfigured (`vocabulary_unfit`) if it was fitted with other weights.
         """
-        if self.recipe.shipped_vocabulary is None:
+        if self.config.shipped_vocabulary is None:
             return None
-        path = SHIPPED_VOCABULARIES / self.recipe.shipped_vocabulary
+        path = SHIPPED_VOCABULARIES / self.config.shipped_vocabulary
         centres = decode_centres(path.read_bytes(), width=self.backbone.width)
         provenance = json.loads(path.with_suffix(".json").read_text())
         if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
@@ -166,13 +166,13 @@ class Extractor:
     ) -> dict[str, Any]:
         """Return the extractor spec: everything that determines a descriptor's value (JSON)."""
         spec: dict[str, Any] = {
-            "extractor": self.recipe.name,
+            "extractor": self.config.name,
             "backbone": self.backbone.name,
             "backbone_fingerprint": self.backbone.fingerprint,
             "layer": self.backbone.layer,
             "facet": self.backbone.facet,
             "preprocessing": self.preprocessing.as_spec(),
-            "aggregator": self.recipe.aggregator,
+            "aggregator": self.config.aggregator,
             "vocabulary_sha256": centres.sha256 if centres else None,
             "clusters": centres.clusters if centres else None,
             "precision": self.precision,
@@ -184,8 +184,8 @@ class Extractor:
                 "sha256": projection.sha256,
                 "from_dimension": projection.dimension,
             }
-        if self.recipe.aggregator == "soft-vlad":
-            spec["temperature"] = self.recipe.temperature
+        if self.config.aggregator == "soft-vlad":
+            spec["temperature"] = self.config.temperature
         if isinstance(self.backbone, TorchHubBackbone):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
         if isinstance(self.backbone, TrainedBackbone):
@@ -217,7 +217,7 @@ class Extractor:
         except PhotoTooLargeForGpu as error:
             raise Misconfigured(
                 "gpu_out_of_memory",
-                f"After loading the weights of {self.recipe.name}, the GPU has no memory left for "
+                f"After loading the weights of {self.config.name}, the GPU has no memory left for "
                 "a single photo. Check what else uses the GPU (`nvidia-smi`), or configure a "
                 "smaller extractor or DEVICE=cpu.",
             ) from error
@@ -252,7 +252,7 @@ class Extractor:
 
         Args:
             photos: (H, W, 3) pixels as `preprocessing` returns them; sizes may differ.
-            centres: The vocabulary; required if `recipe.needs_vocabulary`.
+            centres: The vocabulary; required if `config.needs_vocabulary`.
             projection: A PCA whitening to apply to the descriptors.
 
         Returns:
@@ -264,8 +264,8 @@ class Extractor:
             PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
             ValueError: The extractor needs a vocabulary and `centres` is None.
         """
-        if self.recipe.needs_vocabulary and centres is None:
-            raise ValueError(f"{self.recipe.name} needs a vocabulary")
+        if self.config.needs_vocabulary and centres is None:
+            raise ValueError(f"{self.config.name} needs a vocabulary")
         on_device = None
         if centres is not None:
             on_device = torch.from_numpy(centres.array).to(self.backbone.device)
@@ -292,7 +292,7 @@ class Extractor:
 
     def _aggregate(self, features: torch.Tensor, centres: torch.Tensor | None) -> torch.Tensor:
         """(B, patches, width), (K, width) -> (B, dimension)."""
-        match self.recipe.aggregator:
+        match self.config.aggregator:
             case "avg":
                 rows = average_pooling(features)
             case "gem":
@@ -302,7 +302,7 @@ class Extractor:
                 rows = vlad(features, centres)
             case "soft-vlad":
                 assert centres is not None
-                rows = soft_vlad(features, centres, self.recipe.temperature)
+                rows = soft_vlad(features, centres, self.config.temperature)
             case "none":
                 rows = features[:, 0]
             case other:
@@ -312,9 +312,9 @@ class Extractor:
         return torch.where(finite, rows, torch.nan)
 
 
-def _preprocessing(recipe: ExtractorConfig, backbone: Backbone) -> Preprocessing:
-    if recipe.preprocessing is not None:
-        return get_preprocessing(recipe.preprocessing)
+def _preprocessing(config: ExtractorConfig, backbone: Backbone) -> Preprocessing:
+    if config.preprocessing is not None:
+        return get_preprocessing(config.preprocessing)
     assert isinstance(backbone, TrainedBackbone), "preprocessing is missing"
     return backbone.preprocessing
 

@@ -138,7 +138,7 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 def choose_precision(
-    requested: Literal["auto", "float32", "bfloat16"], recipe: ExtractorConfig, device: torch.device
+    requested: Literal["auto", "float32", "bfloat16"], config: ExtractorConfig, device: torch.device
 ) -> Precision:
     """Return the precision of a new generation; `requested` is the setting PRECISION.
 
@@ -148,7 +148,7 @@ def choose_precision(
     """
     if requested != "auto":
         return requested
-    return "bfloat16" if device.type == "cuda" and recipe.depth is not None else "float32"
+    return "bfloat16" if device.type == "cuda" and config.depth is not None else "float32"
 
 
 @contextlib.contextmanager

@@ -115,9 +115,12 @@ def encode_array(array: NDArray[Any]) -> bytes:
 
 
 def decode_array(data: bytes) -> NDArray[Any]:
-    """Decode the array in the bytes of a `.npy` file; raises one of ARRAY_READ_ERRORS.
+    """Decode the array in the bytes of a `.npy` file.
 
     Nothing is unpickled, and no more memory is allocated than there are bytes.
+
+    Raises one of ARRAY_READ_ERRORS for other bytes, and Unprocessable (`vocabulary_unfit`) for
+    pickled objects.
     """
     _check_array_size(data)
     array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)

@@ -89,9 +89,9 @@ def check_vocabulary_fits(
 
     Raises Unprocessable (`vocabulary_unfit`) naming both specs.
     """
-    if not extractor.recipe.needs_vocabulary:
+    if not extractor.config.needs_vocabulary:
         raise Unprocessable(
-            "vocabulary_unfit", f"The extractor {extractor.recipe.name} uses no vocabulary."
+            "vocabulary_unfit", f"The extractor {extractor.config.name} uses no vocabulary."
         )
     computed = feature_provenance(extractor)
     if has_provenance(provenance):
@@ -100,18 +100,18 @@ def check_vocabulary_fits(
             raise Unprocessable(
                 "vocabulary_unfit",
                 f"The vocabulary was fitted on {_describe_features(fitted_on)}; the extractor "
-                f"{extractor.recipe.name} computes {_describe_features(computed)}. Fit a "
+                f"{extractor.config.name} computes {_describe_features(computed)}. Fit a "
                 "vocabulary with this extractor.",
                 learnt_with=fitted_on,
                 extractor_makes=computed,
             )
-    check_vocabulary_width(centres, extractor.recipe, extractor.backbone.width)
+    check_vocabulary_width(centres, extractor.config, extractor.backbone.width)
 
 
 def check_vocabulary_width(
-    centres: ClusterCentres, recipe: ExtractorConfig, width: int | None
+    centres: ClusterCentres, config: ExtractorConfig, width: int | None
 ) -> None:
-    """Check that the centres have the width of the recipe's local features.
+    """Check that the centres have the width of the extractor's local features.
 
     `width` None skips the check: the width is known only after the network is loaded.
 
@@ -121,7 +121,7 @@ def check_vocabulary_width(
         raise Unprocessable(
             "vocabulary_unfit",
             f"The vocabulary has {centres.dimension} dimensions, the local features of "
-            f"{recipe.name} {width}.",
+            f"{config.name} {width}.",
         )
 
 

@@ -49,7 +49,7 @@ BeforeCommit = Callable[[Session, StoreResult], StoreResult]
 
 def store_photo(
     catalog: Catalog,
-    hints: Wakeups,
+    wakeups: Wakeups,
     map_name: str,
     incoming: ValidatedPhoto,
     before_commit: BeforeCommit,
@@ -58,7 +58,7 @@ def store_photo(
 
     Args:
         catalog: the catalog.
-        hints: notified when a job was queued.
+        wakeups: notified when a job was queued.
         map_name: name of the map.
         incoming: the validated photo.
         before_commit: called in the transaction with the result.
@@ -69,7 +69,7 @@ def store_photo(
     """
     stored = retry_on_conflict(lambda: _store(catalog, map_name, incoming, before_commit))
     if stored.queued:
-        hints.send()
+        wakeups.send()
     return stored
 
 

@@ -300,7 +300,7 @@ def _find_missing_descriptors(session: Session) -> list[IntegrityFault]:
     ]
 
 
-def repair_descriptors(catalog: Catalog, hints: Wakeups, report: IntegrityReport) -> int:
+def repair_descriptors(catalog: Catalog, wakeups: Wakeups, report: IntegrityReport) -> int:
     """Queue the photos of damaged chunks and those without a descriptor; return their number.
 
     The rows of the chunks are deleted in the same transaction: until a photo is described again, it
@@ -313,7 +313,7 @@ def repair_descriptors(catalog: Catalog, hints: Wakeups, report: IntegrityReport
     if photo_ids:
         queued += catalog.run(lambda session: _queue_photos(session, photo_ids))
     if queued:
-        hints.send()
+        wakeups.send()
     return queued
 
 

@@ -1,6 +1,6 @@
-"""Wake-ups as Celery messages: the Celery application and a non-blocking sender.
+"""Wakeups as Celery messages: the Celery application and a non-blocking sender.
 
-Celery carries wake-ups only; the job table is the source of truth. A message names no job. Its task
+Celery carries wakeups only; the job table is the source of truth. A message names no job. Its task
 drains the table for a few seconds, and Flower shows the task's result. When Redis loses, duplicates
 or redelivers a message, the cost is at most one query of the table: claims skip the jobs of other
 workers, and a worker that lost its lease can't commit.
@@ -105,9 +105,9 @@ BROKER_ERRORS = (OperationalError, KombuError, RedisError, OSError, TimeoutError
 
 
 class CeleryWakeups:
-    """Sends wake-ups from a thread, which `close` ends.
+    """Sends wakeups from a thread, which `close` ends.
 
-    Wake-ups are dropped while Redis is unreachable.
+    Wakeups are dropped while Redis is unreachable.
     """
 
     def __init__(self, app: Celery, settings: Settings) -> None:
@@ -124,7 +124,7 @@ class CeleryWakeups:
         self._any_pending = threading.Event()
         self._stop = threading.Event()
         self._next_warning = 0.0
-        self._sender = threading.Thread(target=self._run, name="hints", daemon=True)
+        self._sender = threading.Thread(target=self._run, name="wakeups", daemon=True)
         self._sender.start()
 
     def send(self, queue: WakeupQueue = WakeupQueue.BULK) -> None:
@@ -157,4 +157,4 @@ class CeleryWakeups:
         except BROKER_ERRORS as error:
             if time.monotonic() > self._next_warning:
                 self._next_warning = time.monotonic() + WARNING_INTERVAL_SECONDS
-                log.warning("Redis is unreachable, wake-ups are dropped: %s", error)
+                log.warning("Redis is unreachable, wakeups are dropped: %s", error)

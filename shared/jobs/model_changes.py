@@ -37,7 +37,12 @@ from shared.catalog.jobs import (
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs.transitions import cancel_job, cancel_jobs, release_job, wake_waiting_jobs
+from shared.jobs.transitions import (
+    cancel_job,
+    cancel_jobs,
+    make_waiting_jobs_claimable,
+    release_job,
+)
 
 
 def start_model_change(
@@ -106,8 +111,10 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
 
 
 def wake_vocabulary_waiters(session: Session, map_id: UUID) -> None:
-    """Wake the jobs of the map that waited for a vocabulary."""
-    wake_waiting_jobs(session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY))
+    """Make the map's jobs that wait for a vocabulary claimable."""
+    make_waiting_jobs_claimable(
+        session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY)
+    )
 
 
 def cancel_model_change(session: Session, job: Job) -> None:

@@ -1,15 +1,20 @@
 """Job runner: claims jobs, renews their lease, and decides what happens when a job fails.
 
 The extractor and the steward run their jobs through it, so this is the one place where a job is
-retried:
+retried automatically after an error of its worker (`retry_job` is the manual way):
 
 | failure | what happens to the job |
 |---|---|
-| dependency unavailable (`Unavailable`, `OSError`, database) | requeued; no attempt is counted |
-| `PlacewiseError` on a stored photo | requeued with the error, until an operator has acted |
-| `PlacewiseError` on any other job | failed with the error |
-| lease lost, or the worker stops (`JobInterrupted`) | requeued; no attempt is counted |
+| dependency unavailable (`Unavailable`, `OSError`, database) | requeued, every 2 s without limit |
+| `PlacewiseError` that stops `index` or `reindex` jobs | requeued, every 15 s without limit |
+| `PlacewiseError` that stops other jobs | failed with the error |
+| one photo of a batch can't be described | not handled here: `publish` fails its job |
+| lease lost, or the worker stops (`JobInterrupted`) | requeued |
 | other exception, or the worker died | retried alone, then failed after MAX_ATTEMPTS |
+
+A `PlacewiseError` stops the step of a whole batch of `index` or `reindex` jobs if, say, weights are
+missing. The jobs store the error and are retried, because an operator can remove the cause. Jobs
+that `publish` has failed are not retried. Only the last row counts attempts.
 
 A worker that raises updates its own jobs. The jobs of a worker that died are found by
 `reclaim_expired_leases` once their lease has expired.

@@ -101,7 +101,7 @@ def release_job(
     Args:
         job: The claimed job.
         after_seconds: Delay before it may be claimed.
-        waiting_for: What it waits for; it can't be claimed until `wake_waiting_jobs`.
+        waiting_for: What it waits for; it can't be claimed until `make_waiting_jobs_claimable`.
         problem: Why it has to be retried, an RFC 9457 problem.
     """
     job.state = JobState.RUNNING if job.kind in CHECKPOINTED_JOBS else JobState.QUEUED
@@ -111,8 +111,8 @@ def release_job(
     _drop_lease(job)
 
 
-def wake_waiting_jobs(session: Session, condition: Condition) -> None:
-    """Make the waiting jobs that match the condition claimable: what they waited for exists."""
+def make_waiting_jobs_claimable(session: Session, condition: Condition) -> None:
+    """Make the waiting jobs that match the condition claimable: they need not wait any more."""
     session.execute(
         update(Job)
         .where(Job.waiting_for.is_not(None), condition)

@@ -1,7 +1,7 @@
-"""Wake-ups (hints): messages that tell workers that the job table may have work for them.
+"""Wakeups: messages that tell workers that the job table may have work for them.
 
-A lost wake-up delays a job by seconds and never loses it; a duplicate is harmless. Queries have a
-queue of their own, so that a worker can receive their wake-ups first. Which jobs a worker runs is
+A lost wakeup delays a job by seconds and never loses it; a duplicate is harmless. Queries have a
+queue of their own, so that a worker can receive their wakeups first. Which jobs a worker runs is
 decided by the job table alone.
 """
 
@@ -20,7 +20,7 @@ class WakeupQueue(StrEnum):
 
 
 def queue_for_priority(priority: int) -> WakeupQueue:
-    """Return the queue for wake-ups of jobs with this priority."""
+    """Return the queue for wakeups of jobs with this priority."""
     return WakeupQueue.QUERY if priority >= Priority.QUERY else WakeupQueue.BULK
 
 
@@ -29,11 +29,11 @@ class Wakeups(Protocol):
 
     def send(self, queue: WakeupQueue = WakeupQueue.BULK) -> None:
         """Wake a worker. Never raises and never blocks: the job is already committed, and workers
-        find it without a wake-up, too."""
+        find it without a wakeup, too."""
 
 
 class InProcessWakeups:
-    """Wake-ups inside one process, for the embedded mode: at most one is outstanding."""
+    """Wakeups inside one process, for the embedded mode: at most one is outstanding."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -42,7 +42,7 @@ class InProcessWakeups:
         self._event.set()
 
     def wait(self, seconds: float) -> bool:
-        """Block until a wake-up arrives or the timeout expires; True when one arrived."""
+        """Block until a wakeup arrives or the timeout expires; True when one arrived."""
         arrived = self._event.wait(seconds)
         self._event.clear()
         return arrived

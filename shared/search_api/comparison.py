@@ -78,34 +78,34 @@ class CompareResult(_Message):
     candidates: tuple[RerankedCandidate, ...]
 
 
-def check_rerankable(recipe: ExtractorConfig) -> None:
+def check_rerankable(config: ExtractorConfig) -> None:
     """Raise Unprocessable (`not_rerankable`) for an extractor without local features."""
-    if not recipe.has_local_features:
+    if not config.has_local_features:
         raise Unprocessable(
             "not_rerankable",
-            f"The extractor {recipe.name} computes one feature per photo, but reranking compares "
+            f"The extractor {config.name} computes one feature per photo, but reranking compares "
             "patches. Leave out `rerank`, or use a map with another extractor.",
         )
 
 
-def check_explainable(recipe: ExtractorConfig, spec: Mapping[str, Any] | None) -> None:
+def check_explainable(config: ExtractorConfig, spec: Mapping[str, Any] | None) -> None:
     """Raise Unprocessable (`not_explainable`) if a similarity is not a sum over patches.
 
     Args:
-        recipe: The extractor's configuration.
+        config: The extractor's configuration.
         spec: Spec of the active generation; None if the map has none yet.
     """
     reason = None
-    if not recipe.has_local_features:
+    if not config.has_local_features:
         reason = "it computes one feature per photo, and no patches"
-    elif recipe.aggregator == "gem":
+    elif config.aggregator == "gem":
         reason = "GeM pooling raises features to a power, so a similarity is not a sum over patches"
-    elif spec is not None and spec["dimension"] != (recipe.width or 0) * (spec["clusters"] or 1):
+    elif spec is not None and spec["dimension"] != (config.width or 0) * (spec["clusters"] or 1):
         reason = "its descriptors are projected (PCA), which mixes the clusters"
     if reason is not None:
         raise Unprocessable(
             "not_explainable",
-            f"Results of the extractor {recipe.name} can't be explained: {reason}. Leave out "
+            f"Results of the extractor {config.name} can't be explained: {reason}. Leave out "
             "`explain`, or use a map with another extractor: VLAD without PCA, or `avg`.",
         )
 

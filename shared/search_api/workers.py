@@ -122,7 +122,7 @@ class WorkerState:
 
 
 class WorkerDirectory:
-    """The search workers at the given URLs; thread-safe."""
+    """Polls and stores the status of the search workers at the given URLs. Thread-safe."""
 
     def __init__(self, urls: Sequence[str], http: httpx2.Client) -> None:
         self._http = http

@@ -92,7 +92,10 @@ class PairStatistics:
     def from_rows(
         cls, rows: Rows, near: NDArray[np.int64], far: NDArray[np.int64], words: int
     ) -> PairStatistics:
-        """Compute the moments of (n, 2) near and (m, 2) far pairs of (r, words * width) rows."""
+        """Compute the statistics of descriptor pairs.
+
+        `near` (n, 2) and `far` (m, 2) hold row numbers of `rows`, (r, words * width).
+        """
         return cls(
             ProductMoments.from_products(word_products(rows, near, words)),
             ProductMoments.from_products(word_products(rows, far, words)),

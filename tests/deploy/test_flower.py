@@ -100,12 +100,12 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
         redis_url=f"redis://:{values['REDIS_PASSWORD']}@127.0.0.1:{machine.port('redis')}/0"
     )
     app = create_celery_app(settings)
-    hints = CeleryWakeups(app, settings)
+    wakeups = CeleryWakeups(app, settings)
     try:
         until(lambda: flower.get("/workers", params={"json": "1"}).json()["data"])
         for number in range(PHOTOS, 2 * PHOTOS):
             upload(catalog_on_postgres, store, map_id, photo_bytes(number))
-        hints.send(WakeupQueue.BULK)
+        wakeups.send(WakeupQueue.BULK)
 
         # Drains of before Flower heard of the worker need not be there.
         def drains() -> list[dict[str, Any]]:
@@ -130,7 +130,7 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
         for path in (f"/api/worker/shutdown/{name}", f"/api/task/send-task/{DRAIN_TASK}"):
             assert flower.post(path).status_code == 403
     finally:
-        hints.close()
+        wakeups.close()
         app.close()
     assert machine.stop("extractor") == 0, machine.log("extractor")
     assert machine.stop("flower") == 0, machine.log("flower")

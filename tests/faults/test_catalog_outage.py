@@ -72,14 +72,14 @@ class House:
         self.catalog.close()  # connections that are opened from here on have it
         with self.catalog.write() as session:
             get_or_create_default_map(session, settings.new_map_extractor)
-        store, hints = FolderStore(folder / "objects"), InProcessWakeups()
+        store, wakeups = FolderStore(folder / "objects"), InProcessWakeups()
         self.search = SearchWorker(self.catalog, store, settings)
         self._extractor = ExtractorWorker(self.catalog, store, settings, "extractor")
         self.requests = self.catalog.with_timeouts(
             TransactionTimeouts(STATEMENT_SECONDS, lock_seconds=1.0)
         )
         gateway = GatewayContext(
-            self.requests, store, hints, self.search, settings, LocalhostAuthenticator()
+            self.requests, store, wakeups, self.search, settings, LocalhostAuthenticator()
         )
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
@@ -92,8 +92,8 @@ class House:
             for name, part in (
                 ("search", self.search.run),
                 ("presence", WorkerHeartbeat(self.catalog, self.search, "search").run),
-                ("extractor", partial(self._extractor.run, hints=hints)),
-                ("steward", Scheduler(self.catalog, store, hints, settings).run),
+                ("extractor", partial(self._extractor.run, wakeups=wakeups)),
+                ("steward", Scheduler(self.catalog, store, wakeups, settings).run),
                 ("evaluator", evaluator.run),
             )
         ]

@@ -59,7 +59,7 @@ class Workplace:
     settings: Settings
     map_id: UUID
     make_worker: Callable[[], ExtractorWorker]
-    hints: InProcessWakeups = field(default_factory=InProcessWakeups)
+    wakeups: InProcessWakeups = field(default_factory=InProcessWakeups)
     _worker: ExtractorWorker | None = None
 
     # --- what clients do ---
@@ -100,7 +100,7 @@ class Workplace:
         return self.worker.drain(threading.Event())
 
     def advance(self) -> None:
-        advance_model_changes(self.catalog, self.hints)
+        advance_model_changes(self.catalog, self.wakeups)
 
     def finish(self, job_id: UUID, each_round: Callable[[], None] = lambda: None) -> Job:
         """Drain and steward until the job has ended; the job."""

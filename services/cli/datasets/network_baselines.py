@@ -33,8 +33,8 @@ Rows = NDArray[np.float32]
 class NetworkBaselines:
     """Describes photos with an untrained network and with the default extractor.
 
-    The extractor is used with its shipped and with a fitted vocabulary; the rows of the latter are
-    also reduced by PCA whitening.
+    The extractor is measured with its shipped vocabulary and with a fitted one. Descriptors of the
+    fitted one are also measured after PCA whitening.
     """
 
     names = (
@@ -80,7 +80,7 @@ class NetworkBaselines:
             self.extractor,
             (list(pixels) for pixels in self._batches(photos)),
             len(photos),
-            clusters=self.extractor.recipe.clusters,
+            clusters=self.extractor.config.clusters,
             seed=SEED,
         )
         return torch.from_numpy(fitted.centres.array).to(self.extractor.backbone.device)

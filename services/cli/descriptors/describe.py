@@ -109,12 +109,12 @@ def describe(
             aggregator=aggregator,
             temperature=temperature,
         )
-        recipe = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+        config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
         if weights is not None:
-            if recipe.depth is None:
+            if config.depth is None:
                 raise InvalidRequest(
                     "weights_unused",
-                    f"--weights applies only to extractors based on DINOv2, not to {recipe.name}.",
+                    f"--weights applies only to extractors based on DINOv2, not to {config.name}.",
                 )
             settings = settings.model_copy(update={"dino_weights": weights.absolute()})
 
@@ -125,7 +125,7 @@ def describe(
             result = describe_files(
                 photos,
                 out,
-                recipe,
+                config,
                 vocabulary,
                 pca,
                 settings,
@@ -136,7 +136,7 @@ def describe(
         result.as_json(),
         as_json,
         f"Wrote {result.rows} rows of {result.spec['dimension']} dimensions to "
-        f"{printable_path(out)} ({recipe.name}, {result.seconds['total']:.1f} s).",
+        f"{printable_path(out)} ({config.name}, {result.seconds['total']:.1f} s).",
     )
 
 

@@ -45,7 +45,7 @@ from shared.imaging.preprocessing import Pixels, Preprocessing
 from shared.storage.open_store import open_store
 
 
-def load_extractor(recipe: ExtractorConfig, settings: Settings) -> Extractor:
+def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
     """Load an extractor on the device and in the precision of the settings.
 
     Raises:
@@ -53,23 +53,23 @@ def load_extractor(recipe: ExtractorConfig, settings: Settings) -> Extractor:
     """
     device = choose_device(settings.device)
     return Extractor(
-        recipe,
+        config,
         device,
-        precision=choose_precision(settings.precision, recipe, device),
+        precision=choose_precision(settings.precision, config, device),
         dino_weights=settings.dino_weights,
-        backbone=_added_backbone(recipe, settings, device),
+        backbone=_added_backbone(config, settings, device),
     )
 
 
 def _added_backbone(
-    recipe: ExtractorConfig, settings: Settings, device: torch.device
+    config: ExtractorConfig, settings: Settings, device: torch.device
 ) -> Backbone | None:
     """Load an added model from the catalog and store of the settings, which may be in use.
 
     Returns None for an extractor that is not an added model. Raises Misconfigured (`model_missing`)
     and the errors of the catalog, the store and `AddedModelLoader.load`.
     """
-    name = recipe.trained.registered if recipe.trained else None
+    name = config.trained.registered if config.trained else None
     if name is None:
         return None
     catalog_file = settings.placewise_home / "catalog.sqlite"
@@ -231,7 +231,7 @@ class DescriptorFile:
 def describe_files(
     photos: Sequence[Path],
     out: Path,
-    recipe: ExtractorConfig,
+    config: ExtractorConfig,
     vocabulary: Path | None,
     pca: Path | None,
     settings: Settings,
@@ -244,7 +244,7 @@ def describe_files(
     Args:
         photos: Photo files, in row order.
         out: Output file: `.npy`, or with `names`, HDF5 in hloc's format.
-        recipe: The extractor.
+        config: The configuration of the extractor.
         vocabulary: VLAD vocabulary; None for the shipped one.
         pca: PCA whitening to apply, or None.
         settings: Device, precision, batch size and decoder limits.
@@ -257,9 +257,9 @@ def describe_files(
         Misconfigured: `vocabulary_missing`, `out_unwritable`, and errors of loading the extractor.
     """
     started = time.perf_counter()
-    own = load_own_vocabulary(recipe, vocabulary)
+    own = load_own_vocabulary(config, vocabulary)
     whitening = decode_whitening(pca.read_bytes()) if pca is not None else None
-    extractor = load_extractor(recipe, settings)
+    extractor = load_extractor(config, settings)
     centres = resolve_centres(extractor, own)
     projection = None
     if whitening is not None:
@@ -296,7 +296,7 @@ def describe_files(
     return result
 
 
-def load_own_vocabulary(recipe: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:
+def load_own_vocabulary(config: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:
     """Read the vocabulary file; None if the extractor needs none or ships one.
 
     Raises:
@@ -304,17 +304,17 @@ def load_own_vocabulary(recipe: ExtractorConfig, vocabulary: Path | None) -> Voc
         Misconfigured: `vocabulary_missing` if the extractor needs one and none is given.
     """
     if vocabulary is not None:
-        if not recipe.needs_vocabulary:
+        if not config.needs_vocabulary:
             raise Unprocessable(
-                "vocabulary_unfit", f"The extractor {recipe.name} does not use a vocabulary."
+                "vocabulary_unfit", f"The extractor {config.name} does not use a vocabulary."
             )
         own = read_vocabulary(vocabulary)
-        check_vocabulary_width(own.centres, recipe, recipe.width)  # before the weights are loaded
+        check_vocabulary_width(own.centres, config, config.width)  # before the weights are loaded
         return own
-    if recipe.needs_vocabulary and recipe.shipped_vocabulary is None:
+    if config.needs_vocabulary and config.shipped_vocabulary is None:
         raise Misconfigured(
             "vocabulary_missing",
-            f"The extractor {recipe.name} requires a vocabulary and ships none. Pass --vocabulary "
+            f"The extractor {config.name} requires a vocabulary and ships none. Pass --vocabulary "
             "FILE, or use --aggregator gem, which needs none.",
         )
     return None
@@ -329,7 +329,7 @@ def resolve_centres(extractor: Extractor, own: VocabularyFile | None) -> Cluster
     if own is not None:
         check_vocabulary_fits(own.provenance, own.centres, extractor)
         return own.centres
-    if not extractor.recipe.needs_vocabulary:
+    if not extractor.config.needs_vocabulary:
         return None
     shipped = extractor.shipped_vocabulary()
     assert shipped is not None, "load_own_vocabulary checked that one is shipped"

@@ -66,17 +66,17 @@ def fit_vocabulary_on_folder(
     """
     check_output_path(out, ".npz", "a vocabulary")
     settings = read_settings()
-    recipe = get_extractor_config(
+    config = get_extractor_config(
         extractor or settings.new_map_extractor,
         allow_test_extractors=settings.allow_test_extractors,
     )
-    if not recipe.needs_vocabulary:
+    if not config.needs_vocabulary:
         raise Unprocessable(
             "vocabulary_unfit",
-            f"The extractor {recipe.name} does not use a vocabulary: there is nothing to fit.",
+            f"The extractor {config.name} does not use a vocabulary: there is nothing to fit.",
         )
     all_photos = list_photos(folder)
-    loaded = load_extractor(recipe, settings)
+    loaded = load_extractor(config, settings)
     seed = seed or 0
     numbers = sample_photos(
         len(all_photos), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
@@ -88,7 +88,7 @@ def fit_vocabulary_on_folder(
         loaded,
         decode_pixels(photos, loaded.preprocessing, settings, refused),
         len(photos),
-        clusters=clusters or recipe.clusters,
+        clusters=clusters or config.clusters,
         seed=seed,
         on_progress=lambda stage, done, total: progress.update(
             bars[stage], completed=done, total=total
@@ -189,12 +189,12 @@ def fit_pca_locally(
 def _load_extractor(
     settings: Settings, extractor: str | None, vocabulary: Path | None
 ) -> tuple[Extractor, ClusterCentres | None]:
-    recipe = get_extractor_config(
+    config = get_extractor_config(
         extractor or settings.new_map_extractor,
         allow_test_extractors=settings.allow_test_extractors,
     )
-    own = load_own_vocabulary(recipe, vocabulary)
-    loaded = load_extractor(recipe, settings)
+    own = load_own_vocabulary(config, vocabulary)
+    loaded = load_extractor(config, settings)
     return loaded, resolve_centres(loaded, own)
 
 

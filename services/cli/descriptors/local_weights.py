@@ -85,7 +85,7 @@ class LocalWeights:
     """The `backbone_fingerprint` of an extractor spec."""
 
 
-def list_recipes(settings: Settings) -> Iterator[ExtractorConfig]:
+def list_extractor_configs(settings: Settings) -> Iterator[ExtractorConfig]:
     """List the built-in extractors, the default extractor and the allowed torch.hub entries.
 
     Test extractors are left out, and so are added models, whose weights are in the object store.
@@ -93,28 +93,28 @@ def list_recipes(settings: Settings) -> Iterator[ExtractorConfig]:
     names = dict.fromkeys(
         (*EXTRACTOR_CONFIGS, settings.new_map_extractor, *settings.allowed_hub_extractors)
     )
-    recipes = (get_extractor_config(name, allow_test_extractors=True) for name in names)
-    yield from (recipe for recipe in recipes if not recipe.for_tests and recipe.trained is None)
+    configs = (get_extractor_config(name, allow_test_extractors=True) for name in names)
+    yield from (config for config in configs if not config.for_tests and config.trained is None)
 
 
 def inspect_weights(
-    recipe: ExtractorConfig,
+    config: ExtractorConfig,
     settings: Settings,
     on_reading: Callable[[Path], object] = lambda _path: None,
 ) -> LocalWeights:
     """Inspect the local weights of an extractor, without network access or loading the model.
 
     Args:
-        recipe: The extractor.
+        config: The configuration of the extractor.
         settings: Location of DINOv2 weights.
         on_reading: Called with the path before a file is read to compute its fingerprint, which
             happens if the fingerprint is not cached.
     """
-    if recipe.hub is not None:
-        return _torchhub_weights(recipe.hub)
-    if recipe.depth is not None:
-        return _dinov2_weights(recipe, settings.dino_weights, on_reading)
-    return _packaged_weights(recipe, on_reading)
+    if config.hub is not None:
+        return _torchhub_weights(config.hub)
+    if config.depth is not None:
+        return _dinov2_weights(config, settings.dino_weights, on_reading)
+    return _packaged_weights(config, on_reading)
 
 
 def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
@@ -123,7 +123,7 @@ def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
 
 
 def _packaged_weights(
-    recipe: ExtractorConfig, on_reading: Callable[[Path], object]
+    config: ExtractorConfig, on_reading: Callable[[Path], object]
 ) -> LocalWeights:
     from shared.descriptors.backbones.efficientnet_lite0 import (
         PACKAGE,
@@ -136,10 +136,10 @@ def _packaged_weights(
     try:
         path = weights_path()
     except Misconfigured as error:
-        return LocalWeights(recipe.name, source, False, error.detail, None, None, licence, None)
-    known = _cached_record(recipe.backbone, path, file_sha256, on_reading)
+        return LocalWeights(config.name, source, False, error.detail, None, None, licence, None)
+    known = _cached_record(config.backbone, path, file_sha256, on_reading)
     return LocalWeights(
-        recipe.name,
+        config.name,
         source,
         True,
         None,
@@ -151,7 +151,7 @@ def _packaged_weights(
 
 
 def _dinov2_weights(
-    recipe: ExtractorConfig, weights_file: Path | None, on_reading: Callable[[Path], object]
+    config: ExtractorConfig, weights_file: Path | None, on_reading: Callable[[Path], object]
 ) -> LocalWeights:
     from shared.descriptors.backbones.dinov2 import Dinov2, check_dinov2_weights, dinov2_fingerprint
     from shared.descriptors.backbones.dinov2_weights import (
@@ -160,26 +160,26 @@ def _dinov2_weights(
         open_weights,
     )
 
-    layer, facet = recipe.layer, recipe.facet
+    layer, facet = config.layer, config.facet
     assert layer is not None
     assert facet is not None
-    size = recipe.backbone.removeprefix("dinov2-")
+    size = config.backbone.removeprefix("dinov2-")
     source = f"Hugging Face: {hub_repository(size)}" if weights_file is None else "DINO_WEIGHTS"
     try:
         path = find_local_weights(size, weights_file)
         check_dinov2_weights(size, layer, facet, open_weights(path, size))
     except Misconfigured as error:
         return LocalWeights(
-            recipe.name, source, False, error.detail, None, None, Dinov2.licence, None
+            config.name, source, False, error.detail, None, None, Dinov2.licence, None
         )
 
     def fingerprint(file: Path) -> str:
         return dinov2_fingerprint(size, layer, facet, open_weights(file, size))
 
     # The fingerprint covers only the tensors that this layer and facet use.
-    known = _cached_record(f"{recipe.backbone} {layer} {facet}", path, fingerprint, on_reading)
+    known = _cached_record(f"{config.backbone} {layer} {facet}", path, fingerprint, on_reading)
     return LocalWeights(
-        recipe.name,
+        config.name,
         source,
         True,
         None,

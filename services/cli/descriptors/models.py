@@ -29,7 +29,7 @@ from services.cli.descriptors.local_weights import (
     LocalWeights,
     WeightsRecord,
     inspect_weights,
-    list_recipes,
+    list_extractor_configs,
     save_record,
     torchhub_key,
 )
@@ -171,7 +171,8 @@ def list_(as_json: JsonOption = False) -> None:
                 status.update(f"Computing the fingerprint of {path}")
 
             all_weights = [
-                inspect_weights(recipe, settings, reading) for recipe in list_recipes(settings)
+                inspect_weights(config, settings, reading)
+                for config in list_extractor_configs(settings)
             ]
     if as_json:
         print_json([asdict(weights) for weights in all_weights])
@@ -204,31 +205,31 @@ def fetch(
     """
     with report_errors(as_json):
         settings = read_settings()
-        recipe = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
-        if recipe.for_tests:
-            raise Misconfigured("no_weights", f"The extractor {recipe.name} has no weights.")
-        if recipe.trained is not None:
+        config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+        if config.for_tests:
+            raise Misconfigured("no_weights", f"The extractor {config.name} has no weights.")
+        if config.trained is not None:
             raise Misconfigured(
                 "no_weights",
-                f"The weights of {recipe.name} are in the object store, from which extractors load "
+                f"The weights of {config.name} are in the object store, from which extractors load "
                 "them. There is nothing to fetch.",
             )
-        with _download_progress(recipe.name) as on_progress:
-            dimension = recipe.dimension
-            if recipe.hub is not None:
-                dimension = _fetch_torchhub(recipe.hub, on_progress)
-            elif recipe.depth is not None:
-                _fetch_dinov2(recipe.backbone, settings, on_progress)
-        weights = inspect_weights(recipe, settings)
+        with _download_progress(config.name) as on_progress:
+            dimension = config.dimension
+            if config.hub is not None:
+                dimension = _fetch_torchhub(config.hub, on_progress)
+            elif config.depth is not None:
+                _fetch_dinov2(config.backbone, settings, on_progress)
+        weights = inspect_weights(config, settings)
         if not weights.here:
             raise Misconfigured("weights_unfit", weights.note or "")
     if as_json:
         print_json({**asdict(weights), "dimension": dimension})
         return
     _print_weights(weights, dimension)
-    if recipe.hub is not None and recipe.name not in settings.allowed_hub_extractors:
+    if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         console.print(
-            f"To allow maps to use it, set TORCHHUB_ALLOWED={escape(recipe.name)}",
+            f"To allow maps to use it, set TORCHHUB_ALLOWED={escape(config.name)}",
             soft_wrap=True,
         )
 

@@ -201,12 +201,12 @@ def _validate_entries(
                     "bad_extractors", f"{entry.spec_text}: a checkpoint uses no vocabulary."
                 )
             continue
-        recipe = get_extractor_config(
+        config = get_extractor_config(
             entry.name, allow_test_extractors=settings.allow_test_extractors
         )
-        if entry.fit and not recipe.needs_vocabulary:
+        if entry.fit and not config.needs_vocabulary:
             raise InvalidRequest(
-                "bad_extractors", f"{entry.spec_text}: {recipe.name} uses no vocabulary."
+                "bad_extractors", f"{entry.spec_text}: {config.name} uses no vocabulary."
             )
     if out is not None:
         try:

@@ -155,20 +155,20 @@ def extractor_describer(
             vocabulary is given or shipped.
     """
     about: dict[str, Any] = {}
-    recipe = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
-    extractor = load_extractor(recipe, settings)
-    if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
+    config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+    extractor = load_extractor(config, settings)
+    if config.needs_vocabulary and vocabulary is None and (fit or not config.shipped_vocabulary):
         database = [photo.path for photo in evaluation_set.database]
         centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
         about["vocabulary"] = "fitted on the database photos"
     else:
-        centres = resolve_centres(extractor, load_own_vocabulary(recipe, vocabulary))
+        centres = resolve_centres(extractor, load_own_vocabulary(config, vocabulary))
         if centres is not None:
             about["vocabulary"] = vocabulary.name if vocabulary else "shipped"
     spec = extractor.spec(centres)
     describe = ExtractorDescriber(extractor, centres, settings)
     about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
-    return Describer(recipe.name, _with_cache(describe, spec, settings), spec, about)
+    return Describer(config.name, _with_cache(describe, spec, settings), spec, about)
 
 
 def _fit_vocabulary(
@@ -183,7 +183,7 @@ def _fit_vocabulary(
         extractor,
         decode_pixels(photos, extractor.preprocessing, settings, refused),
         len(photos),
-        clusters=extractor.recipe.clusters,
+        clusters=extractor.config.clusters,
         seed=SEED,
         on_progress=lambda stage, done, total: progress.update(
             bars[names[stage]], completed=done, total=total

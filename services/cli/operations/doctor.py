@@ -64,7 +64,7 @@ def check_device(settings: Settings) -> str:
     device = choose_device(settings.device)
     precision_note = (
         "precision of new generations: "
-        f"{choose_precision(settings.precision, _default_recipe(settings), device)}"
+        f"{choose_precision(settings.precision, _default_extractor_config(settings), device)}"
     )
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
@@ -85,21 +85,21 @@ def check_memory(settings: Settings) -> str:
     from shared.descriptors.inference import DEFAULT_PHOTO_PIXELS
     from shared.imaging.preprocessing import get_preprocessing
 
-    recipe = _default_recipe(settings)
-    if recipe.parameters is None or recipe.preprocessing is None:
-        return f"the size of {recipe.name} is unknown until it is loaded"
+    config = _default_extractor_config(settings)
+    if config.parameters is None or config.preprocessing is None:
+        return f"the size of {config.name} is unknown until it is loaded"
     device = choose_device(settings.device)
     if device.type == "cuda":
         available, owner = torch.cuda.get_device_properties(device).total_memory, "the GPU"
     else:
         available, owner = memory_limit_bytes(), "this machine"
-    weights = recipe.parameters * BYTES_PER_PARAMETER
+    weights = config.parameters * BYTES_PER_PARAMETER
     # A single photo is never split, however many pixels its preprocessing produces.
-    min_batch = math.ceil(get_preprocessing(recipe.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
+    min_batch = math.ceil(get_preprocessing(config.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
     batch = max(settings.batch_photos, min_batch) * BYTES_PER_BATCH_PHOTO
     needed = PROCESS_OVERHEAD_BYTES + weights + batch
     estimate = (
-        f"{recipe.name} requires about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, "
+        f"{config.name} requires about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, "
         f"a batch of {settings.batch_photos} photos {batch / 1e9:.1f}), "
         f"{owner} has {available / 1e9:.1f} GB"
     )
@@ -111,7 +111,7 @@ def check_memory(settings: Settings) -> str:
         and PROCESS_OVERHEAD_BYTES + weights + min_batch * BYTES_PER_BATCH_PHOTO <= available
     ):
         remedies.append(f"BATCH_PHOTOS below {settings.batch_photos}")
-    if recipe.depth is not None:
+    if config.depth is not None:
         remedies.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
     if min_batch > 1:
         remedies.append("EXTRACTOR with the preprocessing square224")
@@ -130,40 +130,40 @@ def check_extractor(settings: Settings) -> str:
     Raises:
         Misconfigured: The weights are missing or don't fit the extractor.
     """
-    recipe = _default_recipe(settings)
-    if recipe.depth is not None:
-        return _check_dinov2(recipe, settings.dino_weights)
-    if recipe.hub is not None:
+    config = _default_extractor_config(settings)
+    if config.depth is not None:
+        return _check_dinov2(config, settings.dino_weights)
+    if config.hub is not None:
         from shared.descriptors.backbones.torchhub import find_local_code
 
-        find_local_code(recipe.hub)
+        find_local_code(config.hub)
     from services.cli.descriptors.local_extractor import load_extractor
 
-    extractor = load_extractor(recipe, settings)
+    extractor = load_extractor(config, settings)
     shipped = extractor.shipped_vocabulary()
-    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
+    return f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
         f"shipped vocabulary of {shipped[0].clusters} centres"
         if shipped
         else "no shipped vocabulary"
     )
 
 
-def _check_dinov2(recipe: ExtractorConfig, weights: Path | None) -> str:
+def _check_dinov2(config: ExtractorConfig, weights: Path | None) -> str:
     from shared.descriptors.backbones.dinov2 import check_dinov2_weights
     from shared.descriptors.backbones.dinov2_weights import find_local_weights, open_weights
 
-    assert recipe.layer is not None
-    assert recipe.facet is not None
-    size = recipe.backbone.removeprefix("dinov2-")
+    assert config.layer is not None
+    assert config.facet is not None
+    size = config.backbone.removeprefix("dinov2-")
     path = find_local_weights(size, weights)
-    check_dinov2_weights(size, recipe.layer, recipe.facet, open_weights(path, size))
+    check_dinov2_weights(size, config.layer, config.facet, open_weights(path, size))
     return (
-        f"{recipe.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
+        f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
         "vocabulary: photos are described once one is fitted or imported"
     )
 
 
-def _default_recipe(settings: Settings) -> ExtractorConfig:
+def _default_extractor_config(settings: Settings) -> ExtractorConfig:
     return settings.extractor_config(settings.new_map_extractor)
 
 

@@ -136,7 +136,7 @@ def gateway() -> None:
 
         with (
             listen(settings.host, settings.port) as listener,
-            _open_hints(settings) as hints,
+            _open_wakeups(settings) as wakeups,
             _search_client(settings) as search,
         ):
             url = reachable_url(*listener.getsockname()[:2])
@@ -146,7 +146,7 @@ def gateway() -> None:
             store = open_installation_store(catalog, settings, exclusive=False)
             requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
             keys = ApiKeyAuthenticator(requests, *admin_key_hashes)
-            context = GatewayContext(requests, store, hints, search, settings, keys)
+            context = GatewayContext(requests, store, wakeups, search, settings, keys)
             server = http_server(
                 create_app(context),
                 context.connections,
@@ -196,13 +196,13 @@ def steward() -> None:
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
-        with _open_hints(settings) as hints, _search_client(settings) as search:
+        with _open_wakeups(settings) as wakeups, _search_client(settings) as search:
             store = open_installation_store(catalog, settings, exclusive=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             registry = CollectorRegistry()
             metrics = StewardMetrics(registry)
-            batches = BatchWorker(catalog, store, hints, settings, name, metrics)
-            scheduler = Scheduler(catalog, store, hints, settings, metrics)
+            batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
+            scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
             evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
             webhooks = WebhookDispatcher(catalog, settings)
             threads = [
@@ -269,14 +269,14 @@ def _admin_key_hashes(settings: Settings, catalog: Catalog) -> list[str]:
 
 
 @contextlib.contextmanager
-def _open_hints(settings: Settings) -> Iterator[CeleryWakeups]:
+def _open_wakeups(settings: Settings) -> Iterator[CeleryWakeups]:
     from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
 
-    hints = CeleryWakeups(create_celery_app(settings), settings)
+    wakeups = CeleryWakeups(create_celery_app(settings), settings)
     try:
-        yield hints
+        yield wakeups
     finally:
-        hints.close()
+        wakeups.close()
 
 
 @contextlib.contextmanager

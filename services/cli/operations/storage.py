@@ -96,7 +96,7 @@ def verify(
                 progress("orphaned objects", report.orphans, report.orphans)
             trash = measure_trash(store)
             report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
-            # No wake-up message is needed: workers poll, and the steward sends messages.
+            # No wakeup message is needed: workers poll, and the steward sends messages.
             queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
     if as_json:
         recovery = {

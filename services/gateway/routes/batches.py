@@ -229,7 +229,7 @@ def _caller_params(caller: Caller, settings: Settings) -> dict[str, Any]:
 def _plan_items(
     gateway: GatewayContext, received: BatchUpload
 ) -> tuple[list[dict[str, Any]], BatchSource, dict[str, Any]]:
-    """Returns the items as column values of BatchItem, their source, and the job params."""
+    """Return the items as column values of BatchItem, their source, and the job params."""
     if received.archive is not None:
         archive = received.archive
         return [], BatchSource.ARCHIVE, {"object_key": archive.key, "filename": archive.name}
@@ -290,7 +290,7 @@ def _form_file_items(
 
 
 def validate_prefix(value: str, settings: Settings) -> str:
-    """Returns the key prefix to import, ending with `/`.
+    """Return the key prefix to import, ending with `/`.
 
     Args:
         value: A prefix below IMPORT_PREFIX, or the same as `s3://S3_BUCKET/...`.

@@ -111,7 +111,7 @@ def _new_evaluation_job(
     kind: JobKind,
     params: dict[str, Any],
 ) -> Job:
-    """Creates a job that queries the generation with the map's own photos.
+    """Create a job that queries the generation with the map's own photos.
 
     Raises:
         Conflict: `nothing_to_evaluate`, if no described photo has a place.

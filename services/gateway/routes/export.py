@@ -121,7 +121,7 @@ def export_descriptors(
 def _write_tables(
     session: Session, generation: Generation, table: IO[bytes], names: IO[bytes]
 ) -> list[_ChunkRows]:
-    """Writes photos.csv to `table` and names.txt to `names`; returns the rows to export."""
+    """Write photos.csv to `table` and names.txt to `names`; return the rows to export."""
     chunks: list[_ChunkRows] = []
     number = 0
     for chunk in list_live_chunks(session, generation.id):

@@ -80,7 +80,7 @@ class HealthResponse(ResponseModel):
 
 
 def service_info() -> ServiceResponse:
-    """Returns the name and version of the service, and its links."""
+    """Return the name and version of the service, and its links."""
     return ServiceResponse(
         service="Placewise",
         version=VERSION,

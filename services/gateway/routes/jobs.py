@@ -143,7 +143,7 @@ def retry_job_by_id(
         session.refresh(job)
         response = JobResponse.of(job, query.map)
         idempotent.store_response(session, 200, response)
-    gateway.hints.send(queue_for_priority(job.priority))
+    gateway.wakeups.send(queue_for_priority(job.priority))
     return response
 
 
@@ -155,7 +155,7 @@ def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Jo
 async def _events(
     gateway: GatewayContext, job_id: UUID, job: JobResponse, map_name: str
 ) -> AsyncIterator[str]:
-    """Yields the event stream of a job, beginning with its current state `job`."""
+    """Yield the event stream of a job, beginning with its current state `job`."""
     number, last_seen, sent = 0, (), ""
     while True:
         if (text := job.model_dump_json()) != sent:

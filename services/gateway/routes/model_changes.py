@@ -97,7 +97,7 @@ def start_vocabulary_fit(
             raise Conflict("no_photos", "The map has no photos to fit on. Upload photos first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         accepted = idempotent.accept_job(session, job)
-    gateway.hints.send()
+    gateway.wakeups.send()
     return accepted
 
 
@@ -137,7 +137,7 @@ async def start_vocabulary_import(
             return idempotent.accept_job(session, job)
 
     accepted = await run_in_threadpool(queue_job)
-    gateway.hints.send()
+    gateway.wakeups.send()
     return accepted
 
 
@@ -213,7 +213,7 @@ def start_generation(
         else:
             job = _queue_switch(session, map_id, config, body.vocabulary_id)
         accepted = idempotent.accept_job(session, job)
-    gateway.hints.send()
+    gateway.wakeups.send()
     return accepted
 
 

@@ -155,7 +155,7 @@ async def upload_model(
             return idempotent.accept_job(session, job)
 
     accepted = await run_in_threadpool(queue_job)
-    gateway.hints.send()
+    gateway.wakeups.send()
     return accepted
 
 
@@ -188,7 +188,7 @@ def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelRespon
 
 
 def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
-    """Validates and returns the fields `name`, `licence` and `note` of the form."""
+    """Validate and return the fields `name`, `licence` and `note` of the form."""
     for field in fields.keys() - MODEL_FORM_FIELDS.keys():
         raise invalid_field_error(field, f"is unknown; valid are {', '.join(MODEL_FORM_FIELDS)}")
     name = fields.get("name", "")

@@ -78,7 +78,7 @@ class PhotoUpdate(RequestModel):
     role: PhotoRole | None = None
 
     def to_columns(self) -> dict[str, Any]:
-        """Returns the new values of the photo's columns, for the fields that are set."""
+        """Return the new values of the photo's columns, for the fields that are set."""
         columns = self.model_dump(exclude_unset=True)
         if columns.get("captured_at") is not None:
             columns["captured_at"] = parse_time("captured_at", columns["captured_at"])
@@ -189,7 +189,7 @@ class MetadataSearchParams(FilterParams, PageParams):
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
-        """Parses the conditions; 422 (`invalid_field`) names the invalid parameter."""
+        """Parse the conditions; 422 (`invalid_field`) names the invalid parameter."""
         if self.filename is not None and "\0" in self.filename:
             raise invalid_field_error("filename", "contains a NUL character")
         return MetadataFilter(

@@ -75,7 +75,7 @@ class PresignRequest(PhotoUpdate):
     sha256: str = Field(pattern="^[0-9a-f]{64}$", description="SHA-256 of the file, hexadecimal")
 
     def photo_fields(self) -> dict[str, Any]:
-        """Returns the fields of the photo, without those of the file, as JSON values."""
+        """Return the fields of the photo, without those of the file, as JSON values."""
         return self.model_dump(mode="json", exclude=set(FILE_FIELDS), exclude_none=True)
 
 
@@ -195,7 +195,7 @@ def _complete_upload(
     key_id: UUID | None,
     quota: AbstractContextManager[None],
 ) -> StoreResult:
-    """Stores the photo under `key`; IdempotentReplay if the upload was completed before."""
+    """Store the photo under `key`; IdempotentReplay if the upload was completed before."""
     store = _require_presigning_store(gateway)
     with gateway.catalog.read() as session:
         upload = get_presigned_upload(session, get_map(session, map_name).id, upload_id)
@@ -227,7 +227,9 @@ def _complete_upload(
             received, media_type, header, _parse_photo_fields(upload.photo_fields), key_id
         )
         with quota:
-            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
+            stored = store_photo(
+                gateway.catalog, gateway.wakeups, map_name, incoming, store_response
+            )
     if stored.photo.object_key != key:
         store.delete(key)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
@@ -239,7 +241,7 @@ def _complete_upload(
 def _verify_copied_object(
     store: PresigningStore, key: str, upload: PresignedUpload
 ) -> StoredUpload:
-    """Reads and hashes the copied object; Unprocessable (`sha256_differs`) for another file."""
+    """Read and hash the copied object; Unprocessable (`sha256_differs`) for another file."""
     received = StoredUpload.read(store, key, upload.filename)
     if received.sha256 != upload.sha256:
         raise Unprocessable(
@@ -251,7 +253,7 @@ def _verify_copied_object(
 
 
 def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:
-    """Raises NotFound if there is no object, and Unprocessable (`size_differs`)."""
+    """Raise NotFound if there is no object, and Unprocessable (`size_differs`)."""
     if info is None:
         raise NotFound("object_not_found", "No file was sent.")
     if info.size_bytes != upload.size_bytes:

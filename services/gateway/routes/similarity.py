@@ -185,7 +185,7 @@ async def read_similarity_result(
 async def _wait_for_result(
     gateway: GatewayContext, response: Response, job: Job, map_name: str, wait_seconds: float
 ) -> SimilarityResponse | JSONResponse:
-    """Waits for the query's job and its compare job, if any; 202 with the job when time is up."""
+    """Wait for the query's job and its compare job, if any; 202 with the job when time is up."""
     deadline = time.monotonic() + wait_seconds
     while True:
         remaining = deadline - time.monotonic()
@@ -228,7 +228,7 @@ def _queue_query(
                 params=params,
             )
             idempotent.store_job_response(session, job)
-    gateway.hints.send(WakeupQueue.QUERY)
+    gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
 

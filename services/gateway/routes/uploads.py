@@ -124,7 +124,7 @@ class UploadOutcome:
 
     @classmethod
     def of(cls, stored: StoreResult, job: Job | None, key: str, map_name: str) -> UploadOutcome:
-        """Builds the response.
+        """Build the response.
 
         Args:
             stored: The stored or existing photo.
@@ -162,7 +162,7 @@ async def respond_to_upload(
     key: str,
     on_described: Callable[[UploadOutcome], None],
 ) -> UploadResponse:
-    """Builds the response to an upload, after waiting for its job if the request prefers it.
+    """Build the response to an upload, after waiting for its job if the request prefers it.
 
     Args:
         request: Its `Prefer: wait=N` sets how long to wait.
@@ -195,13 +195,15 @@ def _store_upload(
     quota: AbstractContextManager[None],
     before_commit: BeforeCommit,
 ) -> StoreResult:
-    """Validates and stores the photo; deletes the received bytes if they are not used."""
+    """Validate and store the photo; delete the received bytes if they are not used."""
     with delete_if_refused(gateway.store, received.key):
         incoming = validate_photo(
             gateway.store, received, gateway.settings.max_image_pixels, key_id
         )
         with quota:
-            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, before_commit)
+            stored = store_photo(
+                gateway.catalog, gateway.wakeups, map_name, incoming, before_commit
+            )
     if stored.photo.object_key != received.key:
         gateway.store.delete(received.key)
     return stored

@@ -18,7 +18,7 @@ from shared.search_api.protocol import SearchHit
 
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
-    """Joins hits with the locations of their photos."""
+    """Join hits with the locations of their photos."""
     return [RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id])) for hit in hits]
 
 
@@ -28,7 +28,7 @@ def estimate_place(
     unfiltered_ranking: Sequence[RankedPhoto],
     radius_m: float,
 ) -> EstimateResponse:
-    """Estimates the place that a ranking points to.
+    """Estimate the place that a ranking points to.
 
     Args:
         calibration: Calibration of this kind of ranking (plain, or by word weights), if any.

@@ -57,13 +57,13 @@ class RankingWeights:
     """One weight per word; () to rank by the plain cosine similarity."""
 
     def state(self, hits: Sequence[SearchHit]) -> str:
-        """Returns the response field `word_weights`: `applied`, `none` or `off`."""
+        """Return the response field `word_weights`: `applied`, `none` or `off`."""
         if self.values:
             return "applied" if self._ranked_by_weights(hits) else "none"
         return "off" if self.record and self.record.applied else "none"
 
     def calibration(self, hits: Sequence[SearchHit]) -> Calibration | None:
-        """Returns the calibration for this kind of ranking; None if there is none."""
+        """Return the calibration for this kind of ranking; None if there is none."""
         if self.values and self.record and self._ranked_by_weights(hits):
             return self.record.calibration
         stored = self.generation.calibration
@@ -76,7 +76,7 @@ class RankingWeights:
 def select_ranking_weights(
     generation: Generation, enabled: bool, settings: Settings
 ) -> RankingWeights:
-    """Selects the word weights of the generation, unless the request or a setting disables them."""
+    """Select the word weights of the generation, unless the request or a setting disables them."""
     record = parse_word_weights(generation.word_weights)
     enabled = enabled and settings.word_weights
     return RankingWeights(generation, record, record.applied if record and enabled else ())
@@ -111,7 +111,7 @@ class SimilarityResult:
 
 
 def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
-    """Creates the query for a stored photo.
+    """Create the query for a stored photo.
 
     Raises:
         NotFound: `map_not_found`, `photo_not_found`.
@@ -137,7 +137,7 @@ def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> 
 
 
 def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
-    """Creates the query for a described query photo.
+    """Create the query for a described query photo.
 
     Raises:
         Gone: `query_expired`, if the generation of its descriptor was deleted.
@@ -164,7 +164,7 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
 def find_similar(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> SimilarityResponse:
-    """Finds the most similar live photos and the place estimate, and adds the search history row.
+    """Find the most similar live photos and the place estimate, and add the search history row.
 
     The query itself is not among the photos. If the disk of the catalog is full, the history row is
     left out.
@@ -190,7 +190,7 @@ def find_similar(
 def run_similarity_search(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> SimilarityResult:
-    """Queries the search tier and computes the estimate. The caller adds the history row."""
+    """Query the search tier and compute the estimate. The caller adds the history row."""
     started = time.perf_counter()
     weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
     depth = max(search_params.top_k, search_params.rerank or 0)
@@ -265,7 +265,7 @@ def _search_live_photos(
     weights: tuple[float, ...],
     min_score: float | None = None,
 ) -> tuple[list[SearchHit], dict[UUID, Photo], SearchResponse]:
-    """Returns the first `depth` live photos; fewer if there are no more."""
+    """Return the first `depth` live photos; fewer if there are no more."""
     k = depth
     while True:
         response = gateway.search.search(
@@ -294,7 +294,7 @@ def _search_live_photos(
 
 
 def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:
-    """Builds the 409 error: why the photo has no descriptor, and which job to poll."""
+    """Build the 409 error: why the photo has no descriptor, and which job to poll."""
     job = session.get(Job, photo.job_id) if photo.job_id else None
     extra: dict[str, Any] = {"file_id": str(photo.id)}
     if job is None:

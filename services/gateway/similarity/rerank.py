@@ -56,7 +56,7 @@ class CompareJobParams(BaseModel):
 def check_comparison_supported(
     gateway: GatewayContext, map_name: str, search_params: SearchParams
 ) -> None:
-    """Checks that the extractor of the map supports the requested comparison.
+    """Check that the extractor of the map supports the requested comparison.
 
     Raises:
         Unprocessable: `not_rerankable`, `not_explainable`.
@@ -80,19 +80,19 @@ def start_comparison_of_stored_photo(
     search_params: SearchParams,
     idempotent: IdempotentRequest,
 ) -> Job:
-    """Searches with a stored photo and queues a compare job for the hits."""
+    """Search with a stored photo and queue a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
     with gateway.catalog.write() as session:
         session.add(history)
         idempotent.store_job_response(session, job)
-    gateway.hints.send(WakeupQueue.QUERY)
+    gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
 
 def start_comparison_of_query_photo(
     gateway: GatewayContext, describe_job: Job, query: SimilarityQuery, search_params: SearchParams
 ) -> Job:
-    """Returns the compare job of a described query photo, and creates it if there is none yet."""
+    """Return the compare job of a described query photo, and create it if there is none yet."""
     with gateway.catalog.read() as session:
         existing = _find_compare_job(session, describe_job)
     if existing is not None:
@@ -107,12 +107,12 @@ def start_comparison_of_query_photo(
             return existing
         current.params = {**current.params, COMPARE_JOB_PARAM: str(job.id)}
         session.add_all([job, history])
-    gateway.hints.send(WakeupQueue.QUERY)
+    gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
 
 def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> SimilarityResponse:
-    """Builds the response from the result of a succeeded compare job.
+    """Build the response from the result of a succeeded compare job.
 
     Raises:
         Gone: `query_expired`, if the result was deleted.
@@ -155,7 +155,7 @@ def _build_compare_job(
     search_params: SearchParams,
     describe_job_id: UUID | None,
 ) -> tuple[Job, Search]:
-    """Searches, and builds the compare job and the history row; neither is added to a session."""
+    """Search, and build the compare job and the history row; neither is added to a session."""
     result = run_similarity_search(gateway, query, search_params)
     params = CompareJobParams(
         request=CompareRequest(

@@ -46,7 +46,7 @@ class FilterParams(MapParams):
     )
 
     def photo_filter(self) -> PhotoFilter:
-        """Parses the filter.
+        """Parse the filter.
 
         Raises:
             Unprocessable: `invalid_field`, with the name of the invalid parameter.
@@ -65,7 +65,7 @@ class FilterParams(MapParams):
 
 
 def parse_optional_time(field: str, text: str | None) -> datetime | None:
-    """Parses a time; None if it is omitted or empty."""
+    """Parse a time; None if it is omitted or empty."""
     return parse_time(field, text) if text else None
 
 
@@ -172,6 +172,6 @@ class SimilarityParams(RankingParams, FilterParams):
     """Query parameters of the similarity searches."""
 
     def search_params(self) -> SearchParams:
-        """Parses the filter; raises as `photo_filter`."""
+        """Parse the filter; raises as `photo_filter`."""
         ranking = self.model_dump(include=set(RankingParams.model_fields))
         return SearchParams(photos=self.photo_filter(), **ranking)

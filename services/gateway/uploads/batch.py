@@ -73,7 +73,7 @@ class BatchUpload:
 async def parse_batch_upload(
     request: Request, store: ObjectStore, settings: Settings
 ) -> BatchUpload:
-    """Parses the body of a batch upload and stores its files.
+    """Parse the body of a batch upload and store its files.
 
     Nothing is left in the store if it raises; `discard_batch_upload` deletes the files later.
 
@@ -117,14 +117,14 @@ async def parse_batch_upload(
 
 
 def discard_batch_upload(store: ObjectStore, received: BatchUpload) -> None:
-    """Deletes the stored files of the batch."""
+    """Delete the stored files of the batch."""
     for file in (*received.files, received.archive):
         if file is not None and file.error is None:
             store.delete(file.key)
 
 
 def batch_too_large_error(max_bytes: int) -> PlacewiseError:
-    """Builds the 413 error for a batch of more than `max_bytes`."""
+    """Build the 413 error for a batch of more than `max_bytes`."""
     return TooLarge(
         "batch_too_large",
         f"The files of the batch are larger than {max_bytes} bytes together (MAX_ARCHIVE_SIZE). "
@@ -165,13 +165,13 @@ class _BatchPartHandler:
         self._committed = False
 
     def discard_uncommitted(self) -> None:
-        """Aborts the current write, and deletes the files unless `commit` was called."""
+        """Abort the current write, and delete the files unless `commit` was called."""
         self._abort_write()
         if not self._committed:
             discard_batch_upload(self._store, self.batch)
 
     def commit(self) -> None:
-        """Keeps the stored files: the body was complete."""
+        """Keep the stored files: the body was complete."""
         self._committed = True
 
     def begin(self, name: str, filename: str | None) -> None:
@@ -237,7 +237,7 @@ class _BatchPartHandler:
             self._write_queue.append((self._file, None))
 
     def write(self) -> None:
-        """Validates and stores the bytes received since the last call."""
+        """Validate and store the bytes received since the last call."""
         while self._write_queue:
             file, piece = self._write_queue.popleft()
             if file.error is not None:
@@ -281,7 +281,7 @@ class _BatchPartHandler:
 
 
 def too_many_photos_error(limit: int) -> PlacewiseError:
-    """Builds the 413 error for a batch of more than `limit` photos."""
+    """Build the 413 error for a batch of more than `limit` photos."""
     return TooLarge(
         "too_many_photos",
         f"The batch has more than {limit} photos (MAX_BATCH_PHOTOS). Split it into several.",

@@ -47,7 +47,7 @@ class MultipartFormParser:
         max_bytes: int,
         too_large: Callable[[], Exception],
     ) -> None:
-        """Creates the parser for the body of a request.
+        """Create the parser for the body of a request.
 
         Args:
             request: Its headers give the boundary and the declared size.
@@ -86,7 +86,7 @@ class MultipartFormParser:
             raise too_large()
 
     def feed(self, piece: bytes) -> None:
-        """Parses the next bytes of the body."""
+        """Parse the next bytes of the body."""
         # The whole body counts, with part headers and the epilogue: it can't be endless.
         self._body_bytes += len(piece)
         if self._body_bytes > self._max_bytes:
@@ -97,7 +97,7 @@ class MultipartFormParser:
             raise malformed_body_error(str(error)) from error
 
     def finish(self) -> None:
-        """Raises InvalidRequest (`malformed_body`) if the body is incomplete."""
+        """Raise InvalidRequest (`malformed_body`) if the body is incomplete."""
         if not self._ended:
             raise malformed_body_error("the body ends before the last boundary")
 
@@ -131,12 +131,12 @@ class MultipartFormParser:
 
 
 def malformed_body_error(reason: str) -> PlacewiseError:
-    """Builds the 400 error for a body that can't be parsed."""
+    """Build the 400 error for a body that can't be parsed."""
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
 def body_media_type(request: Request) -> str:
-    """Returns the media type of the body in lower case, without parameters; "" if not given."""
+    """Return the media type of the body in lower case, without parameters; "" if not given."""
     media_type, _ = parse_options_header(request.headers.get("content-type", ""))
     return media_type.decode("latin-1").lower()
 
@@ -173,7 +173,7 @@ async def store_form_file(
     *,
     too_large: Callable[[int], PlacewiseError] = file_too_large_error,
 ) -> StoredUpload:
-    """Stores the file of a form in the object store while it is received.
+    """Store the file of a form in the object store while it is received.
 
     Nothing is left in the store if it raises.
 
@@ -228,7 +228,7 @@ async def store_form_file(
 
 
 def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
-    """Writes the remaining bytes and makes the object visible."""
+    """Write the remaining bytes and make the object visible."""
     if writer is None:
         store.put(key, rest)
         return
@@ -239,7 +239,7 @@ def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, re
 def multipart_schema(
     file: str, required: Sequence[str] = (), **fields: dict[str, Any]
 ) -> dict[str, Any]:
-    """Returns the OpenAPI request body of a form with a file, for `openapi_extra`.
+    """Return the OpenAPI request body of a form with a file, for `openapi_extra`.
 
     FastAPI can't derive it, because the routes read the body as a stream.
 
@@ -270,14 +270,14 @@ class _SingleFileHandler:
         self._pending: list[bytes] = []
 
     def take_pending(self) -> bytes:
-        """Returns the bytes of the file since the last call."""
+        """Return the bytes of the file since the last call."""
         data = b"".join(self._pending)
         self._pending.clear()
         self.pending_bytes = 0
         return data
 
     def require_file(self) -> None:
-        """Raises InvalidRequest (`no_file`) if the form has no file."""
+        """Raise InvalidRequest (`no_file`) if the form has no file."""
         if not self._file_seen:
             raise InvalidRequest(
                 "no_file", f"The form has no file in the field {FILE_FIELD!r}: curl -F file=@PHOTO."

@@ -61,7 +61,7 @@ from shared.ingest.validation import (
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.runner import JobInterrupted, JobRunner
-from shared.jobs.transitions import release_job, succeed_job, wake_waiting_jobs
+from shared.jobs.transitions import make_waiting_jobs_claimable, release_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.keys import new_original_key
 
@@ -75,11 +75,11 @@ class BatchItemImporter:
     """Imports batch items; caches the open archives."""
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, hints: Wakeups, settings: Settings
+        self, catalog: Catalog, store: ObjectStore, wakeups: Wakeups, settings: Settings
     ) -> None:
         self._catalog = catalog
         self._store = store
-        self._hints = hints
+        self._wakeups = wakeups
         self._settings = settings
         self._quota = PhotoQuota(catalog)
         self._archives: LRUCache[UUID, Archive] = LRUCache(MAX_OPEN_ARCHIVES)
@@ -126,7 +126,7 @@ class BatchItemImporter:
             self._store.delete(key)
             return
         if result.queued:
-            self._hints.send()
+            self._wakeups.send()
         if result.photo.object_key != key:
             self._store.delete(key)
 
@@ -233,7 +233,7 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
     except StorageFull:
         return
     with catalog.write() as session:
-        wake_waiting_jobs(session, waits)
+        make_waiting_jobs_claimable(session, waits)
 
 
 class BatchWorker:
@@ -243,7 +243,7 @@ class BatchWorker:
         self,
         catalog: Catalog,
         store: ObjectStore,
-        hints: Wakeups,
+        wakeups: Wakeups,
         settings: Settings,
         name: str,
         metrics: StewardMetrics | None = None,
@@ -252,7 +252,7 @@ class BatchWorker:
         self._store = store
         self._settings = settings
         self._disk = DiskSpace(settings)
-        self._importer = BatchItemImporter(catalog, store, hints, settings)
+        self._importer = BatchItemImporter(catalog, store, wakeups, settings)
         metrics = metrics or StewardMetrics(CollectorRegistry())
         self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics.count_jobs)
 

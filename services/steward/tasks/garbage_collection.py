@@ -211,7 +211,7 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
             session.execute(delete(Job).where(Job.id.in_(job_ids)))
 
 
-def collect_direct_uploads(catalog: Catalog, store: ObjectStore) -> None:
+def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
     """Delete presigned uploads that expired, with the objects uploaded for them.
 
     Completed ones stay COMPLETED_UPLOAD_SECONDS longer: until then, completing one again returns
@@ -280,6 +280,6 @@ def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) ->
     collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_model_change_files(catalog, store)
-    collect_direct_uploads(catalog, store)
+    collect_presigned_uploads(catalog, store)
     collect_job_files(catalog, store, ARCHIVES, JobKind.BATCH)
     collect_job_files(catalog, store, CHECKPOINTS, JobKind.ADD_MODEL)

@@ -1,4 +1,4 @@
-"""Short maintenance tasks: expired leases, lost wake-ups, retention, cached map statistics.
+"""Short maintenance tasks: expired leases, lost wakeups, retention, cached map statistics.
 
 Retention covers finished jobs, the search history, webhook deliveries and idempotency keys.
 """
@@ -37,11 +37,11 @@ def release_expired_leases(catalog: Catalog, max_attempts: int, *, all_leases: b
     return reclaimed
 
 
-def resend_hints(catalog: Catalog, hints: Wakeups) -> int:
-    """Wake a worker for each queue with claimable jobs: the first wake-up may have been lost.
+def resend_wakeups(catalog: Catalog, wakeups: Wakeups) -> int:
+    """Wake a worker for each queue with claimable jobs: the first wakeup may have been lost.
 
     Returns:
-        The number of wake-ups sent.
+        The number of wakeups sent.
     """
     sent = 0
     with catalog.read() as session:
@@ -52,7 +52,7 @@ def resend_hints(catalog: Catalog, hints: Wakeups) -> int:
             if session.scalar(
                 select(exists(select(Job.id).where(claimable_condition(), condition)))
             ):
-                hints.send(queue)
+                wakeups.send(queue)
                 sent += 1
     return sent
 

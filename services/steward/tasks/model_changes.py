@@ -97,7 +97,7 @@ REINDEX_JOBS_PER_TRANSACTION = 2000
 DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
 
 
-def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
+def advance_model_changes(catalog: Catalog, wakeups: Wakeups) -> None:
     """Advance every model change that waits for descriptors or for search workers by one step."""
     with catalog.read() as session:
         waiting = session.scalars(
@@ -110,10 +110,10 @@ def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
             if current.waiting_for in ADVANCED_WAITS and current.generation_id:
                 queued = _advance_generation(session, current, current.generation_id)
                 if queued:
-                    hints.send()
+                    wakeups.send()
 
 
-def auto_fit_vocabularies(catalog: Catalog, hints: Wakeups, auto_fit_photos: int) -> None:
+def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
     """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one."""
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
@@ -129,7 +129,7 @@ def auto_fit_vocabularies(catalog: Catalog, hints: Wakeups, auto_fit_photos: int
         log.info(
             "fitting a vocabulary for map %s, which has enough photos (job %s)", map_id, job.id
         )
-        hints.send()
+        wakeups.send()
 
 
 def _has_enough_waiting_photos(session: Session, map_id: UUID, min_photos: int) -> bool:

@@ -6,7 +6,8 @@
              block's qkv projection that computes queries, keys or values
     feature of a patch = facet / |facet|          class and register tokens dropped
 
-AnyLoc hooks a whole forward pass; this one stops once the facet is computed, with the same numbers.
+AnyLoc runs a complete forward pass and captures the facet with a hook. This module stops after
+computing the facet; the values are identical.
 The blocks are timm's. Positions are resampled as in Meta's code, on which AnyLoc's published
 vocabularies depend; timm's own resampling gives other features at any size but the training's.
 """

@@ -4,7 +4,7 @@ MegaLoc, BoQ, CosPlace, EigenPlaces and others publish such entries: (B, 3, H, W
 -> (B, D). If an entry returns a tuple, its first element is used: BoQ adds its attention maps.
 
 A repository is downloaded at a fixed commit to the folder that torch.hub uses
-(`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), fingerprinted and executed. `Settings.recipe` decides whether
+(`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), fingerprinted and executed. `Settings.config` decides whether
 its code may run at all; once it runs, it can do whatever this process can do.
 """
 

@@ -39,11 +39,11 @@ def extractors() -> dict[str, Extractor]:
     """By preprocessing: EfficientNet-Lite0 with its own weights, one copy for all."""
     made: dict[str, Extractor] = {}
     for name in ("square224", "demo1024", "paper480x640", "round14"):
-        recipe = get_extractor_config(
+        config = get_extractor_config(
             f"efficientnet-lite0-vlad:preprocessing={name}", allow_test_extractors=False
         )
         loaded = made["square224"].backbone if made else None
-        made[name] = Extractor(recipe, torch.device("cpu"), backbone=loaded)
+        made[name] = Extractor(config, torch.device("cpu"), backbone=loaded)
     return made
 
 

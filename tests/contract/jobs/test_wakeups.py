@@ -10,24 +10,24 @@ from shared.jobs import (
 
 
 def test_a_hint_sent_before_the_wait_is_not_lost() -> None:
-    hints = InProcessWakeups()
-    hints.send()
-    assert hints.wait(30)
+    wakeups = InProcessWakeups()
+    wakeups.send()
+    assert wakeups.wait(30)
 
 
 def test_at_most_one_hint_is_outstanding() -> None:
-    hints = InProcessWakeups()
+    wakeups = InProcessWakeups()
     for _ in range(5):
-        hints.send()
-    assert hints.wait(30)
-    assert not hints.wait(0)
+        wakeups.send()
+    assert wakeups.wait(30)
+    assert not wakeups.wait(0)
 
 
 def test_a_waiting_worker_wakes_with_the_hint() -> None:
-    hints = InProcessWakeups()
+    wakeups = InProcessWakeups()
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(hints.wait, 60)
-        hints.send()
+        waiting = pool.submit(wakeups.wait, 60)
+        wakeups.send()
         assert waiting.result(timeout=30)
 
 

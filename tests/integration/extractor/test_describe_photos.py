@@ -287,13 +287,13 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     assert refused.error is not None
     assert refused.error["code"] == "no_vocabulary"
 
-    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # AUTO_FIT_PHOTOS
-    assert not vlads.hints.wait(0)
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)  # AUTO_FIT_PHOTOS
+    assert not vlads.wakeups.wait(0)
     photo_ids += vlads.upload(4)
     vlads.drain()
-    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)
-    assert vlads.hints.wait(0)
-    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # once is enough
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
+    assert vlads.wakeups.wait(0)
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)  # once is enough
     with vlads.catalog.read() as session:
         job_id = session.scalars(select(Job.id).where(Job.kind == JobKind.FIT)).one()
     fit = vlads.finish(job_id)
@@ -317,7 +317,7 @@ def test_no_vocabulary_is_fitted_by_itself_after_a_fit_was_cancelled(vlads: Work
     vlads.upload(1, 2)
     vlads.drain()
     vlads.cancel(vlads.start(JobKind.FIT, clusters=8, sample=100, seed=0))
-    auto_fit_vocabularies(vlads.catalog, vlads.hints, 1)
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 1)
     with vlads.catalog.read() as session:
         assert session.scalar(select(func.count()).where(Job.kind == JobKind.FIT)) == 1
 

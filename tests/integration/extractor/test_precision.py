@@ -39,8 +39,8 @@ def make_set(
 
 
 def row(precision: Precision, number: int) -> Any:
-    recipe = get_extractor_config("test-tiny-avg", allow_test_extractors=True)
-    made = Extractor(recipe, torch.device("cpu"), precision=precision)
+    config = get_extractor_config("test-tiny-avg", allow_test_extractors=True)
+    made = Extractor(config, torch.device("cpu"), precision=precision)
     pixels = decode_photo(photo_bytes(number), made.preprocessing, 10**9).pixels
     return made.describe([pixels], None)[0]
 

@@ -23,8 +23,8 @@ WIDTH = 16  # of the tiny backbone's local features
 
 
 def tiny_features() -> Provenance:
-    recipe = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)
-    return feature_provenance(Extractor(recipe, choose_device("cpu")))
+    config = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)
+    return feature_provenance(Extractor(config, choose_device("cpu")))
 
 
 def vocabulary_file(**provenance: Any) -> bytes:

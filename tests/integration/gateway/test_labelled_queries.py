@@ -79,7 +79,7 @@ def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Workplace) ->
     vlads.drain()
 
     def fits() -> list[str]:
-        auto_fit_vocabularies(vlads.catalog, vlads.hints, auto_fit_photos=3)
+        auto_fit_vocabularies(vlads.catalog, vlads.wakeups, auto_fit_photos=3)
         with vlads.catalog.read() as session:
             return list(session.scalars(select(Job.state).where(Job.kind == JobKind.FIT)))
 

@@ -16,7 +16,7 @@ from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_direct_uploads
+from services.steward.tasks.garbage_collection import collect_presigned_uploads
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.base import db_now_plus
 from shared.catalog.photos import Photo, PresignedUpload
@@ -176,10 +176,10 @@ def test_what_is_sent_after_completing_changes_nothing_and_is_collected(
     service.drain()
     assert service("GET", f"/uploads/{file_id}/image").content == PHOTO
     assert service.json("GET", f"/uploads/{file_id}")["searchable"]
-    collect_direct_uploads(catalog, store)
+    collect_presigned_uploads(catalog, store)
     assert complete(service, upload).status_code == 202, "still known"
     expire(catalog, seconds_ago=2 * 86_400)
-    collect_direct_uploads(catalog, store)
+    collect_presigned_uploads(catalog, store)
     assert keys(store, "incoming/") == set()
     problem(complete(service, upload), 404, "upload_not_found")
     assert service("GET", f"/uploads/{file_id}/image").content == PHOTO
@@ -285,7 +285,7 @@ def test_what_was_not_completed_in_time_is_gone_and_collected(
         )
     problem(complete(service, upload), 410, "upload_expired")
     assert photos(catalog) == 0
-    collect_direct_uploads(catalog, store)
+    collect_presigned_uploads(catalog, store)
     assert keys(store) == {f"incoming/{retained['upload_id']}"}
     problem(complete(service, upload), 404, "upload_not_found")
     assert complete(service, retained).status_code == 202

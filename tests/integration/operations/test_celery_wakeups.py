@@ -13,7 +13,7 @@ import pytest
 from redis import Redis
 from sqlalchemy import func, select
 
-from services.steward.tasks.maintenance import resend_hints
+from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -43,7 +43,7 @@ def own_redis() -> Iterator[RedisServer]:
 
 
 @pytest.fixture
-def hints(own_redis: RedisServer) -> Iterator[CeleryWakeups]:
+def wakeups(own_redis: RedisServer) -> Iterator[CeleryWakeups]:
     settings = Settings(redis_url=own_redis.url)
     made = CeleryWakeups(create_celery_app(settings), settings)
     yield made
@@ -63,9 +63,9 @@ def until(condition) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
-    hints: CeleryWakeups, own_redis: RedisServer
+    wakeups: CeleryWakeups, own_redis: RedisServer
 ) -> None:
-    hints.send(WakeupQueue.QUERY)
+    wakeups.send(WakeupQueue.QUERY)
     until(lambda: waiting(own_redis)[WakeupQueue.QUERY])
     found = waiting(own_redis)
     assert (len(found[WakeupQueue.QUERY]), len(found[WakeupQueue.BULK])) == (1, 0)
@@ -77,10 +77,10 @@ def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
 
 
 def test_a_lane_holds_few_hints_however_many_are_sent(
-    hints: CeleryWakeups, own_redis: RedisServer
+    wakeups: CeleryWakeups, own_redis: RedisServer
 ) -> None:
     for _ in range(3 * MAX_PENDING_WAKEUPS):
-        hints.send()
+        wakeups.send()
         time.sleep(0.02)
     until(lambda: len(waiting(own_redis)[WakeupQueue.BULK]) >= MAX_PENDING_WAKEUPS)
     time.sleep(0.2)
@@ -88,18 +88,18 @@ def test_a_lane_holds_few_hints_however_many_are_sent(
 
 
 def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
-    hints: CeleryWakeups, own_redis: RedisServer
+    wakeups: CeleryWakeups, own_redis: RedisServer
 ) -> None:
     assert own_redis.process is not None
     own_redis.process.kill()
     begun = time.monotonic()
     for _ in range(100):
-        hints.send()
+        wakeups.send()
     assert time.monotonic() - begun < 1.0
     own_redis.process.start()
 
     def arrived() -> bool:
-        hints.send()
+        wakeups.send()
         return bool(waiting(own_redis)[WakeupQueue.BULK])
 
     until(arrived)
@@ -164,7 +164,7 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    hints: CeleryWakeups,
+    wakeups: CeleryWakeups,
     own_redis: RedisServer,
     extractor: Extractor,
 ) -> None:
@@ -181,14 +181,14 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
     put(20)
     ask(catalog_on_postgres, store, map_id, photo_bytes(3))
     for lane in WakeupQueue:
-        hints.send(lane)
-        hints.send(lane)  # two of one are harmless
+        wakeups.send(lane)
+        wakeups.send(lane)  # two of one are harmless
     until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 41})
 
     put(5)
     with Redis.from_url(own_redis.url) as client:
         client.flushall()
-    resend_hints(catalog_on_postgres, hints)  # the steward's duty
+    resend_wakeups(catalog_on_postgres, wakeups)  # the steward's duty
     until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 46})
 
     extractor.process.terminate()

@@ -15,7 +15,7 @@ from services.steward.tasks.garbage_collection import (
     collect_ended_generations,
     collect_garbage,
 )
-from services.steward.tasks.maintenance import resend_hints
+from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog.base import db_now_plus
 from shared.catalog.generations import GenerationState
 from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
@@ -96,7 +96,7 @@ def test_each_duty_is_done_by_the_loop(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One round does everything once: each duty leaves its trace."""
-    hints = InProcessWakeups()
+    wakeups = InProcessWakeups()
     soon = settings.model_copy(
         update={"compact_chunks": 2, "orphan_age_seconds": 0.0, "auto_fit_photos": 1}
     )
@@ -125,14 +125,14 @@ def test_each_duty_is_done_by_the_loop(
         session.add(forgotten)
         session.flush()
     chunk_map.store.put(incoming_key(forgotten.id), b"never completed")
-    steward = Scheduler(chunk_map.catalog, chunk_map.store, hints, soon)
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, wakeups, soon)
     stop = threading.Event()
     steward.tasks.append(PeriodicTask("stop", 0.0, stop.set))
     steward.run(stop)
     assert chunk_map.live() == [(0, 2)]
     assert chunk_map.objects("originals/") == set()
     assert chunk_map.objects("incoming/") == set()
-    assert hints.wait(0)
+    assert wakeups.wait(0)
     chunk_map.check_rows(retained)
     with chunk_map.catalog.read() as session:
         assert session.scalars(select(IdempotencyRecord.id)).all() == []
@@ -143,19 +143,19 @@ def test_each_duty_is_done_by_the_loop(
 
 
 def test_a_lost_hint_is_sent_again_while_there_is_work(chunk_map: ChunkMap) -> None:
-    hints = InProcessWakeups()
-    resend_hints(chunk_map.catalog, hints)
-    assert not hints.wait(0)
+    wakeups = InProcessWakeups()
+    resend_wakeups(chunk_map.catalog, wakeups)
+    assert not wakeups.wait(0)
     add_one_job(chunk_map, JobKind.INDEX, waiting_for="vocabulary")
     add_one_job(chunk_map, JobKind.INDEX, run_after=db_now_plus(60))
-    resend_hints(chunk_map.catalog, hints)
-    assert not hints.wait(0)  # no worker could do anything
+    resend_wakeups(chunk_map.catalog, wakeups)
+    assert not wakeups.wait(0)  # no worker could do anything
     add_one_job(chunk_map, JobKind.INDEX)
-    resend_hints(chunk_map.catalog, hints)
-    assert hints.wait(0)
+    resend_wakeups(chunk_map.catalog, wakeups)
+    assert wakeups.wait(0)
     take(chunk_map.catalog)
-    resend_hints(chunk_map.catalog, hints)
-    assert not hints.wait(0)
+    resend_wakeups(chunk_map.catalog, wakeups)
+    assert not wakeups.wait(0)
 
 
 def test_jobs_of_an_abandoned_generation_vanish_after_the_grace(

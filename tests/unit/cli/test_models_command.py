@@ -121,15 +121,15 @@ def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
     assert "these look like the weights of dinov2-vits14" in other["note"]
 
     read: list[Path] = []
-    recipe = next(r for r in weights_here.list_recipes(Settings()) if r.name == VITS)
+    config = next(r for r in weights_here.list_extractor_configs(Settings()) if r.name == VITS)
     assert (
-        weights_here.inspect_weights(recipe, Settings(), read.append).fingerprint
+        weights_here.inspect_weights(config, Settings(), read.append).fingerprint
         == found["fingerprint"]
     )
     assert read == [], "it is known by now"
     save({name: 2 * tensor for name, tensor in weights.items()}, file)
     assert (
-        weights_here.inspect_weights(recipe, Settings(), read.append).fingerprint
+        weights_here.inspect_weights(config, Settings(), read.append).fingerprint
         != found["fingerprint"]
     )
     assert read == [file]

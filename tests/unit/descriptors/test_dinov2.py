@@ -207,18 +207,18 @@ def test_timm_would_resample_positions_otherwise() -> None:
 
 
 @pytest.mark.parametrize("size", SHAPES)
-def test_shapes_are_those_of_timms_networks_and_of_the_recipes(size: str) -> None:
+def test_shapes_are_those_of_timms_networks_and_of_the_configurations(size: str) -> None:
     import timm
 
-    shape, recipe = SHAPES[size], EXTRACTOR_CONFIGS[f"anyloc-{size}"]
-    assert (shape.depth, shape.width) == (recipe.depth, recipe.width)
+    shape, config = SHAPES[size], EXTRACTOR_CONFIGS[f"anyloc-{size}"]
+    assert (shape.depth, shape.width) == (config.depth, config.width)
     with torch.device("meta"):
         network: Any = timm.create_model(shape.timm_name, pretrained=False)
         assert len(network.blocks) == shape.depth
         assert network.embed_dim == shape.width
         assert network.blocks[0].attn.num_heads == shape.heads
         parameters = sum(tensor.numel() for tensor in network.parameters())
-        assert parameters <= recipe.parameters < 1.01 * parameters
+        assert parameters <= config.parameters < 1.01 * parameters
         assert network.pos_embed.shape == (1, 1 + SIDE * SIDE, shape.width)
     assert network.pretrained_cfg["mean"] == (0.485, 0.456, 0.406)
     assert network.pretrained_cfg["std"] == (0.229, 0.224, 0.225)

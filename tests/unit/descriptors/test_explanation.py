@@ -40,33 +40,33 @@ def centres() -> ClusterCentres:
 
 
 def described(
-    recipe: ExtractorConfig, photo: torch.Tensor, centres: ClusterCentres
+    config: ExtractorConfig, photo: torch.Tensor, centres: ClusterCentres
 ) -> torch.Tensor:
     c = torch.from_numpy(centres.array)
-    if recipe.aggregator == "avg":
+    if config.aggregator == "avg":
         return average_pooling(photo[None])[0]
-    if recipe.aggregator == "vlad":
+    if config.aggregator == "vlad":
         return vlad(photo[None], c)[0]
-    return soft_vlad(photo[None], c, recipe.temperature)[0]
+    return soft_vlad(photo[None], c, config.temperature)[0]
 
 
-@pytest.mark.parametrize("recipe", [VLAD, SOFT, MEAN], ids=lambda recipe: recipe.aggregator)
+@pytest.mark.parametrize("config", [VLAD, SOFT, MEAN], ids=lambda config: config.aggregator)
 def test_shares_of_patches_and_of_clusters_add_up_to_the_cosine(
-    recipe: ExtractorConfig, centres: ClusterCentres
+    config: ExtractorConfig, centres: ClusterCentres
 ) -> None:
     query = features(1)
     query[5] = 0  # a patch without direction
-    rows = torch.stack([described(recipe, features(seed), centres) for seed in (2, 3, 4)])
-    cosines = (rows @ described(recipe, query, centres)).numpy()
+    rows = torch.stack([described(config, features(seed), centres) for seed in (2, 3, 4)])
+    cosines = (rows @ described(config, query, centres)).numpy()
     found = explain_similarities(
-        recipe, query, centres if recipe.needs_vocabulary else None, rows.numpy()
+        config, query, centres if config.needs_vocabulary else None, rows.numpy()
     )
     assert len(found) == len(cosines)
     for shares, cosine in zip(found, cosines, strict=True):
         assert shares.patches.shape == (PATCHES,)
         assert shares.patches.sum() == pytest.approx(cosine, abs=2e-6)
         assert shares.patches[5] == 0
-        if recipe.needs_vocabulary:
+        if config.needs_vocabulary:
             assert shares.clusters is not None
             assert shares.clusters.shape == (CLUSTERS,)
             assert shares.clusters.sum() == pytest.approx(cosine, abs=2e-6)
@@ -81,14 +81,14 @@ def test_share_of_a_cluster_is_the_product_of_its_two_blocks(centres: ClusterCen
     assert shares.clusters == pytest.approx(blocks.numpy(), abs=1e-6)
 
 
-@pytest.mark.parametrize("recipe", [VLAD, SOFT], ids=lambda recipe: recipe.aggregator)
+@pytest.mark.parametrize("config", [VLAD, SOFT], ids=lambda config: config.aggregator)
 def test_weighted_shares_add_up_to_the_weighted_score(
-    recipe: ExtractorConfig, centres: ClusterCentres
+    config: ExtractorConfig, centres: ClusterCentres
 ) -> None:
     words = (0.0, 2.0, 0.5, 1.0, 0.0, 3.0, 0.1)
-    query, other = (described(recipe, features(seed), centres) for seed in (1, 2))
+    query, other = (described(config, features(seed), centres) for seed in (1, 2))
     weighted = normalize(query * torch.tensor(words).repeat_interleave(WIDTH), dim=0)
-    (shares,) = explain_similarities(recipe, features(1), centres, other[None].numpy(), words)
+    (shares,) = explain_similarities(config, features(1), centres, other[None].numpy(), words)
     assert shares.clusters is not None
     assert shares.clusters[[0, 4]].tolist() == [0, 0]
     for kind in (shares.clusters, shares.patches):

@@ -138,7 +138,7 @@ AGGREGATIONS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = 
 def test_the_aggregator_of_the_name_is_at_work(options: str) -> None:
     made = chosen(options)
     array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
-    centres = parse_centres(array) if made.recipe.needs_vocabulary else None
+    centres = parse_centres(array) if made.config.needs_vocabulary else None
     photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
     expected = AGGREGATIONS[options](made.features(photos), torch.from_numpy(array))
     assert np.array_equal(made.describe(photos, centres), expected.numpy())
@@ -151,7 +151,7 @@ def test_features_that_are_not_finite_make_a_row_of_nan_and_harm_no_other(
 ) -> None:
     made = chosen(options)
     array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
-    centres = parse_centres(array) if made.recipe.needs_vocabulary else None
+    centres = parse_centres(array) if made.config.needs_vocabulary else None
     photos = np.random.default_rng(3).integers(0, 256, (3, 32, 32, 3), dtype=np.uint8)
     sound = made.describe(photos, centres)
     features = made.features(photos).clone()

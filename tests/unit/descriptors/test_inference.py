@@ -44,10 +44,10 @@ class SmallGpu(TinyBackbone):
 
 
 def on(backbone: SmallGpu, limit: BatchSizeLimit | None = None) -> Extractor:
-    recipe = get_extractor_config(
+    config = get_extractor_config(
         "test-tiny-vlad:aggregator=avg,preprocessing=square224", allow_test_extractors=True
     )
-    return Extractor(recipe, CPU, backbone=backbone, limit=limit)
+    return Extractor(config, CPU, backbone=backbone, limit=limit)
 
 
 def photos(count: int, side: int = SIDE) -> list[NDArray[np.uint8]]:
@@ -133,8 +133,8 @@ def test_models_are_warmed_up_on_a_gpu_when_they_are_loaded(
     asked: list[int] = []
 
     class Loaded(Extractor):
-        def __init__(self, recipe: Any, _device: torch.device, **options: Any) -> None:
-            super().__init__(recipe, CPU, **options)
+        def __init__(self, config: Any, _device: torch.device, **options: Any) -> None:
+            super().__init__(config, CPU, **options)
 
         def warm_up(self, photos: int) -> None:
             asked.append(photos)

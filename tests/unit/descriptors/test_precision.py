@@ -32,8 +32,8 @@ def small_vit(shape: VitShape, folder: Path) -> Extractor:
     """A small network with random weights under the name of a large one."""
     file = save(random_weights(shape), folder / "weights.pth")
     backbone = Dinov2("vits14", shape.depth - 1, "value", CPU, file, shape=shape)
-    recipe = replace(EXTRACTOR_CONFIGS["anyloc-vits14"], width=shape.width)
-    return Extractor(recipe, CPU, backbone=backbone)
+    config = replace(EXTRACTOR_CONFIGS["anyloc-vits14"], width=shape.width)
+    return Extractor(config, CPU, backbone=backbone)
 
 
 @pytest.fixture(params=["plain", "swiglu"])
@@ -65,9 +65,9 @@ def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
     assert choose_precision("auto", dino, CPU) == "float32"
     assert choose_precision("auto", convolutions, CUDA) == "float32"
     assert choose_precision("auto", theirs, CUDA) == "float32"
-    for recipe in (dino, convolutions, theirs):
+    for config in (dino, convolutions, theirs):
         for asked in PRECISIONS:
-            assert {choose_precision(asked, recipe, device) for device in (CPU, CUDA)} == {asked}
+            assert {choose_precision(asked, config, device) for device in (CPU, CUDA)} == {asked}
 
 
 def test_spec_tells_precisions_apart_and_single_means_what_it_meant() -> None:

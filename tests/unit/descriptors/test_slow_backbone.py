@@ -17,8 +17,8 @@ WIDTHS = (16, 7168, 98_304)
 
 
 def extractor(options: str) -> Extractor:
-    recipe = get_extractor_config(f"test-slow-avg:{options}", allow_test_extractors=True)
-    return Extractor(recipe, torch.device("cpu"))
+    config = get_extractor_config(f"test-slow-avg:{options}", allow_test_extractors=True)
+    return Extractor(config, torch.device("cpu"))
 
 
 def pixels_of(made: Extractor, numbers: range) -> NDArray[np.uint8]:

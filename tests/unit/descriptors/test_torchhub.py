@@ -38,8 +38,8 @@ def torch_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def extractor(folder: Path, entry: str) -> Extractor:
-    recipe = get_extractor_config(f"torchhub:{folder}:{entry}", allow_test_extractors=False)
-    return Extractor(recipe, CPU)
+    config = get_extractor_config(f"torchhub:{folder}:{entry}", allow_test_extractors=False)
+    return Extractor(config, CPU)
 
 
 def refusal(folder: Path, entry: str, code: str = "torchhub_unfit") -> str:
@@ -255,12 +255,12 @@ def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
     monkeypatch.setattr(torchhub_code, "GITHUB", "http://127.0.0.1:9")
     monkeypatch.setattr("shared.descriptors.weight_files.RETRY_PAUSE_SECONDS", 0)
     name = f"torchhub:somebody/places@{COMMIT}:colours"
-    recipe = get_extractor_config(name, allow_test_extractors=False)
+    config = get_extractor_config(name, allow_test_extractors=False)
     with pytest.raises(Misconfigured) as caught:
-        Extractor(recipe, CPU)
+        Extractor(config, CPU)
     assert caught.value.code == "weights_missing"
     shutil.copytree(folder, torch_home / f"somebody_places_{COMMIT}")
-    found = Extractor(recipe, CPU)
+    found = Extractor(config, CPU)
     assert found.backbone.card["source"] == f"somebody/places@{COMMIT}"
     assert isinstance(found.backbone, TorchHubBackbone)
     assert found.spec(None)["code_fingerprint"] == torchhub_code.code_fingerprint(folder)

@@ -30,7 +30,7 @@ def test_extractors_that_differ_in_what_follows_the_backbone_share_it(
 ) -> None:
     vlad, average = models.extractor("test-tiny-vlad:clusters=3"), models.extractor("test-tiny-avg")
     assert average.backbone is vlad.backbone
-    assert (vlad.recipe.clusters, average.recipe.aggregator) == (3, "avg")
+    assert (vlad.config.clusters, average.config.aggregator) == (3, "avg")
 
 
 def test_extractors_used_least_lately_are_let_go(models: ModelRegistry) -> None:

@@ -70,9 +70,9 @@ def test_arguments_have_the_types_that_they_look_like(written: str, value: objec
     ],
 )
 def test_one_network_has_one_name(written: str, canonical: str) -> None:
-    recipe = get_extractor_config(f"{REPOSITORY}:{written}", allow_test_extractors=False)
-    assert recipe.name == f"{REPOSITORY}:{canonical}".rstrip(":")
-    assert get_extractor_config(recipe.name, allow_test_extractors=False) == recipe
+    config = get_extractor_config(f"{REPOSITORY}:{written}", allow_test_extractors=False)
+    assert config.name == f"{REPOSITORY}:{canonical}".rstrip(":")
+    assert get_extractor_config(config.name, allow_test_extractors=False) == config
 
 
 @pytest.mark.parametrize("pin", ["", "@main", "@v1.0", f"@{COMMIT[:39]}", f"@{COMMIT}0"])

@@ -31,11 +31,11 @@ def test_what_is_neither_is_refused(name: str) -> None:
 
 
 def test_only_the_loaded_model_tells_how_photos_are_brought_to_size() -> None:
-    recipe = get_extractor_config("gsv:walks", allow_test_extractors=False)
-    assert (recipe.name, recipe.aggregator) == ("gsv:walks", "none")
-    assert (recipe.width, recipe.dimension, recipe.preprocessing) == (None, None, None)
+    config = get_extractor_config("gsv:walks", allow_test_extractors=False)
+    assert (config.name, config.aggregator) == ("gsv:walks", "none")
+    assert (config.width, config.dimension, config.preprocessing) == (None, None, None)
     other = get_extractor_config("gsv:nights", allow_test_extractors=False)
-    assert recipe.local_features != other.local_features
+    assert config.local_features != other.local_features
 
 
 def test_maps_use_models_that_were_added_and_no_files(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""What can be compared is known from the recipe and the spec, before anything is queued."""
+"""What can be compared is known from the configuration and the spec, before anything is queued."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def spec(dimension: int, clusters: int | None) -> dict[str, Any]:
     return {"dimension": dimension, "clusters": clusters}
 
 
-def recipe_of(name: str) -> Any:
+def config_of(name: str) -> Any:
     return get_extractor_config(name, allow_test_extractors=True)
 
 
@@ -34,8 +34,8 @@ def recipe_of(name: str) -> Any:
 def test_sums_over_patches_can_be_explained(
     name: str, of_generation: dict[str, Any] | None
 ) -> None:
-    check_explainable(recipe_of(name), of_generation)
-    check_rerankable(recipe_of(name))
+    check_explainable(config_of(name), of_generation)
+    check_rerankable(config_of(name))
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,12 @@ def test_what_is_no_sum_over_patches_says_why(
     name: str, of_generation: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(Unprocessable, match=why) as refused:
-        check_explainable(recipe_of(name), of_generation)
+        check_explainable(config_of(name), of_generation)
     assert refused.value.code == "not_explainable"
 
 
 def test_one_feature_of_a_photo_can_t_be_reranked() -> None:
     with pytest.raises(Unprocessable, match="compares patches") as refused:
-        check_rerankable(recipe_of(HUB))
+        check_rerankable(config_of(HUB))
     assert refused.value.code == "not_rerankable"
-    check_rerankable(recipe_of(f"{VITB}:aggregator=gem"))
+    check_rerankable(config_of(f"{VITB}:aggregator=gem"))

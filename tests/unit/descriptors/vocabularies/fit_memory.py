@@ -53,8 +53,8 @@ class ManyPatches:
 
 def main(photos: int) -> None:
     torch.set_num_threads(1)
-    recipe = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
-    extractor = Extractor(recipe, torch.device("cpu"), backbone=ManyPatches())
+    config = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
+    extractor = Extractor(config, torch.device("cpu"), backbone=ManyPatches())
     blank = np.zeros((8, 8, 3), np.uint8)
 
     def batches() -> Iterator[list[NDArray[np.uint8]]]:

@@ -21,14 +21,14 @@ from shared.imaging.preprocessing import PREPROCESSINGS as IN_VISION
 ANYLOC_OPTIONS = "Its options: aggregator, clusters, facet, layer, preprocessing."
 
 
-def recipe(name: str) -> ExtractorConfig:
+def config(name: str) -> ExtractorConfig:
     return get_extractor_config(name, allow_test_extractors=False)
 
 
 def refusal(name: str, code: str) -> str:
     """The detail with which the name is refused."""
     with pytest.raises(Misconfigured) as caught:
-        recipe(name)
+        config(name)
     assert caught.value.code == code
     return caught.value.detail
 
@@ -60,20 +60,20 @@ def test_unknown_extractor_names_the_known_but_not_those_for_tests(name: str) ->
 def test_anyloc_takes_the_value_facet_of_its_authors_layer(
     name: str, layer: int, dimension: int
 ) -> None:
-    found = recipe(name)
+    found = config(name)
     assert (found.layer, found.facet, found.dimension) == (layer, "value", dimension)
     assert found.needs_vocabulary
     assert found.shipped_vocabulary is None
 
 
 def test_dimension_follows_the_clusters_of_vlad_only() -> None:
-    assert recipe("efficientnet-lite0-vlad").dimension == 7168
-    assert recipe("efficientnet-lite0-vlad:clusters=8").dimension == 8 * 112
+    assert config("efficientnet-lite0-vlad").dimension == 7168
+    assert config("efficientnet-lite0-vlad:clusters=8").dimension == 8 * 112
     assert EXTRACTOR_CONFIGS["test-tiny-avg"].dimension == 16
 
 
 def test_options_are_taken() -> None:
-    found = recipe("anyloc-vitb14:layer=9,facet=key,clusters=32")
+    found = config("anyloc-vitb14:layer=9,facet=key,clusters=32")
     assert (found.layer, found.facet, found.clusters) == (9, "key", 32)
     assert found.dimension == 32 * 768
     assert found.backbone == "dinov2-vitb14"
@@ -104,9 +104,9 @@ def test_options_are_taken() -> None:
     ],
 )
 def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
-    found = recipe(written)
+    found = config(written)
     assert found.name == ("anyloc-vitb14:" + canonical).rstrip(":")
-    assert recipe(found.name) == found
+    assert config(found.name) == found
 
 
 @pytest.mark.parametrize(
@@ -155,8 +155,8 @@ def test_slow_extractor_takes_its_time_and_width_from_its_name() -> None:
     assert found.name == "test-slow-avg:milliseconds=500,width=98304"
     assert (found.milliseconds, found.dimension) == (500, 98_304)
     for other in ("test-slow-avg", "test-slow-avg:width=98304", "test-slow-avg:milliseconds=500"):
-        recipe = get_extractor_config(other, allow_test_extractors=True)
-        assert recipe.local_features != found.local_features
+        config = get_extractor_config(other, allow_test_extractors=True)
+        assert config.local_features != found.local_features
 
 
 @pytest.mark.parametrize("option", ["width=15", "width=131073", "milliseconds=60001"])
@@ -166,17 +166,17 @@ def test_slow_extractor_says_what_it_can_do(option: str) -> None:
 
 
 def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> None:
-    own = recipe("efficientnet-lite0-vlad")
+    own = config("efficientnet-lite0-vlad")
     assert own.shipped_vocabulary is not None
-    assert recipe("efficientnet-lite0-vlad:clusters=8").shipped_vocabulary == own.shipped_vocabulary
+    assert config("efficientnet-lite0-vlad:clusters=8").shipped_vocabulary == own.shipped_vocabulary
 
 
 def test_aggregators_without_a_vocabulary_have_the_length_of_a_local_feature() -> None:
     for aggregator in ("gem", "avg"):
-        found = recipe(f"efficientnet-lite0-vlad:aggregator={aggregator}")
+        found = config(f"efficientnet-lite0-vlad:aggregator={aggregator}")
         assert (found.dimension, found.needs_vocabulary) == (112, False)
         assert found.shipped_vocabulary is None
-    soft = recipe("efficientnet-lite0-vlad:aggregator=soft-vlad")
+    soft = config("efficientnet-lite0-vlad:aggregator=soft-vlad")
     assert (soft.dimension, soft.needs_vocabulary) == (7168, True)
     assert soft.shipped_vocabulary is not None
 
@@ -196,11 +196,11 @@ def test_preprocessings_are_those_that_vision_has() -> None:
 
 
 def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
-    own = recipe("anyloc-vitb14").local_features
+    own = config("anyloc-vitb14").local_features
     for option in ("clusters=8", "aggregator=gem", "preprocessing=demo1024"):
-        assert recipe(f"anyloc-vitb14:{option}").local_features == own
+        assert config(f"anyloc-vitb14:{option}").local_features == own
     for other in ("anyloc-vitb14:layer=9", "anyloc-vitb14:facet=key", "anyloc-vits14"):
-        assert recipe(other).local_features != own
+        assert config(other).local_features != own
 
 
 def test_extractors_are_chosen_without_torch() -> None:
