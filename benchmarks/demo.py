@@ -52,6 +52,7 @@ class QueryOutcome:
 
     @property
     def right(self) -> bool:
+        """Whether the estimated location is within CORRECT_WITHIN_M of the ground truth."""
         return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
 
 
@@ -136,18 +137,18 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
     sheet = Image.new("RGB", (width, rows * block + GAP), "white")
     pen = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=14)
-    for number, answer in enumerate(chosen):
+    for number, outcome in enumerate(chosen):
         left = GAP + number % COLUMNS * (CELL[0] + GAP)
         top = GAP + number // COLUMNS * block
-        frame = OUT_OF_MAP_COLOUR if answer.estimate.in_map is False else WRONG_COLOUR
-        frame = CORRECT_COLOUR if answer.best_is_correct and frame == WRONG_COLOUR else frame
-        _paste(sheet, answer.query, left, top)
+        frame = OUT_OF_MAP_COLOUR if outcome.estimate.in_map is False else WRONG_COLOUR
+        frame = CORRECT_COLOUR if outcome.best_is_correct and frame == WRONG_COLOUR else frame
+        _paste(sheet, outcome.query, left, top)
         pen.text((left, top + CELL[1] + 2), "query", fill="black", font=font)
         below = top + CELL[1] + CAPTION
         right, bottom = left + CELL[0], below + CELL[1]
         pen.rectangle((left - EDGE, below - EDGE, right + EDGE, bottom + EDGE), frame)
-        _paste(sheet, database / answer.best, left, below)
-        pen.text((left, below + CELL[1] + EDGE), _caption(answer), fill=frame, font=font)
+        _paste(sheet, database / outcome.best, left, below)
+        pen.text((left, below + CELL[1] + EDGE), _caption(outcome), fill=frame, font=font)
     target.parent.mkdir(parents=True, exist_ok=True)
     sheet.save(target, quality=85)
 
@@ -166,12 +167,12 @@ def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
     return [outcome for group in chosen for outcome in group][: 2 * COLUMNS]
 
 
-def _caption(answer: QueryOutcome) -> str:
-    if answer.estimate.in_map is False:
-        return "not in this map" + (" (it is)" if answer.in_map else "")
-    sure = answer.estimate.confidence
-    error = f"{answer.error_m:.0f} m off" if answer.error_m is not None else "no place"
-    return error if sure is None else f"{error}, {sure:.0%} sure"
+def _caption(outcome: QueryOutcome) -> str:
+    if outcome.estimate.in_map is False:
+        return "not in this map" + (" (it is)" if outcome.in_map else "")
+    confidence = outcome.estimate.confidence
+    error = f"{outcome.error_m:.0f} m off" if outcome.error_m is not None else "no place"
+    return error if confidence is None else f"{error}, {confidence:.0%} sure"
 
 
 def _paste(sheet: Image.Image, path: Path, left: int, top: int) -> None:
@@ -182,13 +183,13 @@ def _paste(sheet: Image.Image, path: Path, left: int, top: int) -> None:
 def main() -> None:
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    options = _arguments()
+    options = _parse_arguments()
     from services.cli.client import connect
     from services.cli.output import progress_bar
 
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
-        os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo evaluates when it wants to print
+        os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
         city = Path(folder, "city")
         generate_city(
             CityOptions(
@@ -213,7 +214,7 @@ def main() -> None:
             print(f"Queries and their matches: {options.picture}")
 
 
-def _arguments() -> argparse.Namespace:
+def _parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Index and query a generated city.")
     parser.add_argument("--places", type=int, default=300)
     parser.add_argument("--views", type=int, default=3, help="database photos per place")
@@ -245,9 +246,9 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
         if vocabulary == "own":
             fit_and_wait(client, {}, progress)
         job = wait_for_job(client, client.evaluate(), progress, "evaluating")
-        found = (job.result or {})["labelled_queries"]
-        shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
-        print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
+        metrics = (job.result or {})["labelled_queries"]
+        shares = " / ".join(f"{metrics[f'R@{k}']:.1%}" for k in (1, 5, 10))
+        print(f"  {vocabulary:7s} vocabulary  {shares}  ({metrics['queries']} queries)")
     bar = progress.add_task("querying", total=len(queries[1::2]))
     outcomes = []
     for query in queries[1::2]:

@@ -66,19 +66,19 @@ def measure(
         fleet.start()
         first = upload_all(caller.url, multipart_forms(photos, TEXTURES), 4)
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
-        _time_query(caller, photos[0])  # connections, and the query's own way
+        _time_query(caller, photos[0])  # opens connections and loads what only queries need
         _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
         since = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("searching", total=seconds)
-        moments = random.Random(SEED)
+        rng = random.Random(SEED)
         pause = 2 * milliseconds * batch / 1000
-        took: list[float] = []
+        latencies: list[float] = []
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             progress.update(bar, completed=seconds - left)
-            time.sleep(moments.uniform(0, pause))
-            took.append(_time_query(caller, moments.choice(photos)))
-        stages = _stage_seconds(fleet, took)
+            time.sleep(rng.uniform(0, pause))
+            latencies.append(_time_query(caller, rng.choice(photos)))
+        stages = _stage_seconds(fleet, latencies)
         periods = _batch_seconds(fleet, since, batch)
         report.add(
             "uploads still waiting at the end",
@@ -87,12 +87,12 @@ def measure(
         )
         report.add("services that crashed", len(fleet.crashed), at_most=0)
     batch_ms = 1000 * statistics.median(periods)
-    report.add("queries", len(took))
+    report.add("queries", len(latencies))
     report.add("a batch, p50", batch_ms, "ms")
-    report.add_latency("query", took, worst_at_most_ms=batch_ms + TARGET_MS_ABOVE_BATCH)
-    for stage, found in stages.items():
-        report.add_latency(stage, found)
-    report.details = {"seconds": took, "stages": stages, "batch_seconds": periods}
+    report.add_latency("query", latencies, worst_at_most_ms=batch_ms + TARGET_MS_ABOVE_BATCH)
+    for stage, durations in stages.items():
+        report.add_latency(stage, durations)
+    report.details = {"seconds": latencies, "stages": stages, "batch_seconds": periods}
     return report
 
 
@@ -101,9 +101,9 @@ def _time_query(caller: HttpCaller, photo: bytes) -> float:
     form = multipart_form(photo)
     sent_at = time.perf_counter()
     answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
-    took = time.perf_counter() - sent_at
+    seconds = time.perf_counter() - sent_at
     assert answer.status == 200, answer.body
-    return took
+    return seconds
 
 
 def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
@@ -175,32 +175,35 @@ def _batch_seconds(fleet: Fleet, since: datetime, batch: int) -> list[float]:
                 Job.kind == JobKind.DESCRIBE, Job.state == JobState.SUCCEEDED
             )
         ).all()
-    found = [
+    durations = [
         (after - before).total_seconds()
         for before, after in itertools.pairwise(commits)
         if not any(at is not None and before < at < after for at in queries)
     ]
-    assert found, "no batch came without a query between: query less often"
-    return found
+    assert durations, "no batch came without a query between: query less often"
+    return durations
 
 
-def _stage_seconds(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
+def _stage_seconds(fleet: Fleet, latencies: Sequence[float]) -> dict[str, list[float]]:
     """Return the time of each query by stage, from the job table."""
     with fleet.catalog.read() as session:
         jobs = session.scalars(
-            select(Job).where(Job.kind == JobKind.DESCRIBE).order_by(Job.id.desc()).limit(len(took))
+            select(Job)
+            .where(Job.kind == JobKind.DESCRIBE)
+            .order_by(Job.id.desc())
+            .limit(len(latencies))
         ).all()
-    found: dict[str, list[float]] = {
+    by_stage: dict[str, list[float]] = {
         "waiting for a worker": [],
         "at the worker": [],
         "gateway, store and search": [],
     }
-    for job, seconds in zip(reversed(jobs), took, strict=True):
+    for job, seconds in zip(reversed(jobs), latencies, strict=True):
         assert job.started_at is not None
         assert job.finished_at is not None
         waited = (job.started_at - job.created_at).total_seconds()
         worked = (job.finished_at - job.started_at).total_seconds()
-        found["waiting for a worker"].append(waited)
-        found["at the worker"].append(worked)
-        found["gateway, store and search"].append(seconds - waited - worked)
-    return found
+        by_stage["waiting for a worker"].append(waited)
+        by_stage["at the worker"].append(worked)
+        by_stage["gateway, store and search"].append(seconds - waited - worked)
+    return by_stage

@@ -120,13 +120,13 @@ def _describe_photos(
     features: list[LocalFeatures] = []
     rows: dict[str, list[Rows]] = {name: [] for name in centres}
     for pixels in _batches(extractor, paths):
-        made = extractor.local_features(pixels)
-        for photo, one in zip(pixels, made, strict=True):
+        features_of_batch = extractor.local_features(pixels)
+        for photo, one in zip(pixels, features_of_batch, strict=True):
             features.append(
                 LocalFeatures.from_features(one, extractor.backbone.grid(*photo.shape[:2]))
             )
         for name, of_vocabulary in centres.items():
-            rows[name].append(vlad(torch.stack(made), of_vocabulary).numpy())
+            rows[name].append(vlad(torch.stack(features_of_batch), of_vocabulary).numpy())
         advance(len(pixels))
     return DescribedPhotos(features, {name: np.concatenate(parts) for name, parts in rows.items()})
 
@@ -144,13 +144,13 @@ def _report_city(
         queries.rows[vocabulary], database.rows[vocabulary], max(RERANK_DEPTHS)
     )
     scores = np.empty(ranked.shape)
-    took = []
+    durations = []
     for query in range(len(ranked)):
         started = time.process_time()
         scores[query] = _rerank_scores(
             extractor, queries, query, database, ranked[query], vocabulary
         )
-        took.append((time.process_time() - started) / ranked.shape[1])
+        durations.append((time.process_time() - started) / ranked.shape[1])
         advance()
     for depth in (0, *RERANK_DEPTHS):
         shares = recall_at_k(_apply_rerank(ranked, scores, depth), positives, KS)
@@ -159,7 +159,7 @@ def _report_city(
             report.add(f"R@{k}, {vocabulary} vocabulary, {how}", 100 * share, "%")
     for depth in RERANK_DEPTHS:
         report.add(
-            f"comparing {depth} photos, {vocabulary}, median", median(took) * depth, "s of CPU"
+            f"comparing {depth} photos, {vocabulary}, median", median(durations) * depth, "s of CPU"
         )
 
 
@@ -188,13 +188,13 @@ def _apply_rerank(ranked: Indices, scores: NDArray[np.float64], depth: int) -> I
 
 def _time_features(extractor: Extractor, paths: Sequence[Path]) -> float:
     """Return the seconds of one core for reading, decoding and the network, per photo."""
-    took = []
+    durations = []
     for _ in range(TIMING_ROUNDS):
         started = time.process_time()
         for pixels in _batches(extractor, paths):
             extractor.local_features(pixels)
-        took.append((time.process_time() - started) / len(paths))
-    return median(took)
+        durations.append((time.process_time() - started) / len(paths))
+    return median(durations)
 
 
 def _report_real_photos(report: Report, extractor: Extractor, folder: Path) -> None:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import time
+import warnings
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,6 +18,7 @@ from uuid import UUID
 
 from placewise.answers import (
     AddedModel,
+    Answer,
     BatchItem,
     BatchStarted,
     CreatedKey,
@@ -451,6 +454,39 @@ class AsyncClient(AsyncTransport):
     async def revoke_key(self, key_id: Id) -> Key:
         """Revoke an API key (admin only)."""
         return Key(**await self._call("DELETE", f"/keys/{key_id}"))
+
+    @property
+    def raw(self) -> AsyncRawClient:
+        """Deprecated: the calls of this client with the API's JSON instead of typed responses."""
+        warnings.warn(
+            "`raw` will be removed in the next release: use `as_json()` of the typed responses.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return AsyncRawClient(self)
+
+
+class AsyncRawClient:
+    """Calls the methods of a client and returns dictionaries, and lists instead of iterators."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        self._client = client
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        method = getattr(self._client, name)
+
+        async def call(*args: Any, **kwargs: Any) -> Any:
+            if inspect.isasyncgenfunction(method):
+                return [_to_json(answer) async for answer in method(*args, **kwargs)]
+            return _to_json(await method(*args, **kwargs))
+
+        return call
+
+
+def _to_json(answer: Any) -> Any:
+    if isinstance(answer, list):
+        return [_to_json(item) for item in answer]
+    return answer.as_json() if isinstance(answer, Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

@@ -6,7 +6,9 @@ Generated from `async_client.py` by `make client`. Edit that file.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +17,7 @@ from uuid import UUID
 
 from placewise.answers import (
     AddedModel,
+    Answer,
     BatchItem,
     BatchStarted,
     CreatedKey,
@@ -263,7 +266,10 @@ class Client(Transport):
         return Job(**self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
     def retry(self, work: Work) -> Job:
-        """Queue a failed job again; for a batch, its failed items."""
+        """Queue a failed or cancelled job again.
+
+        For a batch: its failed and cancelled items whose bytes are still stored.
+        """
         return Job(**self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
     def photo(self, file_id: Id) -> OnePhoto:
@@ -443,6 +449,39 @@ class Client(Transport):
     def revoke_key(self, key_id: Id) -> Key:
         """Revoke an API key (admin only)."""
         return Key(**self._call("DELETE", f"/keys/{key_id}"))
+
+    @property
+    def raw(self) -> RawClient:
+        """Deprecated: the calls of this client with the API's JSON instead of typed responses."""
+        warnings.warn(
+            "`raw` will be removed in the next release: use `as_json()` of the typed responses.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return RawClient(self)
+
+
+class RawClient:
+    """Calls the methods of a client and returns dictionaries, and lists instead of iterators."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        method = getattr(self._client, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if inspect.isgeneratorfunction(method):
+                return [_to_json(answer) for answer in method(*args, **kwargs)]
+            return _to_json(method(*args, **kwargs))
+
+        return call
+
+
+def _to_json(answer: Any) -> Any:
+    if isinstance(answer, list):
+        return [_to_json(item) for item in answer]
+    return answer.as_json() if isinstance(answer, Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

@@ -1,14 +1,8 @@
 """The embedded server: gateway, extractor, search and steward in one process.
 
 It needs no other servers: it uses SQLite and a local folder, or a bucket if S3_ENDPOINT is set. It
-runs the same classes as the separate services; only the backends differ:
-
-| | embedded | separate services |
-|---|---|---|
-| wakeups | `threading.Event` | Celery messages |
-| object store | folder | S3 |
-| search protocol | function call | HTTP |
-| catalog | SQLite | PostgreSQL |
+runs the same classes as the separate services with other adapters, which the first table of
+docs/architecture.md lists.
 """
 
 from __future__ import annotations

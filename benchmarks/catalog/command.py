@@ -291,10 +291,10 @@ def measure(progress: Progress, *, photos: int) -> Report:
                 progress.update(bar, description=name)
         finally:
             catalog.close()
-    faulty = [e for e in explainer.found if e.faults() and e.call not in KNOWN_FULL_SCANS]
+    faulty = [e for e in explainer.plans if e.faults() and e.call not in KNOWN_FULL_SCANS]
     report = Report(f"Statements of the services, {photos:,} photos")
     table = Table("call", "ms", "rows read", "rows returned", "scans")
-    for e in explainer.found:
+    for e in explainer.plans:
         cells = (e.call, f"{e.milliseconds:.1f}", f"{e.read:,}", f"{e.returned:,}")
         table.add_row(*cells, ", ".join(e.scans), style="red" if e in faulty else None)
     report.tables.append(table)
@@ -305,7 +305,7 @@ def measure(progress: Progress, *, photos: int) -> Report:
     report.details = {
         "photos": photos,
         "tables": filled.tables,
-        "statements": [{**asdict(e), "faults": e.faults()} for e in explainer.found],
+        "statements": [{**asdict(e), "faults": e.faults()} for e in explainer.plans],
     }
     return report
 

@@ -16,7 +16,8 @@ from shared.catalog.session import Catalog
 EXPLAINABLE = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)
 LARGE_TABLES = ("photos", "jobs", "descriptors", "searches")
 
-# What may be read whatever is returned: counts stop at COUNTED_AT_MOST, of two tables at most.
+# Rows that a statement may read whatever it returns: it counts the rows of at most two tables, and
+# a count stops at MAX_COUNTED_MATCHES.
 MAX_ROWS_READ = 2 * MAX_COUNTED_MATCHES + 2_000
 MAX_ROWS_READ_PER_RETURNED = 20
 
@@ -32,13 +33,14 @@ class StatementPlan:
     returned: int
     milliseconds: float
     sequential: tuple[str, ...]
-    """Large tables that were read from one end to the other."""
+    """Large tables that were read completely."""
 
     def faults(self) -> list[str]:
-        found = [f"sequential scan over {table}" for table in self.sequential]
+        """Describe what makes the statement slow on a large catalog; empty if nothing does."""
+        faults = [f"sequential scan over {table}" for table in self.sequential]
         if self.read > max(MAX_ROWS_READ, MAX_ROWS_READ_PER_RETURNED * self.returned):
-            found.append(f"reads {self.read:,} rows to return {self.returned:,}")
-        return found
+            faults.append(f"reads {self.read:,} rows to return {self.returned:,}")
+        return faults
 
 
 @dataclass
@@ -47,12 +49,13 @@ class Explainer:
 
     catalog: Catalog
     small: bool = False
-    """Reading everything is cheap, so the planner would: what matters is that it need not. Scans
-    and joins of whole tables are forbidden; a walk through a whole index shows in what is read."""
-    found: list[StatementPlan] = field(default_factory=list)
+    """The tables are small: a planner would scan them, because that is cheap. Sequential scans and
+    hash and merge joins are disabled, so that the plan shows whether an index can be used."""
+    plans: list[StatementPlan] = field(default_factory=list)
 
     @contextlib.contextmanager
     def call(self, name: str) -> Iterator[None]:
+        """Collect the plans of the statements that are sent inside the block under this name."""
         seen: set[str] = set()
 
         def before(
@@ -61,7 +64,7 @@ class Explainer:
             if many or sql in seen or not EXPLAINABLE.match(sql) or "pg_catalog" in sql:
                 return
             seen.add(sql)
-            self.found.append(self._explain(connection, name, sql, parameters))
+            self.plans.append(self._explain(connection, name, sql, parameters))
 
         event.listen(self.catalog.engine, "before_cursor_execute", before)
         try:
@@ -70,7 +73,7 @@ class Explainer:
             event.remove(self.catalog.engine, "before_cursor_execute", before)
 
     def _explain(self, connection: Any, call: str, sql: str, parameters: Any) -> StatementPlan:
-        # In its own transaction, so on the very rows; and undone, so that it changes nothing.
+        # In the caller's transaction, so that it reads the same rows; rolled back to the savepoint.
         with connection.connection.cursor() as cursor:
             cursor.execute("SAVEPOINT explained")
             if self.small:

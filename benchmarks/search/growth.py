@@ -26,32 +26,32 @@ SEED = 20_261_121
 def measure_growth(
     report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
 ) -> None:
-    """Time scans and plain reads of the same codes in turn."""
+    """Report the latency of scans, and its ratio to reading the same codes from memory."""
     rotation = get_rotation(DIMENSION)
     words = int(level_ends(rotation.padded)[0])
-    draw = np.random.default_rng(SEED)
-    query = SignCodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), rotation)
+    rng = np.random.default_rng(SEED)
+    query = SignCodedQuery.of(rng.standard_normal(DIMENSION).astype(np.float32), rotation)
     task = progress.add_task("growth", total=len(sizes) * ROUNDS)
     for rows in sizes:
-        codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
+        codes = np.frombuffer(rng.bytes(8 * rows * words), np.uint64).reshape(rows, words)
         blocks = _blocks(codes)
         mask = np.ones(rows, bool)
-        took = []
+        durations = []
         scan_first_level(blocks, [query], [mask])
-        with MemoryBandwidth(codes) as speed:
+        with MemoryBandwidth(codes) as bandwidth:
             for _ in range(ROUNDS):
                 started_at = time.perf_counter()
                 scan_first_level(blocks, [query], [mask])
-                took.append(time.perf_counter() - started_at)
-                speed.sample()
+                durations.append(time.perf_counter() - started_at)
+                bandwidth.sample()
                 progress.advance(task)
-        report.add_latency(f"growth: scan of {rows:,} codes", took)
-        ratio = median(took) * speed.bytes_per_second / codes.nbytes
+        report.add_latency(f"growth: scan of {rows:,} codes", durations)
+        ratio = median(durations) * bandwidth.bytes_per_second / codes.nbytes
         report.add(f"growth: {rows:,} codes, time / reading", ratio, "x", at_most=TARGET_RATIO)
 
 
 def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:
-    """Return codes as the scan takes them: by chunk, the first level only."""
+    """Return (rows, words) first-level codes as `scan_first_level` takes them, by chunk."""
     begins = np.arange(0, len(codes), BLOCK_ROWS)
     nothing = np.empty(0, np.uint64)
     return SignCodeBlocks(

@@ -28,45 +28,45 @@ Words = NDArray[np.uint64]
 
 @numba_jit(REORDERED_FASTMATH)
 def _xor_words(words: Words) -> np.uint64:
-    """Return a value that depends on every word; four streams at once are faster than one."""
+    """XOR all words, in four interleaved streams, which read faster than one."""
     quarter = words.shape[0] // 4
     a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
     d = words[3 * quarter :]
-    found = np.uint64(0)
+    total = np.uint64(0)
     for i in range(quarter):
-        found ^= a[i] ^ b[i] ^ c[i] ^ d[i]
-    return found
+        total ^= a[i] ^ b[i] ^ c[i] ^ d[i]
+    return total
 
 
 class MemoryBandwidth:
-    """Measures memory bandwidth by one thread, and by one thread per core; the faster counts.
+    """Measures memory bandwidth with one thread and with one thread per core; reports the faster.
 
     A context manager. Samples are taken between other measurements, so that other load on the
     machine affects both.
     """
 
     def __init__(self, words: Words | None = None) -> None:
-        """Read these words, or by default some that do not fit into any CPU cache."""
+        """Measure reads of `words`; by default of an array that is larger than any CPU cache."""
         self._words = np.ones(STREAM_BYTES // 8, np.uint64) if words is None else words.ravel()
         cores = len(os.sched_getaffinity(0))
         self._parts = np.array_split(self._words, cores)
         self._pool = ThreadPoolExecutor(cores, thread_name_prefix="read")
-        self._took: tuple[list[float], list[float]] = ([], [])
+        self._durations: tuple[list[float], list[float]] = ([], [])
         _xor_words(self._words[:8])
 
     def sample(self) -> None:
-        """Read everything once in each way."""
+        """Read all words once with one thread, and once with one thread per core."""
         started_at = time.perf_counter()
         _xor_words(self._words)
         alone = time.perf_counter()
         list(self._pool.map(_xor_words, self._parts))
-        self._took[0].append(alone - started_at)
-        self._took[1].append(time.perf_counter() - alone)
+        self._durations[0].append(alone - started_at)
+        self._durations[1].append(time.perf_counter() - alone)
 
     @property
     def bytes_per_second(self) -> float:
-        """Median rate of the faster way. StatisticsError before the first sample."""
-        return self._words.nbytes / min(map(median, self._took))
+        """Median bandwidth of the faster one. StatisticsError before the first sample."""
+        return self._words.nbytes / min(map(median, self._durations))
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +84,7 @@ class ByteCounter:
 
 @contextlib.contextmanager
 def count_bytes_read() -> Iterator[ByteCounter]:
-    """Count the bytes that searches by codes read inside the block, by wrapping their loops."""
+    """Count the bytes that searches by codes read inside the block, by wrapping their kernels."""
     count = ByteCounter()
 
     lock = threading.Lock()
@@ -125,4 +125,4 @@ def private_bytes() -> int:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("RssAnon:"):
             return 1024 * int(line.split()[1])
-    raise AssertionError("Linux tells RssAnon")
+    raise AssertionError("/proc/self/status has no RssAnon: this needs Linux")

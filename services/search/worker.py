@@ -74,7 +74,7 @@ class QueryRowReader:
         if chunk is None:
             return self._read_cached(request.object_key, request.row)
         if request.row >= len(chunk.rows):
-            raise query_expired_error(f"row {request.row} of {request.object_key}")
+            raise reference_expired_error(f"row {request.row} of {request.object_key}")
         row: Row = chunk.rows[request.row]
         return row
 
@@ -87,9 +87,9 @@ class QueryRowReader:
         try:
             loaded = read_row(self._store, object_key, row)
         except NotFound:
-            raise query_expired_error(f"descriptor {object_key}") from None
+            raise reference_expired_error(f"descriptor {object_key}") from None
         except IndexError:
-            raise query_expired_error(f"row {row} of {object_key}") from None
+            raise reference_expired_error(f"row {row} of {object_key}") from None
         except ValueError as error:
             raise _unreadable_error(object_key) from error
         if object_key.startswith(QUERIES):
@@ -101,8 +101,8 @@ class QueryRowReader:
         return loaded
 
 
-def query_expired_error(what: str) -> Gone:
-    """Error for a query whose row, object or generation no longer exists."""
+def reference_expired_error(what: str) -> Gone:
+    """Error for a query reference whose row, object or generation no longer exists."""
     return Gone("query_expired", f"The {what} no longer exists. Query with the photo again.")
 
 
@@ -265,7 +265,7 @@ class SearchWorker:
                 return snapshot
             snapshot = self._sync_generation(generation_id, min_version)
             if snapshot is None:
-                raise query_expired_error(f"generation {generation_id}")
+                raise reference_expired_error(f"generation {generation_id}")
             if snapshot.version >= min_version:
                 return snapshot
             if time.monotonic() > deadline:

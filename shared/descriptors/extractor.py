@@ -45,24 +45,30 @@ from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessin
 SHIPPED_VOCABULARIES = Path(__file__).parent / "vocabularies"
 
 
-def _dinov2(config: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
+def _load_dinov2(config: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
     assert config.layer is not None
     assert config.facet is not None
     size = config.backbone.removeprefix("dinov2-")
     return Dinov2(size, config.layer, config.facet, device, weights)
 
 
-def _slow(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+def _load_slow_backbone(
+    config: ExtractorConfig, device: torch.device, _weights: Path | None
+) -> Backbone:
     assert config.width is not None
     return SlowBackbone(config.width, config.milliseconds / 1000, device)
 
 
-def _torchhub(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+def _load_torchhub_entry(
+    config: ExtractorConfig, device: torch.device, _weights: Path | None
+) -> Backbone:
     assert config.hub is not None
     return TorchHubBackbone(config.hub, device)
 
 
-def _trained(config: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
+def _load_trained_backbone(
+    config: ExtractorConfig, device: torch.device, _weights: Path | None
+) -> Backbone:
     assert config.trained is not None
     assert config.trained.file is not None, "a registered model is loaded through the catalog"
     return TrainedBackbone.from_checkpoint(config.name, Path(config.trained.file), device)
@@ -70,11 +76,11 @@ def _trained(config: ExtractorConfig, device: torch.device, _weights: Path | Non
 
 BACKBONES: dict[str, Callable[[ExtractorConfig, torch.device, Path | None], Backbone]] = {
     "efficientnet-lite0": lambda _config, device, _weights: EfficientNetLite0(device),
-    SLOW_TEST_BACKBONE: _slow,
+    SLOW_TEST_BACKBONE: _load_slow_backbone,
     "test-tiny": lambda _config, device, _weights: TinyBackbone(device),
-    TORCHHUB_BACKBONE: _torchhub,
-    TRAINED_BACKBONE: _trained,
-    **{f"dinov2-{size}": _dinov2 for size in SHAPES},
+    TORCHHUB_BACKBONE: _load_torchhub_entry,
+    TRAINED_BACKBONE: _load_trained_backbone,
+    **{f"dinov2-{size}": _load_dinov2 for size in SHAPES},
 }
 
 

@@ -46,7 +46,7 @@ class VprModelConfig(BaseModel):
     """The architecture of a VPR model; `model_dump()` returns plain types.
 
     Names are canonicalised: backbones by any name in STAGES or ALIASES, case-insensitive, with `-`
-    for `_`; aggregators by any name that contains a key of AGGREGATORS.
+    for `_`; aggregators by the longest key of AGGREGATORS that the name contains.
 
     Raises:
         Unprocessable: `unknown_backbone`, `unknown_aggregator` (both list the valid names),
@@ -102,7 +102,7 @@ class VprModelConfig(BaseModel):
     @field_validator("agg_arch")
     @classmethod
     def _canonical_aggregator(cls, name: str) -> str:
-        for canonical in AGGREGATORS:
+        for canonical in sorted(AGGREGATORS, key=len, reverse=True):
             if canonical.lower() in name.lower():
                 return canonical
         raise Unprocessable(

@@ -26,7 +26,7 @@ def test_no_statement_reads_a_whole_map(
         calls = list(run_all_calls(catalog, filled, explainer, tmp_path))
     finally:
         catalog.close()
-    assert {e.call for e in explainer.found} >= set(calls) - {
+    assert {e.call for e in explainer.plans} >= set(calls) - {
         "steward: fit maps that wait",
         "steward: evaluate changed maps",
         "steward: free trash",  # looks at the disk
@@ -34,7 +34,7 @@ def test_no_statement_reads_a_whole_map(
     assert set(KNOWN_FULL_SCANS) <= set(calls), "an exception that is none any more"
     faulty = {
         f"{e.call}: {e.faults()} {e.scans} {e.sql}"
-        for e in explainer.found
+        for e in explainer.plans
         if e.faults() and e.call not in KNOWN_FULL_SCANS
     }
     assert not faulty, "\n".join(sorted(faulty))
@@ -55,4 +55,4 @@ def test_missing_index_is_noticed(
             pass
     finally:
         catalog.close()
-    assert any("tags" in e.call and e.faults() for e in explainer.found)
+    assert any("tags" in e.call and e.faults() for e in explainer.plans)

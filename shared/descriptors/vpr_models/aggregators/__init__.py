@@ -17,4 +17,4 @@ AGGREGATORS: dict[str, type[Aggregator]] = {
     "SALAD": SALAD,
     "BoQ": BoQ,
 }
-"""By canonical name. A configuration selects one by any name that contains it, in any case."""
+"""By canonical name. A configuration selects the longest that its name contains, in any case."""

@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from shared.descriptors.backbones import normalise_features, normalise_pixels
 from shared.descriptors.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.descriptors.vpr_models import backbones as pretrained
+from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.backbones import StagedBackbone, build_backbone, build_dinov2
 from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
@@ -113,6 +114,14 @@ def test_names_are_taken_as_the_predecessor_took_them() -> None:
     assert config(backbone_arch="dinov2-b").backbone_arch == "dinov2_vitb14"
     for written, meant in (("gempool", "GeM"), ("COSPLACE", "CosPlace"), ("my_mixvpr", "MixVPR")):
         assert config(agg_arch=written).agg_arch == meant
+
+
+def test_an_aggregator_whose_name_contains_that_of_another_can_be_selected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(AGGREGATORS, "MaskedGeM", AGGREGATORS["GeM"])
+    assert config(agg_arch="MaskedGeM").agg_arch == "MaskedGeM"
+    assert config(agg_arch="GeM").agg_arch == "GeM"
 
 
 def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> None:
