@@ -33,8 +33,8 @@ def distance_m(
 
     The result is within 0.6 % of the distance on the ellipsoid, and exact to a millimetre on the
     sphere, also for points a metre apart, across the antimeridian, at the poles and near the
-    antipodes. There the haversine alone loses metres to rounding, so that the formula also uses
-    `g`, the haversine of the distance to the antipode.
+    antipodes. For nearly antipodal points the haversine `h` alone loses metres to rounding;
+    therefore the angle is atan2(sqrt(h), sqrt(g)), with `g` = 1 - h computed without cancellation.
 
     Args:
         latitude_1, longitude_1, latitude_2, longitude_2: degrees.
@@ -64,7 +64,10 @@ def distances_m(
 
 
 def latitude_bounds(latitude: float, radius_m: float) -> tuple[float, float]:
-    """Return the latitudes that enclose every point within `radius_m`, for a query by index."""
+    """Return the southern and northern latitude, in degrees, of all points within `radius_m`.
+
+    For a query that uses the index on the latitude; it also finds points farther away.
+    """
     margin = math.degrees(radius_m / EARTH_RADIUS_M) * (1 + 1e-9) + 1e-9
     return latitude - margin, latitude + margin
 

@@ -84,7 +84,7 @@ def same_ranking(found: Ranking, expected: Ranking) -> bool:
 
 
 def same_photos(found: Ranking, expected: Ranking) -> bool:
-    """Return whether the photos are the same, for methods that compute scores in float32."""
+    """Return whether photos and order are equal, for methods that compute scores in float32."""
     return [photo_id for photo_id, _ in found] == [photo_id for photo_id, _ in expected]
 
 

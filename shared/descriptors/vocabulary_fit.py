@@ -170,7 +170,7 @@ class VocabularyFit:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Steps done, and the maximum of steps."""
+        """Number of steps done, and the maximum number of steps: a fit that converges has fewer."""
         batches = len(self._batches)
         passes = self._effort.mini_batch_passes + self._effort.settling_passes
         total = self.clusters + passes * batches

@@ -45,7 +45,7 @@ class StoredUpload:
         return cls(key, filename, size_bytes, sha256, first_bytes)
 
     def open(self, store: ObjectStore) -> BinaryIO:
-        """Open the file, from memory or from the store."""
+        """Open the bytes of the upload: `content` if they are in memory, else the stored object."""
         return store.open(self.key) if self.content is None else io.BytesIO(self.content)
 
 

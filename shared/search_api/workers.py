@@ -117,7 +117,7 @@ class WorkerState:
         return -1 if self.status is None else self.status.versions.get(generation_id, -1)
 
     def lacks_chunks(self, generation_id: UUID) -> bool:
-        """Whether it could not read a chunk of the generation, which another replica may have."""
+        """Whether the worker lacks a chunk of the generation, which another replica may have."""
         return self.status is not None and generation_id in self.status.incomplete
 
 

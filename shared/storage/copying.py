@@ -53,9 +53,9 @@ def hash_object(store: ObjectStore, key: str) -> tuple[int, str]:
 
 
 def download_object(store: ObjectStore, key: str, target: Path) -> str:
-    """Write an object durably to a private file; return its SHA-256.
+    """Download an object to a file that is synced to disk and private; return its SHA-256.
 
-    NotFound when it is missing.
+    Raises NotFound if the object is missing.
     """
     with store.open(key) as source, create_private_file(target) as file:
         _, sha256 = copy_and_hash(source, file.write)

@@ -297,7 +297,9 @@ def describe_files(
 
 
 def load_own_vocabulary(config: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:
-    """Read the vocabulary file; None if the extractor needs none or ships one.
+    """Read the vocabulary file that the user has named; None if there is none and none is required.
+
+    An extractor that uses no vocabulary, or ships one, requires none.
 
     Raises:
         Unprocessable: `vocabulary_unfit` if it does not match the extractor.

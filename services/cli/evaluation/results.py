@@ -64,7 +64,8 @@ def evaluate_rankings(
     """Compute all metrics of one set, and the comparison with an earlier run, if requested.
 
     Args:
-        evaluation_set: The set; its database may be empty if only numbers are known.
+        evaluation_set: The set. `database` is empty if its photos are unknown; each query is then
+            a cluster of its own, and no distances are reported.
         ranked: Database indices and scores per query, best first.
         options: Output options.
         has_scores: Whether the scores of `ranked` are meaningful.

@@ -96,7 +96,7 @@ class Archive(Protocol):
     """
 
     def members(self) -> Iterator[ArchiveMember]:
-        """Yield all members in the archive's order; TooLarge as `ArchiveLimits` raises."""
+        """Yield all members in the archive's order; raises TooLarge beyond `ArchiveLimits`."""
 
     def read(self, member: ArchiveMember) -> Iterator[bytes]:
         """Yield the member's bytes in pieces of at most ARCHIVE_READ_BYTES.
