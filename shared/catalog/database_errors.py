@@ -46,8 +46,8 @@ def to_unavailable(error: BaseException) -> Unavailable | None:
     if sqlite == "SQLITE_FULL" or state == POSTGRES_FULL:
         return StorageFull(
             "disk_full",
-            "The catalog's disk is full; nothing was changed. Make room on it, or delete "
-            "photos or maps.",
+            "The catalog's disk is full; nothing was changed. Free disk space on it, or "
+            "delete photos or maps.",
             retry_after_seconds=FULL_RETRY_SECONDS,
         )
     if sqlite.startswith(DAMAGED) or state in POSTGRES_DAMAGED:

@@ -284,7 +284,7 @@ def _to_misconfigured(path: Path, error: SQLAlchemyError) -> Misconfigured | Non
         return Misconfigured(
             "disk_full",
             f"The disk of {path} is full ({free} bytes free); opening the catalog needs a few "
-            "megabytes. Make room on that disk, then start again; you can delete photos and maps "
+            "megabytes. Free space on that disk, then start again; you can delete photos and maps "
             "once the server runs.",
         )
     if name.startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY", "SQLITE_PERM", "SQLITE_AUTH")):

@@ -195,7 +195,7 @@ def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
     event.listen(catalog.engine, "begin", full)
     usage = shutil._ntuple_diskusage(100, 100, 0)
     monkeypatch.setattr("shared.catalog.schema.shutil.disk_usage", lambda folder: usage)
-    with pytest.raises(Misconfigured, match="Make room") as caught:
+    with pytest.raises(Misconfigured, match="Free space") as caught:
         migrate(catalog)
     assert caught.value.code == "disk_full"
     with catalog.engine.connect() as connection, pytest.raises(OperationalError):
