@@ -54,7 +54,7 @@ test-browser: $(INSTALLED) ## tests of the page in Chromium (apt-get install chr
 	PLACEWISE_TEST_BROWSER=1 $(BIN)/python -m pytest tests/browser
 
 test-api-fuzz: $(INSTALLED) ## many generated API calls (PLACEWISE_FUZZ_EXAMPLES=)
-	PLACEWISE_FUZZ_EXAMPLES=$${PLACEWISE_FUZZ_EXAMPLES:-200} $(BIN)/python -m pytest tests/integration/test_api_fuzz.py --timeout 7200
+	PLACEWISE_FUZZ_EXAMPLES=$${PLACEWISE_FUZZ_EXAMPLES:-200} $(BIN)/python -m pytest tests/integration/gateway/test_api_fuzz.py --timeout 7200
 
 pictures: $(INSTALLED) ## test-browser, and retake the screenshots in docs/pictures
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser

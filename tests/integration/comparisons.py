@@ -11,7 +11,7 @@ from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.maps import Search
 from shared.catalog.photos import Photo
 from shared.jobs import InProcessWakeups, Job
-from tests.integration.gateway import Service
+from tests.integration.in_process_api import Service
 
 ROUNDS = 60
 CLOSELY: dict[str, Any] = {"rerank": 3, "explain": "true"}

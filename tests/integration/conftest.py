@@ -20,8 +20,8 @@ from shared.errors import PlacewiseError
 from shared.imaging.decode import DecodedPhoto
 from shared.imaging.preprocessing import Preprocessing
 from shared.storage import FolderStore
-from tests.integration.door import Door
-from tests.integration.gateway import Service
+from tests.integration.api_with_keys import Door
+from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_map
 

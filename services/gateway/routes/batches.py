@@ -19,7 +19,10 @@ from services.gateway.admission import (
     get_photo_limit,
 )
 from services.gateway.authentication import READ, WRITE, Caller, get_caller
-from services.gateway.batch_upload import (
+from services.gateway.dependencies import DEFAULT_MAP, GatewayContext, GatewayDep, JobId, MapName
+from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, job_url, to_job_accepted
+from services.gateway.uploads.batch import (
     ARCHIVE_FIELD,
     FILES_FIELD,
     MANIFEST_FIELD,
@@ -31,9 +34,6 @@ from services.gateway.batch_upload import (
     parse_batch_upload,
     too_many_photos_error,
 )
-from services.gateway.dependencies import DEFAULT_MAP, GatewayContext, GatewayDep, JobId, MapName
-from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel, job_url, to_job_accepted
 from shared.catalog.batch_items import (
     BatchItem,
     BatchSource,

@@ -20,13 +20,13 @@ from services.gateway.dependencies import (
     MapName,
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
-from services.gateway.multipart_upload import multipart_schema, store_form_file
 from services.gateway.schemas import (
     GenerationResponse,
     JobAcceptedResponse,
     VocabularyResponse,
     accept_job,
 )
+from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.chunks import estimate_described
 from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map

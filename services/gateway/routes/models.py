@@ -25,8 +25,8 @@ from services.gateway.dependencies import (
     MapName,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.multipart_upload import multipart_schema, store_form_file
 from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.maps import get_map
 from shared.catalog.models import (
     Model,

@@ -24,7 +24,7 @@ from services.gateway.schemas import (
     PhotoDetailResponse,
     PhotoResponse,
 )
-from services.gateway.search_params import FilterDep
+from services.gateway.similarity.search_params import FilterDep
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map

@@ -24,16 +24,16 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.multipart_upload import multipart_schema, store_form_file
-from services.gateway.reranking import (
+from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse, accept_job
+from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
+from services.gateway.similarity.rerank import (
     check_comparison_supported,
     comparison_response,
     start_comparison_of_query_photo,
     start_comparison_of_stored_photo,
 )
-from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse, accept_job
-from services.gateway.search_params import SearchParams, SearchParamsDep
-from services.gateway.similarity_search import find_similar, query_from_job, query_from_photo
+from services.gateway.similarity.search_params import SearchParams, SearchParamsDep
+from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import (

@@ -29,8 +29,8 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep
-from services.gateway.multipart_upload import multipart_schema, store_form_file
 from services.gateway.schemas import UploadResponse, url_in_map
+from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError

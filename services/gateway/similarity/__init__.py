@@ -1,0 +1,1 @@
+"""Similarity searches: parameters, execution, the place estimate, and reranking."""

@@ -1,0 +1,88 @@
+"""Place estimate of a similarity search: where, how certain, or "not in this map"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from uuid import UUID
+
+from services.gateway.schemas import EstimateResponse
+from shared.catalog.photos import Photo
+from shared.evaluation.calibration import Calibration
+from shared.evaluation.place_evidence import (
+    PhotoLocation,
+    RankedPhoto,
+    compute_evidence,
+    estimate_location,
+)
+from shared.search_api.protocol import SearchHit
+
+
+def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
+    """Joins hits with the locations of their photos."""
+    return [RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id])) for hit in hits]
+
+
+def estimate_place(
+    calibration: Calibration | None,
+    ranking: Sequence[RankedPhoto],
+    unfiltered_ranking: Sequence[RankedPhoto],
+    radius_m: float,
+) -> EstimateResponse:
+    """Estimates the place that a ranking points to.
+
+    Args:
+        calibration: Calibration of this kind of ranking (plain, or by word weights), if any.
+        ranking: The hits of the search, best first.
+        unfiltered_ranking: The hits without the filter. The evidence for the place is computed
+            from them, because the calibration was learnt without filters.
+        radius_m: Photos within this radius in metres show the same place.
+    """
+    state = calibration.state if calibration else "uncalibrated"
+    evidence = (
+        compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
+    )
+    if evidence is None:
+        reason = (
+            "No photo of the map matches the filter."
+            if not ranking
+            else "The most similar photo has neither coordinates nor a place."
+        )
+        return EstimateResponse(calibration=state, reason=reason)
+    accepted = calibration.accepts(evidence) if calibration else None
+    confidence = (
+        calibration.confidence.probability(evidence)
+        if calibration and calibration.confidence
+        else None
+    )
+    spot = (
+        estimate_location(ranking, radius_m)
+        if accepted is not False
+        else PhotoLocation(None, None, None)
+    )
+    return EstimateResponse(
+        in_map=accepted,
+        latitude=spot.latitude,
+        longitude=spot.longitude,
+        radius_m=None if spot.latitude is None else radius_m,
+        place=spot.place,
+        confidence=confidence,
+        calibration=state,
+        reason=_estimate_reason(accepted, evidence.support, calibration),
+    )
+
+
+def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
+    if accepted is None or calibration is None or calibration.support_threshold is None:
+        return (
+            "Whether the place is in the map is not known yet: this needs an evaluation with at "
+            "least 20 photos with coordinates or places (POST /api/v1/evaluations)."
+        )
+    compared = (
+        f"The support of the first ten photos for the place is {support:.4f}; 5 % of the queries "
+        f"outside the map reach {calibration.support_threshold:.4f}."
+    )
+    return compared if accepted else f"Probably not in this map. {compared}"
+
+
+def _photo_location(photo: Photo) -> PhotoLocation:
+    return PhotoLocation(photo.latitude, photo.longitude, photo.place)

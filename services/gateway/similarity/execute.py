@@ -1,0 +1,322 @@
+"""Similarity searches: query the search tier, join the hits with live photos, estimate the place.
+
+Hits are joined with the catalog by photo id. Photos that have just been deleted are dropped, and
+the search is repeated with a larger k until k live photos are found or there are no more.
+
+The module also selects the word weights that a search ranks by (`select_ranking_weights`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from services.gateway.dependencies import GatewayContext
+from services.gateway.schemas import (
+    PhotoResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
+    job_url,
+)
+from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.similarity.search_params import SearchParams
+from shared.catalog.chunks import find_descriptor
+from shared.catalog.database_errors import to_unavailable
+from shared.catalog.generations import Generation, active_generation
+from shared.catalog.maps import Map, Search, get_map
+from shared.catalog.photos import Photo, get_live_photos, get_photo
+from shared.catalog.vocabularies import vocabulary_standing
+from shared.config.settings import Settings
+from shared.errors import Conflict, Gone, StorageFull
+from shared.evaluation.calibration import Calibration
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH
+from shared.jobs import Job, JobState
+from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
+from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse
+from shared.word_weights.record import WordWeights, parse_word_weights
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RankingWeights:
+    """Word weights of a search, and the calibration that belongs to them."""
+
+    generation: Generation
+    record: WordWeights | None
+    values: tuple[float, ...]
+    """One weight per word; () to rank by the plain cosine similarity."""
+
+    def state(self, hits: Sequence[SearchHit]) -> str:
+        """Returns the response field `word_weights`: `applied`, `none` or `off`."""
+        if self.values:
+            return "applied" if self._ranked_by_weights(hits) else "none"
+        return "off" if self.record and self.record.applied else "none"
+
+    def calibration(self, hits: Sequence[SearchHit]) -> Calibration | None:
+        """Returns the calibration for this kind of ranking; None if there is none."""
+        if self.values and self.record and self._ranked_by_weights(hits):
+            return self.record.calibration
+        stored = self.generation.calibration
+        return Calibration.model_validate(stored) if stored else None
+
+    def _ranked_by_weights(self, hits: Sequence[SearchHit]) -> bool:
+        return not hits or hits[0].weighted_score is not None
+
+
+def select_ranking_weights(
+    generation: Generation, enabled: bool, settings: Settings
+) -> RankingWeights:
+    """Selects the word weights of the generation, unless the request or a setting disables them."""
+    record = parse_word_weights(generation.word_weights)
+    enabled = enabled and settings.word_weights
+    return RankingWeights(generation, record, record.applied if record and enabled else ())
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarityQuery:
+    """The descriptor to search with, the generation to search in, and fields of the response."""
+
+    map_id: UUID
+    map_name: str
+    min_version: int
+    generation: Generation
+    vocabulary: str
+    object_key: str
+    row: int
+    photo_id: UUID | None
+    filename: str
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarityResult:
+    """Result of a search: the response without photos, the hits and the history row."""
+
+    response_without_photos: SimilarityResponse
+    """All fields of the response except the photos."""
+    hits: list[SearchHit]
+    """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
+    photos: dict[UUID, Photo]
+    word_weights: tuple[float, ...]
+    """The weights that the hits are ranked by, one per word; () for the plain ranking."""
+    history_row: Search
+    """Row of the search history; the caller adds it to a session."""
+
+
+def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
+    """Creates the query for a stored photo.
+
+    Raises:
+        NotFound: `map_not_found`, `photo_not_found`.
+        Conflict: `not_searchable`, if the photo has no descriptor yet.
+    """
+    with gateway.catalog.read() as session:
+        map_ = get_map(session, map_name)
+        photo = get_photo(session, map_.id, photo_id)
+        generation = active_generation(session, map_.id)
+        located = find_descriptor(session, generation.id, photo.id) if generation else None
+        if generation is None or located is None:
+            raise _not_searchable_error(session, photo, map_name)
+        descriptor, chunk = located
+        return SimilarityQuery(
+            map_id=map_.id,
+            map_name=map_.name,
+            min_version=map_.version,
+            generation=generation,
+            vocabulary=vocabulary_standing(session, generation),
+            object_key=chunk.object_key,
+            row=descriptor.row,
+            photo_id=photo.id,
+            filename=photo.filename,
+        )
+
+
+def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
+    """Creates the query for a described query photo.
+
+    Raises:
+        Gone: `query_expired`, if the generation of its descriptor was deleted.
+    """
+    result: dict[str, Any] = job.result or {}
+    with gateway.catalog.read() as session:
+        map_ = session.get_one(Map, job.map_id)
+        generation = session.get(Generation, UUID(result["generation_id"]))
+        if generation is None:
+            raise Gone(
+                "query_expired",
+                "The generation of the query was deleted. Send the photo again.",
+            )
+        return SimilarityQuery(
+            map_id=map_.id,
+            map_name=map_.name,
+            min_version=map_.version,
+            generation=generation,
+            vocabulary=vocabulary_standing(session, generation),
+            object_key=result["object_key"],
+            row=result["row"],
+            photo_id=None,
+            filename=job.params["filename"],
+        )
+
+
+def find_similar(
+    gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
+) -> SimilarityResponse:
+    """Finds the most similar live photos and the place estimate, and adds the search history row.
+
+    The query itself is not among the photos. If the disk of the catalog is full, the history row is
+    left out.
+    """
+    result = run_similarity_search(gateway, query, search_params)
+    try:
+        with gateway.catalog.write() as session:
+            session.add(result.history_row)
+    except SQLAlchemyError as error:
+        if not isinstance(to_unavailable(error), StorageFull):
+            raise
+        log.warning("the search is not added to the history: the disk of the catalog is full")
+    return result.response_without_photos.with_photos(
+        SimilarPhotoResponse(
+            similarity_score=hit.score,
+            weighted_score=hit.weighted_score,
+            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map_name),
+        )
+        for hit in result.hits
+    )
+
+
+def run_similarity_search(
+    gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
+) -> SimilarityResult:
+    """Queries the search tier and computes the estimate. The caller adds the history row."""
+    started = time.perf_counter()
+    weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
+    depth = max(search_params.top_k, search_params.rerank or 0)
+    # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
+    search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
+    hits, photos, response = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
+    ranking = unfiltered_ranking = locate_hits(hits, photos)
+    if not search_params.photos.is_empty:
+        unfiltered_ranking = locate_hits(*search(NO_FILTER, EVIDENCE_DEPTH)[:2])
+    estimate = estimate_place(
+        weights.calibration(hits), ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
+    )
+    similar = hits[:depth]
+    if search_params.min_score is not None and weights.values:
+        # `min_score` applies to the plain cosine similarity, but the ranking is by weighted scores:
+        # matching photos may be anywhere in it.
+        similar, photos, response = search(
+            search_params.photos, depth, min_score=search_params.min_score
+        )
+    elif search_params.min_score is not None:
+        similar = [hit for hit in similar if hit.score >= search_params.min_score]
+    elapsed_ms = (time.perf_counter() - started) * 1000
+    response_without_photos = SimilarityResponse(
+        query_file_id=query.photo_id,
+        query_filename=query.filename,
+        processing_time_ms=elapsed_ms,
+        total_similar=0,
+        similar_images=[],
+        estimate=estimate,
+        vocabulary=query.vocabulary,
+        word_weights=weights.state(hits),
+        generation_id=query.generation.id,
+        certificate=response.certificate,
+        certified_k=_count_certified(similar[: search_params.top_k], response),
+        max_z=response.max_z,
+        rows_scanned=response.rows_scanned,
+        rows_reranked=response.rows_reranked,
+        snapshot_version=response.snapshot_version,
+        degraded=bool(response.missing),
+        missing=list(response.missing),
+    )
+    history = Search(
+        map_id=query.map_id,
+        generation_id=query.generation.id,
+        query_photo_id=query.photo_id,
+        query_filename=query.filename,
+        top_k=search_params.top_k,
+        results=min(len(similar), search_params.top_k),
+        processing_ms=elapsed_ms,
+        best_score=hits[0].score if hits else None,
+        in_map=estimate.in_map,
+    )
+    weighted = any(hit.weighted_score is not None for hit in similar)
+    return SimilarityResult(
+        response_without_photos,
+        similar,
+        photos,
+        weights.values if weighted else (),
+        history,
+    )
+
+
+def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:
+    """Number of leading hits that the search guarantees."""
+    certain = {hit.photo_id for hit in response.hits[: response.certified_k]}
+    return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in certain, hits))
+
+
+def _search_live_photos(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    photos: PhotoFilter,
+    depth: int,
+    *,
+    weights: tuple[float, ...],
+    min_score: float | None = None,
+) -> tuple[list[SearchHit], dict[UUID, Photo], SearchResponse]:
+    """Returns the first `depth` live photos; fewer if there are no more."""
+    k = depth
+    while True:
+        response = gateway.search.search(
+            SearchRequest(
+                map_id=query.map_id,
+                generation_id=query.generation.id,
+                object_key=query.object_key,
+                row=query.row,
+                min_version=query.min_version,
+                k=k,
+                photos=photos,
+                min_score=min_score,
+                exclude=(query.photo_id,) if query.photo_id else (),
+                word_weights=weights,
+                mode=search_params.mode,
+                most_rows=search_params.most_rows,
+                most_seconds=search_params.most_seconds,
+            )
+        )
+        with gateway.catalog.read() as session:
+            live = get_live_photos(session, [hit.photo_id for hit in response.hits])
+        hits = [hit for hit in response.hits if hit.photo_id in live]
+        if len(hits) >= depth or len(response.hits) < k:
+            return hits[:depth], live, response
+        k *= 2
+
+
+def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:
+    """Builds the 409 error: why the photo has no descriptor, and which job to poll."""
+    job = session.get(Job, photo.job_id) if photo.job_id else None
+    extra: dict[str, Any] = {"file_id": str(photo.id)}
+    if job is None:
+        return Conflict("not_searchable", "The photo has no descriptor yet.", **extra)
+    status_url = job_url(job.id, map_name)
+    extra |= {"job_id": str(job.id), "status_url": status_url, "state": job.state}
+    if job.state == JobState.FAILED:
+        reason = (job.error or {}).get("detail", "no reason is stored")
+        detail = f"The photo could not be described: {reason}"
+    elif job.waiting_for:
+        detail = f"The photo is not searchable yet: its job is waiting for {job.waiting_for}."
+    else:
+        detail = f"The photo is not searchable yet: its job is {job.state}. Poll {status_url}."
+    return Conflict("not_searchable", detail, **extra)

@@ -1,0 +1,1 @@
+"""Uploads: multipart bodies are parsed and stored while they arrive."""

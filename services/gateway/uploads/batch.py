@@ -1,0 +1,318 @@
+"""Streaming parser of batch uploads: many files, one archive, or a manifest of object keys.
+
+The files are written to the object store while they are received. Each file is validated on its
+own: a refused file becomes a failed item of the batch, and the rest of its bytes is skipped. If the
+whole body is refused, nothing is left in the store.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from fastapi import Request
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.uploads.multipart import MultipartFormParser, body_media_type
+from shared.config.settings import Settings
+from shared.errors import (
+    InvalidRequest,
+    PlacewiseError,
+    TooLarge,
+    UnsupportedMedia,
+    invalid_field_error,
+)
+from shared.imaging.file_formats import (
+    ACCEPTED_ARCHIVES,
+    ARCHIVE_SIGNATURE_BYTES,
+    detect_archive_format,
+)
+from shared.ingest.photo_metadata import MAX_MANIFEST_BYTES
+from shared.ingest.validation import StreamValidator, check_photo_signature
+from shared.storage import ObjectStore, ObjectWriter
+from shared.storage.keys import new_archive_key, new_original_key
+
+FILES_FIELD, ARCHIVE_FIELD, MANIFEST_FIELD, PREFIX_FIELD = "file", "archive", "manifest", "prefix"
+NDJSON_MEDIA_TYPES = ("application/x-ndjson", "application/jsonl", "application/x-jsonlines")
+MAX_PART_HEADER_BYTES = 1024
+MAX_PREFIX_BYTES = 1024  # the maximum length of an S3 key
+
+
+@dataclass(slots=True)
+class BatchFile:
+    """A file of the form: stored under `key`, or refused with `error`."""
+
+    name: str
+    key: str
+    size_bytes: int = 0
+    sha256: str = ""
+    error: PlacewiseError | None = None
+
+
+@dataclass(slots=True)
+class BatchUpload:
+    """The parsed body of a batch upload."""
+
+    files: list[BatchFile] = field(default_factory=list)
+    archive: BatchFile | None = None
+    manifest: bytes | None = None
+    prefix: str | None = None
+
+    def idempotency_content(self) -> list[Any]:
+        """Content for the idempotency fingerprint: equal for the same files and manifest."""
+        return [
+            [[file.name, file.sha256] for file in self.files],
+            self.archive and [self.archive.name, self.archive.sha256],
+            None if self.manifest is None else hashlib.sha256(self.manifest).hexdigest(),
+            *([] if self.prefix is None else [self.prefix]),
+        ]
+
+
+async def parse_batch_upload(
+    request: Request, store: ObjectStore, settings: Settings
+) -> BatchUpload:
+    """Parses the body of a batch upload and stores its files.
+
+    Nothing is left in the store if it raises; `discard_batch_upload` deletes the files later.
+
+    Raises:
+        InvalidRequest: `no_file`, `several_sources`, `empty_file`, `malformed_body`.
+        TooLarge: `batch_too_large`, `too_many_photos`, `manifest_too_large`.
+        UnsupportedMedia: `unsupported_archive`, `unsupported_body`.
+        Unprocessable: `invalid_field`.
+    """
+    if body_media_type(request) in NDJSON_MEDIA_TYPES:
+        return BatchUpload(manifest=await _read_manifest_body(request))
+    max_bytes = (
+        settings.max_archive_size
+        + MAX_MANIFEST_BYTES
+        + settings.max_batch_photos * MAX_PART_HEADER_BYTES
+    )
+    parts = _BatchPartHandler(store, settings)
+    form = MultipartFormParser(
+        request, parts, max_bytes, lambda: batch_too_large_error(settings.max_archive_size)
+    )
+    try:
+        async for piece in request.stream():
+            form.feed(piece)
+            await run_in_threadpool(parts.write)
+        form.finish()
+        received = parts.batch
+        if not received.files and received.archive is None and received.manifest is None:
+            if received.prefix is None:
+                raise InvalidRequest(
+                    "no_file",
+                    f"The form has no photos ({FILES_FIELD!r}, once for each), no archive "
+                    f"({ARCHIVE_FIELD!r}), no manifest of keys ({MANIFEST_FIELD!r}) and no prefix "
+                    f"of keys ({PREFIX_FIELD!r}). Send one of them: curl -F archive=@PHOTOS.zip.",
+                )
+        elif received.prefix is not None:
+            raise _conflicting_sources_error("a prefix and another source")
+        parts.commit()
+    finally:
+        await run_in_threadpool(parts.discard_uncommitted)
+    return received
+
+
+def discard_batch_upload(store: ObjectStore, received: BatchUpload) -> None:
+    """Deletes the stored files of the batch."""
+    for file in (*received.files, received.archive):
+        if file is not None and file.error is None:
+            store.delete(file.key)
+
+
+def batch_too_large_error(max_bytes: int) -> PlacewiseError:
+    """Builds the 413 error for a batch of more than `max_bytes`."""
+    return TooLarge(
+        "batch_too_large",
+        f"The files of the batch are larger than {max_bytes} bytes together (MAX_ARCHIVE_SIZE). "
+        "Split the batch into several.",
+        max_bytes=max_bytes,
+    )
+
+
+async def _read_manifest_body(request: Request) -> bytes:
+    data = bytearray()
+    async for piece in request.stream():
+        data += piece
+        if len(data) > MAX_MANIFEST_BYTES:
+            raise _manifest_too_large_error()
+    return bytes(data)
+
+
+class _BatchPartHandler:
+    """Collects the parts of the form.
+
+    `begin`, `data` and `end` only queue the data on the event loop; `write` validates and stores it
+    and is called in a worker thread.
+    """
+
+    def __init__(self, store: ObjectStore, settings: Settings) -> None:
+        self.batch = BatchUpload()
+        self._store = store
+        self._settings = settings
+        self._name = ""
+        self._manifest = bytearray()
+        self._prefix = bytearray()
+        self._files_bytes = 0
+        self._write_queue: deque[tuple[BatchFile, bytes | None]] = deque()
+        """The bytes of the files, in order; None marks the end of a file."""
+        self._file: BatchFile | None = None
+        self._validator: StreamValidator | None = None
+        self._writer: ObjectWriter | None = None
+        self._committed = False
+
+    def discard_uncommitted(self) -> None:
+        """Aborts the current write, and deletes the files unless `commit` was called."""
+        self._abort_write()
+        if not self._committed:
+            discard_batch_upload(self._store, self.batch)
+
+    def commit(self) -> None:
+        """Keeps the stored files: the body was complete."""
+        self._committed = True
+
+    def begin(self, name: str, filename: str | None) -> None:
+        self._name = name
+        if name == MANIFEST_FIELD:
+            if self.batch.manifest is not None:
+                raise _conflicting_sources_error("two manifests")
+            self.batch.manifest = b""
+        elif name == PREFIX_FIELD:
+            if self.batch.prefix is not None:
+                raise _conflicting_sources_error("two prefixes")
+            self.batch.prefix = ""
+        elif name not in (FILES_FIELD, ARCHIVE_FIELD):
+            raise invalid_field_error(
+                name,
+                f"is unknown; valid are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and "
+                f"{PREFIX_FIELD}. Put the fields of single photos into the manifest",
+            )
+        elif filename is None:
+            raise InvalidRequest(
+                "no_file",
+                f"The field {name!r} is not a file. Send it as curl -F {name}=@PATH (with the @).",
+            )
+        elif name == FILES_FIELD:
+            if len(self.batch.files) == self._settings.max_batch_photos:
+                raise too_many_photos_error(self._settings.max_batch_photos)
+            self._file = BatchFile(_display_name(filename), new_original_key())
+            self.batch.files.append(self._file)
+        else:
+            if self.batch.archive is not None:
+                raise _conflicting_sources_error("two archives")
+            self._file = self.batch.archive = BatchFile(_display_name(filename), new_archive_key())
+        if self.batch.archive and (self.batch.files or self.batch.manifest is not None):
+            raise _conflicting_sources_error("an archive and another source")
+
+    def data(self, piece: bytes) -> None:
+        if self._name == MANIFEST_FIELD:
+            self._manifest += piece
+            if len(self._manifest) > MAX_MANIFEST_BYTES:
+                raise _manifest_too_large_error()
+            return
+        if self._name == PREFIX_FIELD:
+            self._prefix += piece
+            if len(self._prefix) > MAX_PREFIX_BYTES:
+                raise invalid_field_error(PREFIX_FIELD, f"has more than {MAX_PREFIX_BYTES} bytes")
+            return
+        self._files_bytes += len(piece)
+        if self._files_bytes > self._settings.max_archive_size:
+            raise batch_too_large_error(self._settings.max_archive_size)
+        assert self._file is not None
+        self._write_queue.append((self._file, piece))
+
+    def end(self) -> None:
+        if self._name == MANIFEST_FIELD:
+            self.batch.manifest = bytes(self._manifest)
+        elif self._name == PREFIX_FIELD:
+            try:
+                self.batch.prefix = self._prefix.decode()
+            except UnicodeDecodeError:
+                raise invalid_field_error(PREFIX_FIELD, "is not UTF-8") from None
+        else:
+            assert self._file is not None
+            self._write_queue.append((self._file, None))
+
+    def write(self) -> None:
+        """Validates and stores the bytes received since the last call."""
+        while self._write_queue:
+            file, piece = self._write_queue.popleft()
+            if file.error is not None:
+                continue  # skip the rest of a refused file
+            try:
+                self._finish(file) if piece is None else self._write(file, piece)
+            except PlacewiseError as error:
+                self._abort_write()
+                if file is self.batch.archive or error.status >= 500:
+                    raise
+                file.error = error
+
+    def _write(self, file: BatchFile, piece: bytes) -> None:
+        if self._validator is None:
+            self._validator = self._new_validator(file)
+        self._validator.add(piece)
+        if self._writer is None:
+            self._writer = self._store.writer(file.key)
+        self._writer.write(piece)
+
+    def _finish(self, file: BatchFile) -> None:
+        if self._validator is None or self._writer is None:
+            raise InvalidRequest("empty_file", f"The file {file.name!r} is empty.")
+        self._validator.end()
+        self._writer.commit()
+        file.size_bytes, file.sha256 = self._validator.size_bytes, self._validator.sha256
+        self._validator = self._writer = None
+
+    def _abort_write(self) -> None:
+        if self._writer is not None:
+            self._writer.abort()
+        self._validator = self._writer = None
+
+    def _new_validator(self, file: BatchFile) -> StreamValidator:
+        if file is self.batch.archive:
+            limit = self._settings.max_archive_size
+            return StreamValidator(
+                limit, _check_archive_signature, signature_bytes=ARCHIVE_SIGNATURE_BYTES
+            )
+        return StreamValidator(self._settings.max_file_size, check_photo_signature)
+
+
+def too_many_photos_error(limit: int) -> PlacewiseError:
+    """Builds the 413 error for a batch of more than `limit` photos."""
+    return TooLarge(
+        "too_many_photos",
+        f"The batch has more than {limit} photos (MAX_BATCH_PHOTOS). Split it into several.",
+    )
+
+
+def _check_archive_signature(begin: bytes) -> None:
+    if detect_archive_format(begin) is None:
+        raise UnsupportedMedia(
+            "unsupported_archive",
+            f"By its content the file is not {ACCEPTED_ARCHIVES}. Send single photos in the "
+            f"field {FILES_FIELD!r}.",
+        )
+
+
+def _display_name(filename: str) -> str:
+    """The client's file name without control characters; manifest lines refer to it."""
+    return "".join(c for c in filename if c.isprintable())[:1000] or "photo"
+
+
+def _conflicting_sources_error(what: str) -> PlacewiseError:
+    return InvalidRequest(
+        "several_sources",
+        f"The form has {what}. A batch is one of: photos ({FILES_FIELD!r}) with an optional "
+        f"{MANIFEST_FIELD!r}; one {ARCHIVE_FIELD!r}, which may contain a table; one "
+        f"{MANIFEST_FIELD!r} of keys; one {PREFIX_FIELD!r} of keys.",
+    )
+
+
+def _manifest_too_large_error() -> PlacewiseError:
+    return TooLarge(
+        "manifest_too_large",
+        f"The manifest is larger than {MAX_MANIFEST_BYTES} bytes. Split it into several.",
+    )

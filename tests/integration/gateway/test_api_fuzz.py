@@ -1,0 +1,173 @@
+"""The API is what its description says, whatever is sent: schemathesis makes the calls.
+
+`make test-api-fuzz` makes many more of them than `make test` does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import hypothesis
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase
+from hypothesis.errors import Unsatisfiable
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from services.extractor.worker import ExtractorWorker
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.storage import FolderStore
+from tests.integration.api_with_keys import ADMIN, Door
+
+pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+
+EXAMPLES = int(os.environ.get("PLACEWISE_FUZZ_EXAMPLES", "2"))  # of calls; a sixth: of sequences
+PROMISED = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+]
+NOTHING_TO_GET_WRONG = {"GET /", "GET /livez", "GET /readyz"}  # calls without a parameter
+# Follows a job to its end, and here nobody ends one.
+ENDLESS = "GET /api/v1/jobs/{job_id}/events"
+STRANGERS: tuple[tuple[dict[str, str], str], ...] = (
+    ({}, "key_missing"),
+    ({"Authorization": "Bearer pw_guessed"}, "key_unknown"),
+    ({"Authorization": "Basic YTpi"}, "key_missing"),
+)
+KEY = {"Authorization": f"Bearer {ADMIN}"}
+
+
+def settings_of(examples: int, **more: Any) -> hypothesis.settings:
+    return hypothesis.settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        derandomize=EXAMPLES <= 2,
+        suppress_health_check=list(HealthCheck),
+        # A fault is told as it was found: making it smaller takes minutes.
+        phases=(Phase.explicit, Phase.generate),
+        **more,
+    )
+
+
+@pytest.fixture
+def fuzzed(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    make_worker: Callable[[], ExtractorWorker],
+) -> Door:
+    """A service that waits for nothing, with photos that can be found."""
+    quick = {"max_wait_seconds": 0, "compare_wait_seconds": 0.0, "search_wait_seconds": 0.1}
+    door = Door(catalog, store, settings.model_copy(update=quick))
+    for number in (1, 2, 3):
+        assert door.put(ADMIN, number).status_code == 202
+    make_worker().drain(threading.Event())
+    return door
+
+
+def described(door: Door) -> Any:
+    return schemathesis.openapi.from_asgi("/openapi.json", door.app)
+
+
+def each_call(
+    door: Door,
+    check: Callable[[Any], None],
+    examples: int,
+    only: Callable[[Any], bool] = lambda operation: True,
+) -> None:
+    """`check` on made-up cases of every call of the description; all that fails is told."""
+    failures: list[str] = []
+    operations = [result.ok() for result in described(door).get_all_operations()]
+    assert len(operations) > 40
+    for operation, mode in itertools.product(filter(only, operations), GenerationMode):
+        if mode == GenerationMode.NEGATIVE and operation.label in NOTHING_TO_GET_WRONG:
+            continue
+        cases = operation.as_strategy(generation_mode=mode)
+        run = hypothesis.given(case=cases)(lambda case: check(case))
+        try:
+            settings_of(examples)(run)()
+        except (BaseExceptionGroup, AssertionError, Unsatisfiable) as error:
+            failures.append(f"{operation.label} ({mode.value}): {error!r}")
+    assert not failures, "\n\n".join(failures)
+
+
+def test_whoever_has_the_key_gets_what_is_described_and_no_fault(fuzzed: Door) -> None:
+    def check(case: Any) -> None:
+        case.call_and_validate(headers=KEY, checks=PROMISED)
+
+    each_call(fuzzed, check, EXAMPLES)
+
+
+def test_calls_about_what_is_there_get_what_is_described(fuzzed: Door) -> None:
+    def check(case: Any) -> None:
+        there = fuzzed.put(ADMIN, 1).json()  # the same one again, unless a call has deleted it
+        known = case.path_parameters.keys() & {"file_id", "job_id"}
+        case.path_parameters.update({name: there[name] for name in known})
+        case.query = {**case.query, "map": "default"}
+        case.call_and_validate(headers=KEY, checks=PROMISED)
+
+    def is_about_one(operation: Any) -> bool:
+        return operation.label != ENDLESS and (
+            "{file_id}" in operation.path or "{job_id}" in operation.path
+        )
+
+    each_call(fuzzed, check, EXAMPLES, is_about_one)
+
+
+def test_without_a_key_nothing_but_what_is_open_is_answered(fuzzed: Door) -> None:
+    def check(case: Any) -> None:
+        made_up = dict(case.headers or {}).items()
+        others = {name: value for name, value in made_up if name.lower() != "authorization"}
+        for headers, code in STRANGERS:
+            case.headers = {**others, **headers}
+            answer = case.call()
+            case.validate_response(answer, checks=PROMISED)
+            if case.path.startswith("/api/"):
+                assert answer.status_code == 401, case.path
+                assert answer.json()["code"] == code
+
+    each_call(fuzzed, check, 1)
+
+
+def test_calls_that_follow_from_one_another_get_what_is_described(fuzzed: Door) -> None:
+    machine = described(fuzzed).as_state_machine()
+
+    class Sequences(machine):  # type: ignore[misc, valid-type]
+        def get_call_kwargs(self, case: Any) -> dict[str, Any]:
+            return {"headers": KEY}
+
+        def validate_response(self, response: Any, case: Any, **options: Any) -> None:
+            case.validate_response(response, checks=PROMISED)
+
+    Sequences.run(settings=settings_of(max(1, EXAMPLES // 6), stateful_step_count=12))
+    assert fuzzed.put(ADMIN, 4).status_code == 202, "and the service is still there"
+    assert fuzzed(ADMIN, "GET", "/health").status_code == 200
+
+
+def test_the_fuzz_would_find_a_fault(fuzzed: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: Any) -> Any:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("services.gateway.routes.maps.list_maps", broken, raising=False)
+    operation = described(fuzzed)["/api/v1/maps"]["GET"]
+    run = hypothesis.given(case=operation.as_strategy())(
+        lambda case: case.call_and_validate(headers=KEY, checks=PROMISED)
+    )
+    with pytest.raises(BaseException, match=r"[Ss]erver error"):
+        settings_of(1)(run)()

@@ -1,0 +1,389 @@
+"""`Idempotency-Key` over HTTP: a repeated call is done once and answered the same."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import httpx2
+import pytest
+from sqlalchemy import func, select, update
+
+from services.extractor.worker import ExtractorWorker
+from services.gateway import idempotency as once
+from services.gateway.routes import model_changes
+from shared.catalog.base import db_now_plus
+from shared.catalog.idempotency import IdempotencyRecord
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.errors import Unavailable
+from shared.imaging.photo_header import read_photo_header
+from shared.jobs import Job
+from shared.storage import FolderStore
+from tests.integration.api_with_keys import Door
+from tests.integration.in_process_api import Service
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.problems import field_refused, problem
+
+REPLAYED = "idempotent-replayed"
+
+
+def keyed(key: str = "key-1", **headers: str) -> dict[str, str]:
+    return {"Idempotency-Key": key, **headers}
+
+
+def upload(service: Service, photo: bytes, key: str = "key-1", **options: Any) -> httpx2.Response:
+    files = {"file": (options.pop("name", "photo.jpg"), photo)}
+    headers = keyed(key, **options.pop("headers", {}))
+    return service("POST", "/upload", files=files, headers=headers, **options)
+
+
+def count(catalog: Catalog, table: type[Job] | type[Photo] | type[IdempotencyRecord]) -> int:
+    with catalog.read() as session:
+        return session.scalar(select(func.count()).select_from(table)) or 0
+
+
+def originals(store: FolderStore) -> int:
+    return sum(1 for _ in store.list("originals/"))
+
+
+def same(first: httpx2.Response, again: httpx2.Response) -> None:
+    assert REPLAYED not in first.headers
+    assert again.headers[REPLAYED] == "true"
+    assert (again.status_code, again.text) == (first.status_code, first.text)
+    for name in ("location", "retry-after", "content-type"):
+        assert again.headers.get(name) == first.headers.get(name), name
+
+
+def call_fit(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/vocabularies", json={"clusters": 4}, **options)
+
+
+def call_map(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/maps", json={"name": "city"}, **options)
+
+
+def call_batch(service: Service, **options: Any) -> httpx2.Response:
+    files = [("file", (f"{number}.jpg", photo_bytes(number))) for number in (1, 2)]
+    return service("POST", "/upload/batch", files=files, **options)
+
+
+def call_evaluation(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/evaluations", **options)
+
+
+def call_query(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/similarity", files={"file": ("a.jpg", near_copy(1))}, **options)
+
+
+def call_upload(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/upload", files={"file": ("b.jpg", photo_bytes(9))}, **options)
+
+
+def call_switch(service: Service, **options: Any) -> httpx2.Response:
+    return service("POST", "/generations", json={"vocabulary_id": None}, **options)
+
+
+def call_import(service: Service, **options: Any) -> httpx2.Response:
+    files = {"file": ("centres.npy", b"\x93NUMPY whatever the extractor will say of it")}
+    return service("POST", "/vocabularies/import", files=files, **options)
+
+
+CALLS: dict[str, tuple[int, Callable[..., httpx2.Response]]] = {
+    "maps": (201, call_map),
+    "upload": (202, call_upload),
+    "similarity": (202, call_query),
+    "vocabularies": (202, call_fit),
+    "import": (202, call_import),
+    "generations": (202, call_switch),
+    "evaluations": (202, call_evaluation),
+    "batch": (202, call_batch),
+}
+every_call = pytest.mark.parametrize(("status", "call"), CALLS.values(), ids=CALLS)
+
+
+@every_call
+def test_a_repeated_call_is_done_once_and_answered_the_same(
+    service: Service, catalog: Catalog, status: int, call: Callable[..., httpx2.Response]
+) -> None:
+    service.indexed(1, latitude=45, longitude=7)
+    first = call(service, headers=keyed())
+    assert first.status_code == status, first.text
+    jobs = count(catalog, Job)
+    same(first, call(service, headers=keyed()))
+    assert count(catalog, Job) == jobs
+    assert count(catalog, IdempotencyRecord) == 1
+
+
+@pytest.mark.parametrize("what", ["cancel", "retry"])
+def test_cancelling_and_retrying_can_be_repeated(service: Service, what: str) -> None:
+    job = service.upload(photo_bytes(1))["job_id"]
+    if what == "retry":
+        service.json("POST", f"/jobs/{job}/cancel")
+    first = service("POST", f"/jobs/{job}/{what}", headers=keyed())
+    assert first.status_code == 200, first.text
+    same(first, service("POST", f"/jobs/{job}/{what}", headers=keyed()))
+
+
+def test_without_a_key_every_call_is_a_call(service: Service, catalog: Catalog) -> None:
+    service.indexed(1, latitude=45, longitude=7)
+    jobs = {call_evaluation(service).json()["job_id"] for _ in range(2)}
+    assert len(jobs) == 2
+    assert count(catalog, IdempotencyRecord) == 0
+
+
+def test_an_upload_whose_answer_was_lost_gives_the_same_ids_and_stores_once(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    data = photo_bytes(1)
+    first = upload(service, data)
+    assert first.status_code == 202
+    # The multipart boundary is another one each time; the content is what counts.
+    same(first, upload(service, data))
+    service.drain()
+    same(first, upload(service, data))
+    assert (count(catalog, Photo), count(catalog, Job), originals(store)) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"data": {"latitude": "45", "longitude": "7"}}, {"name": "other.jpg"}],
+    ids=str,
+)
+def test_another_upload_under_the_key_is_refused_and_leaves_nothing(
+    service: Service, catalog: Catalog, store: FolderStore, other: dict[str, Any]
+) -> None:
+    assert upload(service, photo_bytes(1)).status_code == 202
+    problem(upload(service, photo_bytes(2)), 422, "idempotency_key_reused")
+    problem(upload(service, photo_bytes(1), **other), 422, "idempotency_key_reused")
+    problem(call_map(service, headers=keyed()), 422, "idempotency_key_reused")
+    assert (count(catalog, Photo), originals(store)) == (1, 1)
+
+
+def test_naming_the_default_map_is_saying_the_same(service: Service) -> None:
+    same(
+        upload(service, photo_bytes(1)), upload(service, photo_bytes(1), params={"map": "default"})
+    )
+
+
+def test_two_maps_may_choose_the_same_key(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "city"})
+    first = upload(service, photo_bytes(1))
+    there = upload(service, photo_bytes(1), params={"map": "city"})
+    assert (first.status_code, there.status_code) == (202, 202)
+    assert REPLAYED not in there.headers
+
+
+def test_two_callers_may_choose_the_same_key(door: Door) -> None:
+    mine, yours = (door.key("write")["key"] for _ in range(2))
+    photo = {"file": ("photo.jpg", photo_bytes(1))}
+    first, again, other = (
+        door(key, "POST", "/upload", files=photo, headers=keyed()) for key in (mine, mine, yours)
+    )
+    assert first.status_code == 202
+    same(first, again)
+    assert other.json()["already_there"], "a call of its own, which found the other's photo"
+    assert REPLAYED not in other.headers
+
+
+def test_an_upload_that_waited_is_answered_the_same(service: Service) -> None:
+    wait = {"Prefer": "wait=30"}
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(upload, service, photo_bytes(1), headers=wait)
+        while not asked.done():
+            service.drain()
+        first = asked.result()
+    assert first.status_code == 201, first.text
+    again = upload(service, photo_bytes(1), headers=wait)
+    same(first, again)
+    assert again.json()["status"] == "succeeded"
+
+
+def test_a_refusal_is_kept_and_leaves_nothing(service: Service, store: FolderStore) -> None:
+    broken = b"\xff\xd8\xff" + bytes(5000)
+    first = upload(service, broken)
+    problem(first, 422, "undecodable_photo")
+    same(first, upload(service, broken))
+    assert originals(store) == 0
+    taken = call_map(service, headers=keyed("map"))
+    assert taken.status_code == 201
+    refused = call_map(service, headers=keyed("again"))
+    problem(refused, 409, "map_exists")
+    same(refused, call_map(service, headers=keyed("again")))
+
+
+def test_a_body_that_can_not_be_understood_keeps_no_key(service: Service, catalog: Catalog) -> None:
+    field_refused(service("POST", "/maps", json={"name": "a/b"}, headers=keyed()), "name")
+    assert count(catalog, IdempotencyRecord) == 0
+    assert call_map(service, headers=keyed()).status_code == 201
+
+
+def test_a_failure_of_ours_is_not_kept(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> None:
+        raise Unavailable("object_store_unavailable", "Away.")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("shared.ingest.validation.read_photo_header", away)
+        problem(upload(service, photo_bytes(1)), 503, "object_store_unavailable")
+        broken.setattr(model_changes, "has_live_photo", away)
+        problem(call_fit(service, headers=keyed("fit")), 503, "object_store_unavailable")
+    assert count(catalog, IdempotencyRecord) == 0
+    assert upload(service, photo_bytes(1)).status_code == 202
+    assert call_fit(service, headers=keyed("fit")).status_code == 202
+    assert (count(catalog, Photo), originals(store)) == (1, 1)
+
+
+def test_a_call_under_way_is_told_to_come_again(service: Service, store: FolderStore) -> None:
+    """The first one stands between its claim and its commit until the second was refused."""
+    reached, go_on = threading.Event(), threading.Event()
+    reader = read_photo_header
+
+    def slowly(*arguments: Any) -> Any:
+        reached.set()
+        assert go_on.wait(timeout=30)
+        return reader(*arguments)
+
+    service.let_threads_call()
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
+        patch.setattr("shared.ingest.validation.read_photo_header", slowly)
+        first = pool.submit(upload, service, photo_bytes(1))
+        assert reached.wait(timeout=30)
+        try:
+            refused = upload(service, photo_bytes(1))
+            problem(refused, 409, "idempotency_key_in_use")
+            assert int(refused.headers["retry-after"]) >= 1
+            problem(upload(service, photo_bytes(2)), 422, "idempotency_key_reused")
+        finally:
+            go_on.set()
+        answered = first.result()
+    assert answered.status_code == 202
+    same(answered, upload(service, photo_bytes(1)))
+    assert originals(store) == 1
+
+
+def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_ones(
+    service: Service, catalog: Catalog
+) -> None:
+    """Its lease ends in the middle; the call repeated meanwhile is the one that counts."""
+    service.indexed(1, latitude=45, longitude=7)
+    jobs = count(catalog, Job)
+    second: list[httpx2.Response] = []
+    begin = once.IdempotentRequest.claim_key
+
+    def slowly(self: once.IdempotentRequest, *arguments: Any) -> None:
+        begin(self, *arguments)
+        if not second:
+            with catalog.write() as session:
+                session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
+            second.append(httpx2.Response(0))
+            second[0] = call_evaluation(service, headers=keyed())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(once.IdempotentRequest, "claim_key", slowly)
+        first = call_evaluation(service, headers=keyed())
+    problem(first, 409, "idempotency_key_in_use")
+    assert second[0].status_code == 202
+    assert count(catalog, Job) == jobs + 1
+    same(second[0], call_evaluation(service, headers=keyed()))
+
+
+def test_a_gateway_that_died_blocks_its_key_no_longer_than_its_lease(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a killed process leaves: a claimed key, and nothing after it."""
+    monkeypatch.setattr(once.IdempotentRequest, "release_key", lambda self: None)
+    with monkeypatch.context() as dying:
+        dying.setattr(
+            once.IdempotentRequest,
+            "store_response",
+            lambda *_: (_ for _ in ()).throw(SystemError("killed")),
+        )
+        problem(upload(service, photo_bytes(1)), 500, "internal_error")
+    assert count(catalog, Photo) == 0
+    problem(upload(service, photo_bytes(1)), 409, "idempotency_key_in_use")
+    with catalog.write() as session:
+        session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
+    first = upload(service, photo_bytes(1))
+    assert first.status_code == 202
+    same(first, upload(service, photo_bytes(1)))
+    assert count(catalog, Photo) == 1
+
+
+@pytest.mark.parametrize("make", [call_upload, call_evaluation, call_map], ids=lambda f: f.__name__)
+def test_the_same_call_at_two_gateways_at_once_has_one_effect(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    make_worker: Callable[[], ExtractorWorker],
+    service: Service,
+    make: Callable[..., httpx2.Response],
+) -> None:
+    service.indexed(1, latitude=45, longitude=7)
+    jobs, photos = count(catalog, Job), count(catalog, Photo)
+    gateways = [service, Service(catalog, store, settings, make_worker)]
+    together = threading.Barrier(8)
+
+    def one(number: int) -> httpx2.Response:
+        together.wait(timeout=30)
+        while True:
+            answer = make(gateways[number % 2], headers=keyed())
+            if answer.status_code != 409:
+                return answer
+            problem(answer, 409, "idempotency_key_in_use")
+
+    for gateway in gateways:
+        gateway.let_threads_call()
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(one, range(8)))
+    assert sum(REPLAYED not in answer.headers for answer in answers) == 1
+    assert len({answer.text for answer in answers}) == 1
+    made = {call_upload: (1, 1), call_evaluation: (1, 0), call_map: (0, 0)}[make]
+    assert (count(catalog, Job) - jobs, count(catalog, Photo) - photos) == made
+    assert originals(store) == count(catalog, Photo)
+
+
+@pytest.mark.parametrize("key", ["", "two words", "k" * 256, "schl\xfcssel"], ids=repr)
+def test_a_key_that_is_none_is_refused_by_name(
+    service: Service, catalog: Catalog, store: FolderStore, key: str
+) -> None:
+    headers = {b"Idempotency-Key": key.encode("latin-1")}
+    field_refused(service("POST", "/maps", json={"name": "x"}, headers=headers), "Idempotency-Key")
+    files = {"file": ("photo.jpg", photo_bytes(1))}
+    field_refused(service("POST", "/upload", files=files, headers=headers), "Idempotency-Key")
+    assert (count(catalog, IdempotencyRecord), originals(store)) == (0, 0)
+
+
+def test_the_longest_key_is_one(service: Service) -> None:
+    first = call_map(service, headers=keyed("~" * 255))
+    same(first, call_map(service, headers=keyed("~" * 255)))
+
+
+def test_an_expired_key_is_free(service: Service, catalog: Catalog) -> None:
+    service.indexed(1, latitude=45, longitude=7)
+    first = call_evaluation(service, headers=keyed())
+    with catalog.write() as session:
+        session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
+    again = call_evaluation(service, headers=keyed())
+    assert again.status_code == 202
+    assert again.json()["job_id"] != first.json()["job_id"]
+
+
+def test_the_header_is_described_where_it_means_something(service: Service) -> None:
+    paths = service._client.get("/openapi.json").json()["paths"]
+    named = {
+        path
+        for path, methods in paths.items()
+        for parameter in methods.get("post", {}).get("parameters", ())
+        if parameter["name"] == "Idempotency-Key"
+    }
+    prefix = "/api/v1"
+    assert named >= {
+        *(f"{prefix}/{noun}" for noun in ("maps", "upload", "similarity", "evaluations")),
+        *(f"{prefix}/{noun}" for noun in ("vocabularies", "vocabularies/import", "generations")),
+        *(f"{prefix}/jobs/{{job_id}}/{verb}" for verb in ("cancel", "retry")),
+    }

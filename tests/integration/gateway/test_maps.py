@@ -1,0 +1,491 @@
+"""Deleting a map: gone at once for people, and in the end from every table and the store."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+from sqlalchemy import func, select
+
+from services.extractor.generation_resolver import reindex_outdated_generations
+from services.extractor.model_registry import ModelRegistry
+from services.extractor.publish import publish
+from services.gateway.routes import uploads as upload_module
+from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.tasks import delete_maps as delete_maps_module
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import collect_orphans
+from shared.catalog.base import Base, db_now_plus
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation
+from shared.catalog.installation import Installation
+from shared.catalog.maps import Map, cache_map_statistics
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.processes import RegisteredSearchWorker
+from shared.catalog.session import Catalog
+from shared.catalog.tables import SchemaCompatibility
+from shared.config.settings import Settings
+from shared.ingest.store_photo import store_photo
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
+from shared.storage import FolderStore
+from shared.storage.keys import JOURNAL, TRASH
+from tests.integration.in_process_api import Service
+from tests.support.added import none_added
+from tests.support.catalog_rows import add_job, add_photo, read_job
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.problems import problem
+
+ROUNDS = 50
+
+
+class Away(Exception):
+    pass
+
+
+OF_NO_MAP = {
+    kind.__tablename__
+    for kind in (Installation, Model, RegisteredSearchWorker, SchemaCompatibility)
+}
+
+
+def rows(catalog: Catalog) -> Counter[str]:
+    """How many rows lie in each table but those that belong to no map."""
+    with catalog.read() as session:
+        return Counter(
+            {
+                table.name: session.scalar(select(func.count()).select_from(table)) or 0
+                for table in Base.metadata.sorted_tables
+                if table.name not in OF_NO_MAP
+            }
+        )
+
+
+def objects(store: FolderStore) -> set[str]:
+    """All but the trash, and the journal, which tells of the deletion."""
+    return {info.key for info in store.list("") if not info.key.startswith((JOURNAL, TRASH))}
+
+
+def id_of(service: Service, name: str) -> UUID:
+    with service.catalog.read() as session:
+        return session.scalars(select(Map.id).where(Map.name == name)).one()
+
+
+def remove_all(catalog: Catalog, store: FolderStore) -> None:
+    """The steward's rounds until no deleted map is left."""
+    for _ in range(ROUNDS):
+        purge_deleted_maps(catalog, store)
+        with catalog.read() as session:
+            if not session.scalars(select(Map.id).where(Map.deleted_at.is_not(None))).all():
+                return
+    raise AssertionError("a deleted map is still there")
+
+
+def live_in(service: Service, name: str) -> None:
+    """Everything that can belong to a map: photos, found and failed and asking ones, a vocabulary
+    and an import under way, generations, a whitening, searches, queries, evaluations."""
+    settings = Settings().model_copy(update={"auto_fit_photos": 10_000})
+    service.json("POST", "/maps", 201, json={"name": name, "extractor": "test-tiny-vlad"})
+    params = {"map": name}
+    for number in (1, 2, 3):
+        service.upload(photo_bytes(number), name, latitude=number, longitude=7)
+    service.upload(photo_bytes(4), name, role="query", place="hall")
+    service.upload(photo_bytes(5)[:-60], name)  # it can't be decoded
+    service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 4})
+    finish_changes(service)
+    oldest = service.json("GET", "/search", params={**params, "role": "database"})["images"][-1]
+    service.json("DELETE", f"/uploads/{oldest['image_id']}", params=params)
+    found = service.json("GET", "/search", params={**params, "role": "query"})["images"]
+    service.json("POST", f"/similarity/{found[0]['image_id']}", params=params)
+    service.ask(near_copy(2), name)
+    service.drain()
+    service.json("POST", "/evaluations", 202, params=params)
+    evaluator = EvaluationWorker(
+        service.catalog, service.store, service.search, settings, "evaluator"
+    )
+    assert evaluator.run_next(threading.Event())
+    service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
+    finish_changes(service)
+    service.json("POST", "/generations", 202, params=params, json={"pca": 1})
+    finish_changes(service)
+    with service.catalog.write() as session:
+        cache_map_statistics(session, id_of(service, name))
+    buffer = io.BytesIO()
+    np.save(buffer, np.ones((4, 99), np.float32))
+    files = {"file": ("centres.npy", buffer.getvalue())}
+    service.json("POST", "/vocabularies/import", 202, params=params, files=files)
+    service.ask(near_copy(3), name)
+    service.upload(photo_bytes(6), name)
+    files = {"file": ("batch.jpg", photo_bytes(7))}
+    service.json("POST", "/upload/batch", 202, params=params, files=files)
+    with service.catalog.write() as session:  # which takes a bucket otherwise
+        session.add(
+            PresignedUpload(
+                map_id=id_of(service, name),
+                filename="sent.jpg",
+                size_bytes=1,
+                sha256="0" * 64,
+                said={},
+                expires_at=db_now_plus(3600),
+            )
+        )
+
+
+def finish_changes(service: Service) -> None:
+    for _ in range(8):
+        service.drain()
+        advance_model_changes(service.catalog, InProcessWakeups())
+
+
+# --- what people see -------------------------------------------------------------------------
+
+
+def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    service.indexed(1, 2)
+    live_in(service, "other")
+    service.drain()  # nothing of it is left to do: from here on it stays as it is
+    before = rows(catalog), objects(store)
+    live_in(service, "gone")
+    during = rows(catalog)
+    of_no_map = {
+        *("installation", "idempotency_keys", "api_keys", "live_processes"),
+        *("webhooks", "webhook_deliveries"),
+    }
+    assert all(during[table] > before[0][table] for table in during.keys() - of_no_map), during
+    kinds = {"originals", "thumbnails", "chunks", "queries", "vocabularies", "whitenings", "work"}
+    assert kinds >= {key.split("/")[0] for key in objects(store) - before[1]}
+    service.json("DELETE", "/maps/gone")
+    problem(service("GET", "/maps/gone"), 404, "map_not_found")
+    remove_all(catalog, store)
+    assert rows(catalog) == before[0]
+    assert {key for key in objects(store) if not key.startswith("work/")} == {
+        key for key in before[1] if not key.startswith("work/")
+    }
+    collect_orphans(catalog, store, 0)
+    found = service.json("GET", "/search", params={"map": "other", "role": "query"})["images"]
+    answer = service.json("POST", f"/similarity/{found[0]['image_id']}", params={"map": "other"})
+    assert answer["total_similar"] == 3
+
+
+def test_a_name_is_free_at_once_and_the_new_map_is_left_alone(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "town"})
+    old = service.indexed(1, 2, map_name="town")
+    removed = id_of(service, "town")
+    service.json("DELETE", "/maps/town")
+    kept_as = {"map": f"deleted/{removed}"}  # its row's name, which no one may ask for
+    problem(service("GET", "/search", params=kept_as), 404, "map_not_found")
+    made = service.json("POST", "/maps", 201, json={"name": "town"})
+    assert (made["photos"], made["searchable"], made["generation_id"]) == (0, 0, None)
+    (new,) = service.indexed(1, map_name="town")
+    problem(service("GET", f"/uploads/{old[0]}", params={"map": "town"}), 404, "photo_not_found")
+    remove_all(catalog, store)
+    assert service("GET", f"/uploads/{new}/image", params={"map": "town"}).content == photo_bytes(1)
+    answer = service.json("POST", f"/similarity/{new}", params={"map": "town"})
+    assert answer["similar_images"] == []
+
+
+def test_the_default_map_is_made_anew_and_empty(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    service.indexed(1, 2)
+    old = id_of(service, "default")
+    assert service.json("DELETE", "/maps/default")["deleted_map"] == "default"
+    stats = service.json("GET", "/database/stats")
+    assert (stats["total_images"], stats["searchable_images"], stats["map_version"]) == (0, 0, 0)
+    assert id_of(service, "default") != old
+    (new,) = service.indexed(1)
+    remove_all(catalog, store)
+    assert service.json("GET", f"/uploads/{new}")["searchable"]
+    assert rows(catalog)["maps"] == 1
+
+
+def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "town"})
+    service.let_threads_call()
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda _: service("DELETE", "/maps/town").status_code, range(4)))
+    assert set(answers) <= {200, 404}
+    assert 200 in answers
+    service.json("POST", "/maps", 201, json={"name": "town"})
+
+
+def test_a_map_is_made_once_by_many_at_once(service: Service) -> None:
+    def make(_: int) -> int:
+        return service("POST", "/maps", json={"name": "town"}).status_code
+
+    service.let_threads_call()
+    with ThreadPoolExecutor(4) as pool:
+        assert sorted(pool.map(make, range(4))) == [201, 409, 409, 409]
+
+
+# --- work under way --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def before_publishing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
+    """Has something done when a batch is described and not published yet."""
+
+    def meanwhile(do: Callable[[], object]) -> None:
+        calls = iter([do])
+
+        def act_and_publish(*arguments: Any) -> Any:
+            for act in calls:
+                act()
+                break
+            return publish(*arguments)
+
+        monkeypatch.setattr("services.extractor.worker.publish", act_and_publish)
+
+    return meanwhile
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_a_claimed_batch_is_not_published_into_a_map_that_was_deleted(
+    service: Service,
+    catalog: Catalog,
+    store: FolderStore,
+    before_publishing: Callable[[Callable[[], object]], None],
+    removed: bool,
+) -> None:
+    """Neither while its rows are there nor once the steward has removed them."""
+    (stays,) = service.indexed(9)
+    before = rows(catalog), objects(store)
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    service.indexed(0, map_name="gone")
+    jobs = [service.upload(photo_bytes(number), "gone")["job_id"] for number in (1, 2, 3)]
+    jobs.append(service.ask(near_copy(1), "gone"))
+
+    def delete() -> None:
+        service.json("DELETE", "/maps/gone")
+        if removed:
+            remove_all(catalog, store)
+            return
+        with catalog.read() as session:
+            found = [session.get_one(Job, UUID(job_id)) for job_id in jobs]
+        assert [job.state for job in found] == [JobState.CANCELLED] * 4
+        assert not any(job.lease_token for job in found)
+
+    before_publishing(delete)
+    service.drain()
+    with catalog.read() as session:
+        described = session.scalar(select(func.count()).select_from(Descriptor))
+        chunks = session.scalar(select(func.count()).select_from(Chunk))
+    assert (described, chunks) == ((1, 1) if removed else (2, 2)), "only what was there before"
+    remove_all(catalog, store)
+    collect_orphans(catalog, store, 0)  # what the batch wrote in vain
+    assert rows(catalog) == before[0]
+    assert objects(store) == before[1]
+    assert service.json("GET", f"/uploads/{stays}")["searchable"]
+
+
+def test_jobs_of_a_deleted_map_are_not_taken(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    service.upload(photo_bytes(1), "gone")
+    service.json("DELETE", "/maps/gone")
+    assert service.worker.drain(threading.Event()).claimed == 0
+
+
+def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    service.make_worker()
+    before = rows(catalog)
+    together = threading.Barrier(5)
+
+    def upload(number: int) -> int:
+        together.wait()
+        answers = [
+            service(
+                "POST",
+                "/upload",
+                params={"map": "gone"},
+                files={"file": photo_bytes(10 * number + n)},
+            )
+            for n in range(4)
+        ]
+        return sum(answer.status_code == 202 for answer in answers) + 100 * sum(
+            answer.status_code not in (202, 404) for answer in answers
+        )
+
+    def delete() -> None:
+        together.wait()
+        service.json("DELETE", "/maps/gone")
+        remove_all(catalog, store)
+
+    service.let_threads_call()
+    with ThreadPoolExecutor(5) as pool:
+        uploads = [pool.submit(upload, number) for number in range(4)]
+        deleting = pool.submit(delete)
+        deleting.result()
+        assert all(0 <= task.result() <= 4 for task in uploads)
+    remove_all(catalog, store)
+    assert objects(store) == set()
+    assert rows(catalog) == Counter({**before, "maps": before["maps"] - 1})
+
+
+def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its upload began before the deletion and commits after the steward has looked."""
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    map_id = id_of(service, "gone")
+    service.json("DELETE", "/maps/gone")
+
+    def slip_in(*_: Any) -> None:
+        with catalog.write() as session:
+            store.put(add_photo(session, map_id).object_key, b"late")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(delete_maps_module, "_purge_vocabulary_objects", slip_in)
+        with pytest.raises(Exception, match=r"(?i)foreign key"):
+            purge_deleted_maps(catalog, store)
+    remove_all(catalog, store)
+    assert (rows(catalog)["photos"], rows(catalog)["maps"]) == (0, 1)
+    assert objects(store) == set()
+
+
+def test_a_job_that_slips_in_is_cancelled_before_anything_is_removed(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    map_id = id_of(service, "gone")
+    service.json("DELETE", "/maps/gone")
+    with catalog.write() as session:
+        job = add_job(session, map_id, photo_id=add_photo(session, map_id).id)
+
+    def away(*_: Any) -> bool:
+        raise Away
+
+    monkeypatch.setattr(delete_maps_module, "_purge_chunks", away)
+    with pytest.raises(Away):
+        purge_deleted_maps(catalog, store)
+    assert read_job(catalog, job.id).state == JobState.CANCELLED
+
+
+def test_an_upload_whose_map_went_meanwhile_is_not_found_and_leaves_no_bytes(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    real = store_photo
+
+    def delete_first(*arguments: Any) -> Any:
+        service.json("DELETE", "/maps/gone")
+        remove_all(catalog, store)
+        return real(*arguments)
+
+    monkeypatch.setattr(upload_module, "store_photo", delete_first)
+    files = {"file": photo_bytes(1)}
+    answer = service("POST", "/upload", params={"map": "gone"}, files=files)
+    assert "placewise maps create gone" in problem(answer, 404, "map_not_found")["detail"]
+    assert objects(store) == set()
+
+
+# --- removing --------------------------------------------------------------------------------
+
+
+def test_removal_that_was_killed_anywhere_goes_on(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each round dies one deletion later than the one before; objects go before their rows."""
+    before = rows(catalog), objects(store)
+    live_in(service, "gone")
+    service.json("DELETE", "/maps/gone")
+    real = FolderStore.delete
+    for allowed in range(ROUNDS):
+        left = iter(range(allowed))
+
+        def delete(self: FolderStore, key: str, left: Any = left) -> None:
+            if next(left, None) is None:
+                raise Away
+            real(self, key)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(FolderStore, "delete", delete)
+            try:
+                purge_deleted_maps(catalog, store)
+            except Away:
+                _check_remembered(catalog, store)
+                continue
+        break
+    else:
+        raise AssertionError("it never ended")
+    assert allowed > 3, "several rounds were cut short"
+    remove_all(catalog, store)
+    assert rows(catalog) == before[0]
+    assert {key for key in objects(store) if not key.startswith("work/")} == before[1]
+
+
+def _check_remembered(catalog: Catalog, store: FolderStore) -> None:
+    """Whatever still lies in the store is named by a row, so that it will go."""
+    with catalog.read() as session:
+        originals = set(session.scalars(select(Photo.object_key)))
+        originals |= set(session.scalars(select(BatchItem.object_key)))
+        chunks = set(session.scalars(select(Chunk.object_key)))
+    lying = objects(store)
+    assert {key for key in lying if key.startswith("originals/")} <= originals
+    assert {key for key in lying if key.startswith("chunks/") and key.endswith(".npy")} <= chunks
+
+
+def test_a_map_of_more_rows_than_one_transaction_takes_goes_as_well(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delete_maps_module, "ROWS_PER_TRANSACTION", 10)  # and one chunk at once
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    before = rows(catalog)
+    for number in range(3):
+        service.indexed(number, map_name="gone")
+    with catalog.write() as session:
+        for _ in range(25):
+            add_photo(session, id_of(service, "gone"))
+    service.json("DELETE", "/maps/gone")
+    remove_all(catalog, store)
+    assert rows(catalog) == Counter({**before, "maps": before["maps"] - 1})
+    assert objects(store) == set()
+
+
+def test_two_stewards_remove_a_map_together(
+    service: Service, catalog: Catalog, store: FolderStore
+) -> None:
+    before = rows(catalog)
+    live_in(service, "gone")
+    service.json("DELETE", "/maps/gone")
+    with ThreadPoolExecutor(2) as pool:
+        for removal in [pool.submit(remove_all, catalog, store) for _ in range(2)]:
+            removal.result()
+    assert rows(catalog) == before
+
+
+def test_what_is_being_removed_is_neither_merged_nor_renewed_nor_held_in_memory(
+    service: Service, catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    for number in range(2):
+        service.indexed(number, map_name="gone")
+    with catalog.write() as session:
+        for generation in session.scalars(select(Generation)):
+            generation.spec_fingerprint = "made by another release"
+    service.search.sync()
+    assert service.search.status().rows == 2
+    service.json("DELETE", "/maps/gone")
+    service.search.sync()
+    assert service.search.status().resident_bytes == 0
+    assert merge_small_chunks(catalog, store, compact_chunks=2) == 0
+    assert reindex_outdated_generations(catalog, ModelRegistry(store, settings, none_added)) == 0
+    with catalog.read() as session:
+        kinds = set(session.scalars(select(Job.kind)))
+    assert kinds == {JobKind.INDEX}

@@ -1,0 +1,184 @@
+"""How much a key may do: counted across gateways, said in the answers, refused beyond."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Barrier, Event
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from sqlalchemy import func, select
+
+from services.gateway import rate_limits as quotas_module
+from services.gateway.routes import uploads as upload_module
+from services.steward.batches.worker import BatchWorker
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.ingest import store_photo as photo_quota
+from shared.ingest import validation as incoming_module
+from shared.ingest.validation import ValidatedPhoto
+from shared.jobs import InProcessWakeups
+from shared.storage import FolderStore
+from tests.integration.api_with_keys import ADMIN, Door
+from tests.support.archives import zip_of
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+from tests.support.servers import RedisServer, start_redis
+
+
+@pytest.fixture(params=["in this process", "redis"])
+def settings_of_counts(
+    request: pytest.FixtureRequest, settings: Settings, redis: RedisServer
+) -> Settings:
+    """Where counts are kept: those of one process, or those that several share."""
+    if request.param == "redis":
+        return settings.model_copy(update={"redis_url": SecretStr(redis.url)})
+    return settings
+
+
+@pytest.fixture
+def catalog(sqlite_catalog: Catalog) -> Catalog:
+    """Of one kind: nothing here is the catalog's."""
+    return sqlite_catalog
+
+
+@pytest.fixture
+def limited(catalog: Catalog, store: FolderStore, settings_of_counts: Settings) -> Door:
+    return Door(catalog, store, settings_of_counts)
+
+
+def test_calls_beyond_the_limit_are_refused_and_every_answer_says_how_far_it_is(
+    limited: Door,
+) -> None:
+    key = limited.key("read", requests_per_minute=3)["key"]
+    left = []
+    for _ in range(3):
+        answer = limited(key, "GET", "/jobs")
+        assert answer.status_code == 200
+        assert answer.headers["ratelimit-policy"] == '"requests";q=3;w=60'
+        left.append(answer.headers["ratelimit"].split(";")[1])
+    assert left == ["r=2", "r=1", "r=0"]
+    refused = limited(key, "GET", "/jobs")
+    body = problem(refused, 429, "too_many_requests")
+    assert body["limit"] == 3
+    assert 1 <= int(refused.headers["retry-after"]) <= 60
+    other = limited.key("read", requests_per_minute=3)["key"]
+    assert limited(other, "GET", "/jobs").status_code == 200, "each key has its own"
+    assert "ratelimit" not in limited(ADMIN, "GET", "/jobs").headers
+
+
+def test_bytes_beyond_the_days_quota_are_refused_before_they_are_sent(
+    limited: Door, store: FolderStore
+) -> None:
+    size = len(photo_bytes(1))
+    key = limited.key("write", upload_bytes_per_day=2 * size)["key"]
+    assert limited.put(key, 1).status_code == 202
+    before = {info.key for info in store.list("")}
+    refused = limited.put(key, 2)
+    problem(refused, 429, "upload_quota_reached")
+    assert int(refused.headers["retry-after"]) > 60
+    assert {info.key for info in store.list("")} == before
+    refused = limited(
+        key, "POST", "/upload", content=iter([b"x"]), headers={"Content-Type": "text/plain"}
+    )
+    problem(refused, 411, "length_required")
+
+
+def test_settings_limit_keys_that_have_no_limit_of_their_own(
+    catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    strict = settings.model_copy(update={"key_requests_per_minute": 1})
+    door = Door(catalog, store, strict)
+    key, larger = door.key("read")["key"], door.key("read", requests_per_minute=9)["key"]
+    assert [door(key, "GET", "/jobs").status_code for _ in range(2)] == [200, 429]
+    assert [door(larger, "GET", "/jobs").status_code for _ in range(2)] == [200, 200]
+    assert [door(ADMIN, "GET", "/jobs").status_code for _ in range(2)] == [200, 200]
+
+
+def test_gateways_that_share_a_redis_share_their_counts(
+    catalog: Catalog, store: FolderStore, settings: Settings, redis: RedisServer
+) -> None:
+    shared = settings.model_copy(update={"redis_url": SecretStr(redis.url)})
+    one, other = Door(catalog, store, shared), Door(catalog, store, shared)
+    key = one.key("read", requests_per_minute=2)["key"]
+    answers = [door(key, "GET", "/jobs").status_code for door in (one, other, one, other)]
+    assert answers == [200, 200, 429, 429]
+
+
+def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(quotas_module, "REDIS_RETRY_SECONDS", 0.0)
+    with start_redis(own=True) as redis, caplog.at_level(logging.WARNING):
+        door = Door(catalog, store, settings.model_copy(update={"redis_url": SecretStr(redis.url)}))
+        key = door.key("read", requests_per_minute=1)["key"]
+        assert [door(key, "GET", "/jobs").status_code for _ in range(2)] == [200, 429]
+        assert redis.process is not None
+        redis.process.kill()
+        assert [door(key, "GET", "/jobs").status_code for _ in range(3)] == [200] * 3
+        assert [record.message.count("Redis is unreachable") for record in caplog.records] == [1]
+        redis.process.start()
+        assert [door(key, "GET", "/jobs").status_code for _ in range(2)] == [200, 429]
+        assert "rate limits are on" in caplog.text
+
+
+def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(photo_quota, "FULL_RECOUNT_SECONDS", 0.0)
+    key = door.key("write", max_photos=2)["key"]
+    for _ in range(3):  # the same bytes again, and none at all, are no further photos
+        assert door.put(key, 1).status_code in (200, 202)
+        assert door(key, "POST", "/upload", files={"file": b""}).status_code == 400
+    stored = [door.put(key, number).json()["file_id"] for number in (1, 2)]
+    problem(door.put(key, 3), 429, "photo_quota_reached")
+    assert door.put(ADMIN, 4).status_code == 202
+    assert door(key, "DELETE", f"/uploads/{stored[0]}").status_code == 200
+    assert door.put(key, 3).status_code == 202
+
+
+def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most, uploads = 3, 8
+    all_received = Barrier(uploads)
+    real = incoming_module.validate_photo
+
+    def examine_together(*said: Any) -> ValidatedPhoto:
+        all_received.wait(60)
+        return real(*said)
+
+    monkeypatch.setattr(upload_module, "validate_photo", examine_together)
+    door.app.openapi()  # a route is worked out at its first call, which no two threads may do
+    key = door.key("write", max_photos=most)["key"]
+    with ThreadPoolExecutor(uploads) as pool:
+        answers = list(pool.map(partial(door.put, key), range(uploads)))
+    codes = Counter(answer.status_code for answer in answers)
+    assert codes == {202: most, 429: uploads - most}
+    with door.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(Photo)) == most
+    refused = next(answer for answer in answers if answer.status_code == 429)
+    problem(refused, 429, "photo_quota_reached")
+    assert len(list(door.store.list("originals/"))) == most, "what is refused leaves no bytes"
+
+
+def test_photos_of_a_batch_count_too(
+    door: Door, catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    key = door.key("write", max_photos=2)["key"]
+    archive = zip_of({f"{number}.jpg": photo_bytes(number) for number in range(4)})
+    started = door(key, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)})
+    assert started.status_code == 202, started.text
+    BatchWorker(catalog, store, InProcessWakeups(), settings, "steward").run_next(Event())
+    items = door(ADMIN, "GET", f"/jobs/{started.json()['job_id']}/items").json()["items"]
+    assert [item["state"] for item in items] == ["running", "running", "failed", "failed"]
+    assert items[2]["error"]["code"] == "photo_quota_reached"

@@ -1,0 +1,141 @@
+"""The URLs in the API's answers lead to what they promise, also in a map that is not `default`."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx2
+
+from services.steward.tasks.model_changes import advance_model_changes
+from shared.jobs import InProcessWakeups
+from tests.integration.in_process_api import API, Service
+from tests.support.photos import photo_bytes
+
+MAP = "words"
+URLS = re.compile(r".+_url|image_path")
+# With a bucket alone: tests/integration/gateway/test_presigned_uploads.py.
+DIRECT = {"presign_upload", "complete_upload"}
+
+
+def urls_of(found: Any) -> Iterator[str]:
+    """Every value of a field that is called a URL, however deep."""
+    if isinstance(found, list):
+        for one in found:
+            yield from urls_of(one)
+    if isinstance(found, dict):
+        for name, value in found.items():
+            if URLS.fullmatch(name) and value is not None:
+                yield value
+            yield from urls_of(value)
+
+
+def operations_with_urls(openapi: dict[str, Any]) -> set[str]:
+    """Ids of the calls whose successful answers have such fields."""
+    schemas = openapi["components"]["schemas"]
+
+    def has_url(described: Any) -> bool:
+        referred = re.findall(r'"#/components/schemas/(\w+)"', json.dumps(described))
+        return any(
+            any(URLS.fullmatch(name) for name in schemas[one].get("properties", {}))
+            or has_url(schemas[one])
+            for one in referred
+        )
+
+    return {
+        call["operationId"]
+        for calls in openapi["paths"].values()
+        for call in calls.values()
+        if has_url([answer for status, answer in call["responses"].items() if status < "3"])
+    }
+
+
+class Followed:
+    """Calls of the API on one map; every URL in an answer is followed as it stands."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.called: set[str] = set()
+
+    def __call__(self, operation: str, method: str, path: str, **options: Any) -> Any:
+        options["params"] = {"map": MAP, **options.get("params", {})}
+        answer = self.service(method, path, **options)
+        assert answer.is_success, f"{operation}: {answer.text}"
+        self.called.add(operation)
+        self._follow(operation, answer)
+        return answer.json()
+
+    def _follow(self, operation: str, answer: httpx2.Response) -> None:
+        location = answer.headers.get("location")
+        urls = [*urls_of(answer.json()), *([location] if location else [])]
+        assert urls, operation
+        for url in urls:
+            found = self.service("GET", url.removeprefix(API))
+            unfinished = url.startswith(f"{API}/jobs/") and "/result?" in url
+            allowed = {200, 409} if unfinished else {200}
+            assert found.status_code in allowed, f"{operation}: {url}: {found.text}"
+
+    def until_it_ends(self, started: dict[str, Any]) -> None:
+        for _ in range(60):
+            self.service.drain()
+            advance_model_changes(self.service.catalog, InProcessWakeups())
+            job = self.service.json("GET", started["status_url"].removeprefix(API))
+            if job["state"] not in ("queued", "running"):
+                assert job["state"] == "succeeded", job
+                return
+        raise AssertionError(f"the job did not end: {job}")
+
+    def cancel(self, started: dict[str, Any]) -> None:
+        self("cancel_job", "POST", f"/jobs/{started['job_id']}/cancel")
+
+
+def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": MAP, "extractor": "test-tiny-vlad"})
+    call = Followed(service)
+    for number in range(1, 5):
+        photo = {"file": ("photo.jpg", photo_bytes(number))}
+        said = {"place": f"room {number // 2}", "captured_at": f"2026-01-0{number}T12:00:00Z"}
+        uploaded = call("upload", "POST", "/upload", files=photo, data=said)
+    fitted = call("fit_vocabulary", "POST", "/vocabularies", json={"clusters": 4})
+    call.until_it_ends(fitted)
+    file_id, job_id = uploaded["file_id"], uploaded["job_id"]
+
+    call("list_jobs", "GET", "/jobs")
+    call("get_job", "GET", f"/jobs/{job_id}")
+    events = service("GET", f"/jobs/{job_id}/events", params={"map": MAP}).text
+    event = json.loads(events.split("data: ")[1].split("\n")[0])
+    assert service("GET", event["status_url"].removeprefix(API)).json()["job_id"] == job_id
+    call("get_photo", "GET", f"/uploads/{file_id}")
+    call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
+    call("search_metadata", "GET", "/search")
+
+    similar = call("similar_to_stored", "POST", f"/similarity/{file_id}")
+    query = {"file": ("query.jpg", photo_bytes(5))}
+    asked = call("similar_to_upload", "POST", "/similarity", files=query)
+    call.until_it_ends(asked)
+    call("similarity_result", "GET", f"/jobs/{asked['job_id']}/result")
+    compared = call("similar_to_stored", "POST", f"/similarity/{file_id}", params={"rerank": 2})
+    call.until_it_ends(compared)
+
+    photo = {"file": ("photo.jpg", photo_bytes(6))}
+    batch = call("upload_batch", "POST", "/upload/batch", files=photo)
+    call.cancel(batch)
+    waits = call("upload", "POST", "/upload", files=photo)
+    refused = service("POST", f"/similarity/{waits['file_id']}", params={"map": MAP})
+    assert service("GET", refused.json()["status_url"].removeprefix(API)).status_code == 200
+    call.cancel(waits)
+    call("retry_job", "POST", f"/jobs/{waits['job_id']}/retry")
+
+    file = {"file": ("it.npy", b"is looked at by the extractor")}
+    call.cancel(call("import_vocabulary", "POST", "/vocabularies/import", files=file))
+    wanted = {"extractor": "test-tiny-avg"}
+    call.cancel(call("start_generation", "POST", "/generations", json=wanted))
+    call("add_model", "POST", "/models", files=file, data={"name": "one"})
+    call("evaluate", "POST", "/evaluations")
+    path = f"/generations/{similar['generation_id']}/word-weights"
+    call("learn_word_weights", "POST", path)
+
+    openapi = service._app.openapi()
+    assert call.called | DIRECT == operations_with_urls(openapi), "a call that is not followed"

@@ -1,0 +1,155 @@
+"""What every answer says to browsers, and what none says to anybody."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from services.gateway.app import create_app
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.search.worker import SearchWorker
+from shared.catalog.maps import get_or_create_default_map
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.jobs import InProcessWakeups
+from shared.storage import FolderStore
+from tests.integration.api_with_keys import Door
+from tests.support.problems import problem
+
+HERE = "http://localhost"
+MAPS = "https://maps.example"
+
+
+class Broken:
+    """A search tier with a bug."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise RuntimeError(f"/srv/secret/place.py: {name}")
+
+
+@pytest.fixture
+def catalog(sqlite_catalog: Catalog) -> Catalog:
+    """Of one kind: nothing here is the catalog's."""
+    return sqlite_catalog
+
+
+def client_of(catalog: Catalog, store: FolderStore, settings: Settings, search: Any) -> TestClient:
+    with catalog.write() as session:
+        get_or_create_default_map(session, settings.extractor)
+    keys = LocalhostAuthenticator(settings.allowed_origins)
+    gateway = GatewayContext(catalog, store, InProcessWakeups(), search, settings, keys)
+    return TestClient(create_app(gateway), base_url=HERE)
+
+
+@pytest.fixture
+def client(catalog: Catalog, store: FolderStore, settings: Settings) -> TestClient:
+    return client_of(catalog, store, settings, SearchWorker(catalog, store, settings))
+
+
+def checked(headers: Any) -> None:
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["x-frame-options"] == "DENY"
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["referrer-policy"]
+    assert headers["cross-origin-opener-policy"] == "same-origin"
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/api/v1/jobs", 200),
+        ("/api/v1/nowhere", 404),
+        ("/api/v1/jobs?misspelt=1", 422),
+        ("/", 200),
+        ("/docs", 200),
+        ("/redoc", 200),
+        ("/openapi.json", 200),
+        ("/console/app.js", 200),
+        ("/livez", 200),
+    ],
+)
+def test_every_answer_has_the_headers(client: TestClient, path: str, status: int) -> None:
+    answer = client.get(path)
+    assert answer.status_code == status
+    checked(answer.headers)
+    assert "strict-transport-security" not in answer.headers
+
+
+def test_an_answer_of_the_api_is_kept_by_no_cache_and_runs_nothing(client: TestClient) -> None:
+    headers = client.get("/api/v1/jobs").headers
+    assert headers["cache-control"] == "private, no-store"
+    assert headers["content-security-policy"].startswith("default-src 'none'")
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/redoc"])
+def test_pages_run_no_script_of_elsewhere(client: TestClient, path: str) -> None:
+    answer = client.get(path, headers={"Accept": "text/html"})
+    policy = dict(
+        rule.strip().split(" ", 1) for rule in answer.headers["content-security-policy"].split(";")
+    )
+    assert policy["default-src"] == "'self'"
+    scripts = policy.get("script-src", policy["default-src"])
+    assert "unsafe" not in scripts
+    assert "<script>" not in answer.text
+
+
+def test_refusals_at_the_door_have_the_headers_too(door: Door) -> None:
+    refused = door("wrong", "GET", "/jobs")
+    problem(refused, 401, "key_unknown")
+    checked(refused.headers)
+
+
+def test_https_alone_is_asked_for_where_it_is_set(
+    catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    strict = settings.model_copy(update={"hsts_seconds": 31_536_000})
+    answer = client_of(catalog, store, strict, Broken()).get("/livez")
+    assert answer.headers["strict-transport-security"] == "max-age=31536000"
+
+
+def test_a_fault_says_an_id_and_nothing_of_the_code(
+    catalog: Catalog, store: FolderStore, settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    answer = client_of(catalog, store, settings, Broken()).get("/api/v1/health")
+    body = problem(answer, 500, "internal_error")
+    checked(answer.headers)
+    assert not any(word in answer.text for word in ("secret", "place.py", "Runtime", "Traceback"))
+    assert f"request {body['request_id']}" in caplog.text, "by which the log is searched"
+    assert "/srv/secret/place.py" in caplog.text
+
+
+def test_no_page_of_elsewhere_may_read_answers(client: TestClient) -> None:
+    preflight = client.options(
+        "/api/v1/jobs", headers={"Origin": MAPS, "Access-Control-Request-Method": "GET"}
+    )
+    assert not preflight.is_success
+    for answer in (preflight, client.get("/livez", headers={"Origin": MAPS})):
+        assert not [name for name in answer.headers if name.startswith("access-control")]
+    problem(client.get("/api/v1/jobs", headers={"Origin": MAPS}), 403, "foreign_page")
+
+
+def test_a_page_that_is_trusted_may(
+    catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    open_to = settings.model_copy(update={"cors_origins": f"{MAPS}, https://other.example"})
+    client = client_of(catalog, store, open_to, SearchWorker(catalog, store, settings))
+    preflight = client.options(
+        "/api/v1/jobs",
+        headers={
+            "Origin": MAPS,
+            "Access-Control-Request-Method": "DELETE",
+            "Access-Control-Request-Headers": "authorization, idempotency-key",
+        },
+    )
+    assert preflight.status_code == 200
+    assert preflight.headers["access-control-allow-origin"] == MAPS
+    answer = client.get("/api/v1/jobs", headers={"Origin": MAPS})
+    assert answer.status_code == 200
+    assert answer.headers["access-control-allow-origin"] == MAPS
+    assert "access-control-allow-credentials" not in answer.headers
+    stranger = client.get("/api/v1/jobs", headers={"Origin": "https://evil.example"})
+    problem(stranger, 403, "foreign_page")
+    assert "access-control-allow-origin" not in stranger.headers

@@ -1,0 +1,157 @@
+"""Damage of every kind is found, and what can be repaired is."""
+
+from __future__ import annotations
+
+import json
+from uuid import UUID
+
+import pytest
+from sqlalchemy import delete, func, select
+
+from shared.catalog.base import Base
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.photos import Photo
+from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
+from shared.jobs import InProcessWakeups
+from shared.storage.chunks import manifest_key
+from tests.integration.in_process_api import Service
+from tests.integration.workplace import Workplace
+
+
+def looked(service: Service, *, originals: bool = False) -> IntegrityReport:
+    return verify_store(service.catalog, service.store, originals=originals)
+
+
+def faults(report: IntegrityReport) -> set[tuple[str, str]]:
+    return {(str(fault.wrong), fault.what) for fault in report.faults}
+
+
+def chunk_keys(service: Service) -> list[str]:
+    with service.catalog.read() as session:
+        wanted = select(Chunk.object_key).where(Chunk.superseded_at.is_(None)).order_by(Chunk.id)
+        return list(session.scalars(wanted))
+
+
+def mend(service: Service, report: IntegrityReport) -> int:
+    return repair_descriptors(service.catalog, InProcessWakeups(), report)
+
+
+def test_a_whole_store_has_no_faults(service: Service) -> None:
+    service.indexed(1, 2, 3)
+    report = looked(service, originals=True)
+    assert report.faults == []
+    assert report.checked == {"chunk": 1, "manifest": 1, "original": 3}
+    assert report.read_bytes > 0
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing", "manifest missing", "manifest another"])
+def test_photos_of_a_damaged_chunk_are_described_again(service: Service, damage: str) -> None:
+    file_ids = service.indexed(1, 2, 3)
+    before = service.json("POST", f"/similarity/{file_ids[0]}")["similar_images"]
+    (key,) = chunk_keys(service)
+    manifest = manifest_key(key)
+    if damage == "changed":
+        service.store.put(key, service.store.get(key)[:-1] + b"x")
+        expected = ("damaged", "chunk")
+    elif damage == "missing":
+        service.store.delete(key)
+        expected = ("missing", "chunk")
+    elif damage == "manifest missing":
+        service.store.delete(manifest)
+        expected = ("missing", "manifest")
+    else:
+        said = json.loads(service.store.get(manifest))
+        service.store.put(manifest, json.dumps({**said, "sha256": "0" * 64}).encode())
+        expected = ("different", "manifest")
+    report = looked(service)
+    assert faults(report) == {expected}
+    assert mend(service, report) == 3
+    assert mend(service, report) == 0, "once is enough"
+    service.drain()
+    assert looked(service).faults == []
+    assert key not in chunk_keys(service)
+    after = service.json("POST", f"/similarity/{file_ids[0]}")["similar_images"]
+    for one, other in zip(before, after, strict=True):
+        assert one["image_id"] == other["image_id"]
+        assert one["similarity_score"] == pytest.approx(other["similarity_score"], abs=1e-5)
+
+
+def test_rows_that_belong_to_other_photos_are_found(service: Service) -> None:
+    first, _ = service.indexed(1, 2)
+    with service.catalog.write() as session:
+        session.scalars(select(Descriptor).where(Descriptor.photo_id == UUID(first))).one().row = 5
+    report = looked(service)
+    assert faults(report) == {("different", "chunk")}
+    assert "1 photos have another row" in report.faults[0].detail
+
+
+def test_photos_without_a_descriptor_are_found_and_described_again(service: Service) -> None:
+    first, _ = service.indexed(1, 2)
+    with service.catalog.write() as session:
+        session.execute(delete(Descriptor).where(Descriptor.photo_id == UUID(first)))
+    report = looked(service)
+    assert [(str(f.wrong), f.name) for f in report.faults] == [("not_described", first)]
+    assert mend(service, report) == 1
+    service.drain()
+    assert looked(service).faults == []
+
+
+def test_a_changed_original_is_found_by_its_hash_and_a_missing_one_without(
+    service: Service,
+) -> None:
+    first, second = service.indexed(1, 2)
+    with service.catalog.read() as session:
+        changed = session.get_one(Photo, UUID(first)).object_key
+        lost = session.get_one(Photo, UUID(second)).object_key
+    data = service.store.get(changed)
+    service.store.put(changed, bytes([data[0] ^ 1]) + data[1:])
+    service.store.delete(lost)
+    assert faults(looked(service)) == {("missing", "original")}
+    report = looked(service, originals=True)
+    assert faults(report) == {("missing", "original"), ("damaged", "original")}
+    assert mend(service, report) == 0
+
+
+def test_deleted_photos_and_what_was_merged_away_are_no_faults(service: Service) -> None:
+    first, _ = service.indexed(1, 2)
+    with service.catalog.read() as session:
+        key = session.get_one(Photo, UUID(first)).object_key
+    assert service("DELETE", f"/uploads/{first}").is_success
+    service.store.delete(key)
+    assert looked(service, originals=True).faults == []
+
+
+def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Workplace) -> None:
+    vlads.upload(*range(10))
+    vlads.fit()
+    job_id, building = vlads.build(seed=1)
+    vlads.advance()
+    vlads.drain()
+    with vlads.catalog.read() as session:
+        chunk = session.scalars(select(Chunk).where(Chunk.generation_id == building)).first()
+    assert chunk is not None
+    vlads.store.delete(chunk.object_key)
+    report = verify_store(vlads.catalog, vlads.store, originals=False)
+    assert faults(report) == {("missing", "chunk")}
+    assert repair_descriptors(vlads.catalog, InProcessWakeups(), report) > 0
+    assert vlads.finish(job_id).state == "succeeded"
+    with vlads.catalog.read() as session:
+        rows = select(func.count()).select_from(Descriptor)
+        assert session.scalar(rows.where(Descriptor.generation_id == building)) == 10
+    assert verify_store(vlads.catalog, vlads.store, originals=True).faults == []
+
+
+def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
+    vlads.upload(*range(10))
+    vlads.fit()
+    (key,) = vlads.keys("vocabularies/")
+    vlads.store.put(key, vlads.store.get(key)[:-4] + b"\0\0\0\0")
+    found = verify_store(vlads.catalog, vlads.store, originals=False)
+    assert faults(found) == {("damaged", "vocabulary")}
+
+
+def test_every_table_that_names_objects_is_looked_at() -> None:
+    """A new one has to be added to `list_referenced_objects`, or backups would miss its objects
+    unseen."""
+    naming = {table.name for table in Base.metadata.sorted_tables if "object_key" in table.columns}
+    assert naming == {"batch_items", "chunks", "models", "photos", "vocabularies", "whitenings"}

@@ -1,0 +1,413 @@
+"""Search over several machines: what dies, what lags, what is where, and what is said of it."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from typing import Any, BinaryIO
+from uuid import UUID
+
+import httpx2
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from services.gateway.app import create_app
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.search import service as search_service
+from services.steward.evaluation_search import GeotaggedPhoto
+from services.steward.map_evaluation import MapEvaluation
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.errors import Unavailable
+from shared.evaluation.place_evidence import PhotoLocation
+from shared.jobs import InProcessWakeups
+from shared.search_api.photo_filter import PhotoFilter
+from shared.search_api.protocol import SearchRequest, SearchResponse
+from shared.storage import FolderStore
+from shared.storage.chunks import decode_rows, encode_rows
+from tests.contract.search.test_search_backend import SmallMap, assert_answers, unit_rows
+from tests.support.search_tier import SearchServer, SearchTier
+
+SLOTS = 7  # three shards have three, two and two of them
+BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth
+VECTOR = unit_rows(1000, 1)[0]
+
+
+@pytest.fixture
+def places(catalog: Catalog, store: FolderStore) -> SmallMap:
+    """Photos in every slot."""
+    made = SmallMap(catalog, store)
+    for slot in range(SLOTS):
+        made.add(unit_rows(slot, 3), slot)
+    return made
+
+
+OpenTier = Callable[..., SearchTier]
+
+
+@pytest.fixture
+def tier_of(catalog: Catalog, store: FolderStore, settings: Settings) -> Any:
+    """Opens tiers with so many replicas of each shard; each has loaded everything."""
+    opened: list[SearchTier] = []
+
+    def open_tier(*replicas: int, **changes: object) -> SearchTier:
+        own = settings.model_copy(
+            update={"search_wait_seconds": 0.2, "search_timeout_seconds": 10.0, **changes}
+        )
+        tier = SearchTier(catalog, store, own, replicas)
+        tier.follow()
+        opened.append(tier.__enter__())
+        return tier
+
+    yield open_tier
+    for tier in opened:
+        tier.__exit__(None, None, None)
+
+
+def ask(tier: SearchTier, places: SmallMap, k: int = 100, **changes: Any) -> SearchResponse:
+    request = places.request(places.query(VECTOR), k=k)
+    return tier.port.search(request.model_copy(update=changes))
+
+
+def slots_of(places: SmallMap) -> dict[UUID, int]:
+    """Every live photo's slot, as the catalog has it."""
+    with places.catalog.read() as session:
+        return {
+            photo_id: session.get_one(
+                Chunk, session.get_one(Descriptor, (places.generation_id, photo_id)).chunk_id
+            ).slot
+            for photo_id in places.rows
+        }
+
+
+def photos_of(server: SearchServer) -> set[UUID]:
+    """The photos that the worker has in memory."""
+    snapshots = server.worker._snapshots.values()
+    return {
+        photo_id
+        for snapshot in snapshots
+        for chunk in snapshot.chunks
+        for photo_id in chunk.photos.photo_id[chunk.photos.findable]
+    }
+
+
+# --- who dies --------------------------------------------------------------------------------
+
+
+def test_a_killed_shard_is_named_and_the_others_answer_until_it_is_back(
+    places: SmallMap, tier_of: OpenTier
+) -> None:
+    tier = tier_of(1, 1, 1)
+    everything = places.brute_force(VECTOR, 100)
+    assert_answers(ask(tier, places), everything)
+
+    tier.servers[1][0].stop()
+    slots = slots_of(places)
+    rest = [hit for hit in everything if slots[hit[0]] % 3 != 1]
+    response = ask(tier, places)
+    assert response.missing == ("shard 1/3",)
+    assert (response.certificate, response.certified_k) == ("none", 0)
+    assert_answers(response, rest)
+    assert len(rest) < len(everything)
+    assert tier.port.status().away == ("shard 1/3",)
+
+    tier.servers[1][0].start()
+    deadline = time.monotonic() + BACK_SECONDS
+    while (response := ask(tier, places)).missing:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert_answers(response, everything)
+    assert tier.port.status().away == ()
+
+
+def test_a_killed_replica_is_not_noticed(places: SmallMap, tier_of: OpenTier) -> None:
+    tier = tier_of(2, 2)
+    everything = places.brute_force(VECTOR, 100)
+    tier.servers[0][0].stop()
+    tier.servers[1][1].stop()
+    for _ in range(8):  # whichever is asked first
+        response = ask(tier, places)
+        assert response.missing == ()
+        assert_answers(response, everything)
+    assert tier.port.status().away == ()
+
+
+def test_without_any_worker_search_is_unavailable(places: SmallMap, tier_of: OpenTier) -> None:
+    tier = tier_of(1, 1)
+    for shard in tier.servers:
+        shard[0].stop()
+    with pytest.raises(Unavailable) as caught:
+        ask(tier, places)
+    assert caught.value.code == "search_unavailable"
+    with pytest.raises(Unavailable):
+        tier.port.status()
+
+
+# --- who lags --------------------------------------------------------------------------------
+
+
+def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[SearchRequest]:
+    """The worker never reaches the version that is asked for; what it was asked."""
+    asked: list[SearchRequest] = []
+
+    def search(request: SearchRequest) -> SearchResponse:
+        asked.append(request)
+        raise Unavailable("search_behind", "Search has not caught up.")
+
+    monkeypatch.setattr(server.worker, "search", search)
+    return asked
+
+
+def test_every_shard_answers_at_least_the_version_that_is_asked_for(
+    places: SmallMap, tier_of: OpenTier
+) -> None:
+    tier = tier_of(1, 2, 1)
+    for seed in range(4):
+        places.add(VECTOR[np.newaxis] + unit_rows(seed, 1) / 10, slot=seed % 3)
+        places.delete(next(iter(places.rows)))
+        response = ask(tier, places)
+        assert response.snapshot_version == places.version
+        assert {hit.photo_id for hit in response.hits} == set(places.rows)
+
+
+def test_of_a_replica_that_is_behind_the_other_one_answers(
+    places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = tier_of(1, 2)
+    asked = behind(tier.servers[1][0], monkeypatch)
+    for _ in range(10):
+        response = ask(tier, places)
+        assert response.missing == ()
+        assert_answers(response, places.brute_force(VECTOR, 100))
+    assert asked, "the replica that is behind was never asked first"
+
+
+def test_a_shard_that_stays_behind_is_named_at_the_deadline(
+    places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = tier_of(1, 1, search_timeout_seconds=0.5)
+    asked = behind(tier.servers[0][0], monkeypatch)
+    started = time.monotonic()
+    response = ask(tier, places)
+    assert response.missing == ("shard 0/2",)
+    assert response.hits
+    assert len(asked) > 2, "it was not asked again"
+    assert time.monotonic() - started < 5
+
+
+def test_a_worker_that_hangs_costs_its_own_shard_alone(
+    places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = tier_of(1, 1, search_timeout_seconds=0.5)
+    monkeypatch.setattr(tier.servers[1][0].worker, "search", lambda request: time.sleep(1.5))
+    response = ask(tier, places)
+    assert response.missing == ("shard 1/2",)
+    assert response.hits
+
+
+# --- what is where ---------------------------------------------------------------------------
+
+
+def test_each_photo_is_in_one_shard_and_merging_moves_none(
+    places: SmallMap, tier_of: OpenTier
+) -> None:
+    tier = tier_of(1, 1, 1)
+    for slot in range(SLOTS):
+        places.add(unit_rows(100 + slot, 2), slot)
+    tier.follow()
+    before = [photos_of(shard[0]) for shard in tier.servers]
+    assert sum(len(photos) for photos in before) == len(places.rows)
+    assert set.union(*before) == set(places.rows)
+    slots = slots_of(places)
+    assert all(slots[photo_id] % 3 == i for i, photos in enumerate(before) for photo_id in photos)
+
+    places.delete(next(iter(before[0])))
+    assert all(places.merge(slot) for slot in range(SLOTS))
+    tier.follow()
+    after = [photos_of(shard[0]) for shard in tier.servers]
+    assert after == [photos & set(places.rows) for photos in before]
+    assert_answers(ask(tier, places), places.brute_force(VECTOR, 100))
+
+
+def test_a_query_row_of_another_shard_is_read_alone_and_kept(
+    places: SmallMap, tier_of: OpenTier, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = tier_of(1, 1, 1)
+    held = [server[0].worker.status().resident_bytes for server in tier.servers]
+    photo_id = next(id_ for id_, slot in slots_of(places).items() if slot == 4)
+    request = places.request(places.reference(photo_id), k=5, exclude=(photo_id,))
+    opened: list[str] = []
+    real = store.open
+
+    def open_(key: str) -> BinaryIO:
+        opened.append(key)
+        return real(key)
+
+    monkeypatch.setattr(store, "open", open_)
+    first = tier.port.search(request)
+    assert_answers(first, places.brute_force(places.rows[photo_id], 6)[1:])
+    assert opened == [request.object_key] * 2, "once by each of the shards that don't hold it"
+    assert tier.port.search(request) == first
+    assert len(opened) == 2
+    assert [s[0].worker.status().resident_bytes for s in tier.servers] == held
+
+
+def test_a_damaged_query_row_of_another_shard_is_not_compared(
+    places: SmallMap, tier_of: OpenTier, store: FolderStore
+) -> None:
+    """Its owner would notice by the chunk's hash, but its owner is away."""
+    tier = tier_of(1, 1)
+    photo_id = next(id_ for id_, slot in slots_of(places).items() if slot == 1)
+    key, row = places.reference(photo_id)
+    damaged = decode_rows(store.get(key)).copy()
+    damaged[row, 3] += 0.2
+    store.put(key, encode_rows(damaged))
+    tier.servers[1][0].stop()
+    with pytest.raises(Unavailable) as caught:
+        tier.port.search(places.request((key, row)))
+    assert caught.value.code == "chunk_unreadable"
+    assert caught.value.extra["object_key"] == key
+
+
+def test_a_filter_is_applied_in_every_shard(places: SmallMap, tier_of: OpenTier) -> None:
+    tier = tier_of(1, 1, 1)
+    wanted = tuple(list(places.rows)[::4])
+    response = ask(tier, places, photos=PhotoFilter(ids=wanted))
+    expected = [hit for hit in places.brute_force(VECTOR, 100) if hit[0] in wanted]
+    assert_answers(response, expected)
+    assert response.rows_scanned == len(wanted)
+
+
+def test_equal_scores_of_all_shards_come_in_the_order_of_the_photos(
+    catalog: Catalog, store: FolderStore, tier_of: OpenTier
+) -> None:
+    places = SmallMap(catalog, store)
+    for slot in (2, 0, 1, 0):
+        places.add(np.repeat(VECTOR[np.newaxis], 3, axis=0), slot)
+    response = ask(tier_of(1, 1, 1), places, k=8)
+    assert [hit.photo_id for hit in response.hits] == sorted(places.rows)[:8]
+
+
+# --- what is said of it ----------------------------------------------------------------------
+
+
+def test_the_gateways_health_names_shards_without_workers_and_stays_ready(
+    places: SmallMap,
+    tier_of: OpenTier,
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+) -> None:
+    tier = tier_of(1, 2)
+    gateway = GatewayContext(
+        catalog, store, InProcessWakeups(), tier.port, settings, LocalhostAuthenticator()
+    )
+    with TestClient(create_app(gateway), base_url="http://localhost") as client:
+        assert client.get("/api/v1/health").json()["parts"]["search"] == {
+            "status": "healthy",
+            "detail": f"{len(places.rows)} rows in memory",
+        }
+        tier.servers[0][0].stop()
+        tier.servers[1][0].stop()  # its shard has another one
+        answer = client.get("/api/v1/health")
+        assert (answer.status_code, answer.json()["status"]) == (503, "degraded")
+        assert answer.json()["parts"]["search"] == {
+            "status": "degraded",
+            "detail": "no search worker is available for: shard 0/2",
+        }
+        assert client.get("/readyz").status_code == 200
+        tier.servers[1][1].stop()
+        answer = client.get("/api/v1/health")
+        assert (answer.status_code, answer.json()["status"]) == (503, "unhealthy")
+        assert client.get("/readyz").status_code == 503
+
+
+def test_a_map_is_not_measured_while_a_shard_is_missing(
+    places: SmallMap, tier_of: OpenTier, catalog: Catalog
+) -> None:
+    tier = tier_of(1, 1)
+    with catalog.read() as session:
+        generation = session.get_one(Generation, places.generation_id)
+    measure = MapEvaluation(catalog, tier.port, generation, 25.0, lambda: None)
+    sample = [GeotaggedPhoto(next(iter(places.rows)), PhotoLocation(None, None, "hall"), None)]
+    measure.evaluate(sample)
+    tier.servers[1][0].stop()
+    with pytest.raises(Unavailable) as caught:
+        measure.evaluate(sample)
+    assert caught.value.code == "search_incomplete"
+
+
+def test_a_worker_is_ready_once_it_has_loaded_what_answers(
+    places: SmallMap,
+    catalog: Catalog,
+    store: FolderStore,
+    tier_of: OpenTier,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tier = tier_of(1)
+    server = tier.servers[0][0]
+    server.stop()
+    server.start()
+    server.wait_until_started()
+
+    def ready() -> tuple[int, Any]:
+        answer = httpx2.get(f"{server.url}/readyz")
+        return answer.status_code, answer.json()
+
+    status, body = ready()
+    assert (status, body["reasons"]) == (503, ["the catalog has not been read yet"])
+    server.worker.sync()
+    status, body = ready()
+    assert (status, body["status"], body["reasons"]) == (200, "ready", [])
+    (lag,) = body["lags"].values()
+    assert lag["versions"] == 0
+    assert 0 <= lag["seconds"] < 5
+
+    with monkeypatch.context() as patched:
+        patched.setattr(search_service, "MAX_READY_LAG_SECONDS", 0.0)
+        status, body = ready()
+        assert status == 503
+        assert re.search("is 0 versions behind, last current .* s ago", body["reasons"][0])
+
+    key = places.chunk_keys()[0]
+    whole = store.get(key)
+    store.put(key, whole[:-1])
+    server.stop()
+    server.start()
+    server.wait_until_started()
+    server.worker.sync()
+    status, body = ready()
+    assert (status, body["status"], body["missing"]) == (200, "degraded", [key])
+    assert httpx2.get(f"{server.url}/livez").status_code == 200
+
+
+def test_metrics_tell_searches_rows_versions_and_memory(
+    places: SmallMap, tier_of: OpenTier
+) -> None:
+    tier = tier_of(1)
+    ask(tier, places)
+    ask(tier, places)
+    with pytest.raises(Exception, match="no longer exists"):
+        tier.port.search(places.request(("chunks/no/such.npy", 0)))
+    text = httpx2.get(f"{tier.servers[0][0].url}/metrics").text
+    figures = dict(re.findall(r"^(\w+(?:\{[^}]*\})?) (\S+)$", text, flags=re.MULTILINE))
+    generation = f'{{generation="{places.generation_id}"}}'
+    rows = len(places.rows)
+    expected = {
+        'placewise_search_searches_total{outcome="answered"}': 2,
+        'placewise_search_searches_total{outcome="query_expired"}': 1,
+        "placewise_search_seconds_count": 2,
+        "placewise_search_rows_scanned_total": 2 * rows,
+        "placewise_search_rows": rows,
+        "placewise_search_resident_bytes": rows * 12 * 4,
+        "placewise_search_missing_chunks": 0,
+        f"placewise_search_snapshot_version{generation}": places.version,
+        f"placewise_search_snapshot_lag_versions{generation}": 0,
+    }
+    assert {name: float(figures[name]) for name in expected} == expected
+    assert float(figures[f"placewise_search_snapshot_lag_seconds{generation}"]) >= 0

@@ -1,0 +1,146 @@
+"""What is kept for a while only, and what must not go with it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select, update
+
+from services.steward.tasks import maintenance as retention_module
+from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
+from shared.catalog.base import db_now_plus
+from shared.catalog.maps import Search, get_map
+from shared.catalog.session import Catalog
+from shared.jobs import Job, JobKind, JobState
+from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import add_job
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.problems import problem
+
+DAY_SECONDS = 86_400.0
+DAYS = 30.0
+
+
+def age_jobs(catalog: Catalog, days: float) -> None:
+    """Everything that has ended ended so many days ago."""
+    with catalog.write() as session:
+        session.execute(
+            update(Job)
+            .where(Job.finished_at.is_not(None))
+            .values(finished_at=db_now_plus(-days * DAY_SECONDS))
+            .execution_options(synchronize_session=False)
+        )
+
+
+def jobs(catalog: Catalog) -> set[str]:
+    with catalog.read() as session:
+        return {str(job_id) for job_id in session.scalars(select(Job.id))}
+
+
+def upload_again(service: Service, data: bytes) -> Any:
+    answer = service("POST", "/upload", files={"file": data})
+    assert answer.status_code in (200, 202), answer.text
+    return answer.status_code, answer.json()
+
+
+def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: Catalog) -> None:
+    done = service.upload(photo_bytes(1))["job_id"]
+    asked = service.ask(near_copy(1))
+    service.drain()
+    with catalog.write() as session:
+        map_id = get_map(session, "default").id
+        failed_fit = add_job(
+            session, map_id, JobKind.FIT, state=JobState.FAILED, finished_at=db_now_plus(0)
+        ).id
+    age_jobs(catalog, DAYS - 0.01)
+    delete_old_jobs(catalog, DAYS)
+    assert jobs(catalog) == {done, asked, str(failed_fit)}
+    age_jobs(catalog, DAYS + 0.01)
+    recent = service.upload(photo_bytes(2))["job_id"]
+    service.drain()
+    waiting = service.upload(photo_bytes(3))["job_id"]
+    delete_old_jobs(catalog, DAYS)
+    assert jobs(catalog) == {recent, waiting}
+    problem(service("GET", f"/jobs/{done}"), 404, "job_not_found")
+
+
+def test_a_described_photo_needs_its_job_no_more(service: Service, catalog: Catalog) -> None:
+    first = service.upload(photo_bytes(1))
+    service.drain()
+    age_jobs(catalog, DAYS + 1)
+    delete_old_jobs(catalog, DAYS)
+    assert jobs(catalog) == set()
+    status, again = upload_again(service, photo_bytes(1))
+    assert (status, again["file_id"], again["job_id"]) == (200, first["file_id"], None)
+    assert again["status"] == "succeeded"
+    assert service.json("GET", again["status_url"].removeprefix("/api/v1"))["searchable"]
+    assert service.json("POST", f"/similarity/{first['file_id']}")["total_similar"] == 0
+    assert service.json("DELETE", f"/uploads/{first['file_id']}")["success"]
+    assert upload_again(service, photo_bytes(1))[0] == 202
+
+
+@pytest.mark.parametrize("end", ["failed", "cancelled"])
+def test_a_photo_that_was_not_described_keeps_its_job_and_can_be_queued_again(
+    service: Service, catalog: Catalog, end: str
+) -> None:
+    data = photo_bytes(1)[:-60] if end == "failed" else photo_bytes(1)
+    first = service.upload(data)
+    if end == "cancelled":
+        service.json("POST", f"/jobs/{first['job_id']}/cancel")
+    service.drain()
+    age_jobs(catalog, 10 * DAYS)
+    delete_old_jobs(catalog, DAYS)
+    assert service.json("GET", f"/jobs/{first['job_id']}")["state"] == end
+    status, again = upload_again(service, data)
+    assert (status, again["job_id"], again["status"]) == (202, first["job_id"], "queued")
+    service.drain()
+    job = service.json("GET", f"/jobs/{first['job_id']}")
+    assert job["state"] == ("failed" if end == "failed" else "succeeded")
+    service.json("DELETE", f"/uploads/{first['file_id']}")
+
+
+def test_an_old_failure_that_was_tried_again_is_not_old(service: Service, catalog: Catalog) -> None:
+    job_id = service.upload(photo_bytes(1))["job_id"]
+    service.json("POST", f"/jobs/{job_id}/cancel")
+    age_jobs(catalog, 10 * DAYS)
+    service.json("POST", f"/jobs/{job_id}/retry")
+    delete_old_jobs(catalog, DAYS)
+    assert service.json("GET", f"/jobs/{job_id}")["state"] == "queued"
+
+
+def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog) -> None:
+    (photo,) = service.indexed(1)
+    for _ in range(2):
+        service.json("POST", f"/similarity/{photo}")
+    old, recent = (s["search_id"] for s in service.json("GET", "/searches")["searches"])
+    with catalog.write() as session:
+        session.get_one(Search, UUID(old)).searched_at = datetime.now(UTC) - timedelta(days=91)
+        session.get_one(Search, UUID(recent)).searched_at = datetime.now(UTC) - timedelta(days=89)
+    delete_old_searches(catalog, 90)
+    found = service.json("GET", "/searches")["searches"]
+    assert [search["search_id"] for search in found] == [recent]
+    assert service.json("GET", "/database/stats")["total_searches"] == 1
+
+
+def test_more_than_one_transaction_takes_goes_in_several(
+    service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention_module, "RETENTION_ROWS_PER_TRANSACTION", 2)
+    with catalog.write() as session:
+        map_id = get_map(session, "default").id
+        for _ in range(5):
+            add_job(
+                session,
+                map_id,
+                JobKind.EVALUATE,
+                state=JobState.SUCCEEDED,
+                finished_at=db_now_plus(-2 * DAY_SECONDS),
+            )
+    left = []
+    for _ in range(3):
+        delete_old_jobs(catalog, 1)
+        left.append(len(jobs(catalog)))
+    assert left == [3, 1, 0]

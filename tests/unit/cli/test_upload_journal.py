@@ -1,0 +1,134 @@
+"""A journal: what a server has taken is not sent again, whatever cut the run off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.progress import Progress
+
+from services.cli.ingest.geotags import LocalPhoto, read_photo_manifest
+from services.cli.ingest.upload import JournalEntry, UploadJournal, upload_photos
+from shared.client import Client
+from shared.errors import InvalidRequest, NotFound
+from tests.unit.client.test_client import FakeServer, running_server
+
+TAKEN = JournalEntry("file", "job")
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> LocalPhoto:
+    path = tmp_path / "1.jpg"
+    path.write_bytes(b"one")
+    return LocalPhoto(path, {"latitude": "45.5"})
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "journal.jsonl"
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with running_server() as made:
+        yield made
+
+
+def test_a_photo_that_was_taken_is_known_to_the_next_run(path: Path, photo: LocalPhoto) -> None:
+    with UploadJournal(path, "http://a", None) as journal:
+        assert journal.done(photo) is None
+        journal.add(photo, TAKEN)
+    with UploadJournal(path, "http://a", None) as journal:
+        assert journal.done(photo) == TAKEN
+
+
+def test_a_photo_that_has_changed_or_of_which_more_is_said_is_sent_again(
+    path: Path, photo: LocalPhoto
+) -> None:
+    with UploadJournal(path, "http://a", None) as journal:
+        journal.add(photo, TAKEN)
+    with UploadJournal(path, "http://a", None) as journal:
+        assert journal.done(LocalPhoto(photo.path, {"place": "hall"})) is None
+        photo.path.write_bytes(b"another")
+        assert journal.done(photo) is None
+        photo.path.unlink()
+        assert journal.done(photo) is None
+
+
+def test_a_line_that_a_kill_has_cut_off_is_passed_over(path: Path, photo: LocalPhoto) -> None:
+    with UploadJournal(path, "http://a", None) as journal:
+        journal.add(photo, TAKEN)
+    whole = path.read_text()
+    path.write_text(whole[:-20])
+    with UploadJournal(path, "http://a", None) as journal:
+        assert journal.done(photo) is None
+        journal.add(photo, TAKEN)
+    with UploadJournal(path, "http://a", None) as journal:
+        assert journal.done(photo) == TAKEN
+
+
+@pytest.mark.parametrize("other", [("http://b", None), ("http://a", "lab")])
+def test_a_journal_of_another_server_or_map_is_refused(
+    path: Path, other: tuple[str, str | None]
+) -> None:
+    UploadJournal(path, "http://a", None).__exit__(None, None, None)
+    with pytest.raises(InvalidRequest) as caught:
+        UploadJournal(path, *other)
+    assert caught.value.code == "bad_journal"
+
+
+def test_a_file_that_is_no_journal_is_refused_and_left_alone(path: Path) -> None:
+    path.write_text("my notes\n")
+    with pytest.raises(InvalidRequest):
+        UploadJournal(path, "http://a", None)
+    assert path.read_text() == "my notes\n"
+
+
+def uploads(server: FakeServer) -> int:
+    return sum(asked[1].startswith("/api/v1/upload") for asked in server.asked)
+
+
+def test_a_run_that_was_broken_off_sends_only_the_rest(
+    server: FakeServer, path: Path, photo: LocalPhoto, tmp_path: Path
+) -> None:
+    (tmp_path / "2.jpg").write_bytes(b"two")
+    photos = [photo, LocalPhoto(tmp_path / "2.jpg", {})]
+    stats = {"searchable_images": 2, "vocabulary": "own", "total_images": 2}
+    ended = {"state": "succeeded", "error": None, "waiting_for": None}
+    uploaded = {"file_id": "two", "job_id": "j2", "already_there": False, "status": "queued"}
+    with UploadJournal(path, server.url, None) as journal:
+        journal.add(photo, TAKEN)
+    server.will_answer(200, stats)
+    server.will_answer(202, uploaded)
+    server.will_answer(404, NotFound("job_not_found", "Deleted.").as_problem())
+    server.will_answer(200, ended)
+    server.will_answer(200, stats)
+    with Client(server.url) as client, UploadJournal(path, server.url, None) as journal:
+        report = upload_photos(client, photos, False, Progress(disable=True), journal=journal)
+    assert uploads(server) == 1
+    assert (report["uploaded"], report["already_there"]) == (1, 1)
+    assert report["refused"] == report["failed"] == []
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line.get("file_id") for line in lines] == [None, "file", "two"]
+
+
+def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:
+    (tmp_path / "1.jpg").write_bytes(b"one")
+    return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
+
+
+def test_a_list_names_photos_beside_it_with_what_is_said_of_them(tmp_path: Path) -> None:
+    data = manifest(tmp_path, {"filename": "1.jpg", "tags": ["a", "b"], "role": "query"})
+    [found] = read_photo_manifest(tmp_path / "list.jsonl", data)
+    assert found == LocalPhoto(tmp_path / "1.jpg", {"tags": "a,b", "role": "query"})
+
+
+def test_a_list_that_names_a_missing_photo_is_refused_by_its_line(tmp_path: Path) -> None:
+    data = manifest(tmp_path, {"filename": "1.jpg"}, {"filename": "2.jpg"})
+    with pytest.raises(InvalidRequest) as caught:
+        read_photo_manifest(tmp_path / "list.jsonl", data)
+    assert caught.value.code == "bad_manifest"
+    assert [error["line"] for error in caught.value.extra["errors"]] == [2]

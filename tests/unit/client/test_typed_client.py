@@ -1,0 +1,231 @@
+"""The typed client: one implementation for both ways of waiting, answers as the API describes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import pytest
+from fastapi import FastAPI
+from pydantic import BaseModel
+
+import placewise
+from placewise import answers
+from services.gateway import schemas
+from services.gateway.routes import batches, evaluations, maps
+from services.gateway.routes import stats as figures
+from services.gateway.routes import stats as history
+from tests.unit.client.test_client import FakeServer, running_server
+from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
+
+JOB = {
+    "job_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
+    "kind": "index",
+    "state": "succeeded",
+    "stage": None,
+    "waiting_for": None,
+    "awaited": None,
+    "progress": {"done": 1, "total": 1, "failed": 0},
+    "attempts": 1,
+    "file_id": None,
+    "result": None,
+    "error": None,
+    "created_at": "2026-11-21T05:46:58Z",
+    "started_at": None,
+    "finished_at": None,
+    "status_url": "/api/v1/jobs/01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
+    "result_url": None,
+    "request_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
+}
+PHOTO = {
+    "image_id": "01a1fca4-c1a2-7356-bf32-75e1cb64beb1",
+    "image_path": "/image",
+    "original_filename": "street.jpg",
+    "upload_time": "2026-11-21T05:46:58Z",
+    "file_size": 5,
+    "width": 4,
+    "height": 3,
+    "metadata": {},
+    "tags": ["a"],
+    "latitude": 45.5,
+    "longitude": None,
+    "heading": None,
+    "captured_at": None,
+    "place": None,
+    "role": "database",
+    "image_url": "/image",
+    "thumbnail_url": "/thumbnail",
+}
+STARTED = {"job_id": JOB["job_id"], "status": "queued", "status_url": "/", "result_url": None}
+SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
+    (answers.Photo, schemas.PhotoResponse),
+    (answers.OnePhoto, schemas.PhotoDetailResponse),
+    (answers.Deleted, schemas.DeletedPhotoResponse),
+    (answers.Uploaded, schemas.UploadResponse),
+    (answers.Similar, schemas.SimilarityResponse),
+    (answers.Estimate, schemas.EstimateResponse),
+    (answers.Explanation, schemas.ExplanationResponse),
+    (answers.ClusterShare, schemas.ClusterShareResponse),
+    (answers.Progress, schemas.JobProgress),
+    (answers.Job, schemas.JobResponse),
+    (answers.Started, schemas.JobAcceptedResponse),
+    (answers.BatchStarted, batches.BatchAcceptedResponse),
+    (answers.BatchItem, batches.BatchItemResponse),
+    (answers.Vocabulary, schemas.VocabularyResponse),
+    (answers.Generation, schemas.GenerationResponse),
+    (answers.Evaluation, evaluations.EvaluationResponse),
+    (answers.Search, history.SearchHistoryEntry),
+    (answers.Map, maps.MapResponse),
+    (answers.Stats, figures.StatsResponse),
+]
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with running_server() as made:
+        yield made
+
+
+@pytest.mark.parametrize("source", GENERATED_FILES)
+def test_synchronous_client_is_made_of_the_asynchronous_one(source: str) -> None:
+    assert (ROOT / GENERATED_FILES[source]).read_text() == to_synchronous(source), (
+        "run `make client`"
+    )
+
+
+@pytest.mark.parametrize(("mine", "servers"), SAME, ids=lambda kind: kind.__name__)
+def test_answers_have_the_fields_that_the_server_sends(
+    mine: type[BaseModel], servers: type[BaseModel]
+) -> None:
+    """Every field is there, none is required that may be missing, and null is understood."""
+    app = FastAPI()
+    app.get("/", response_model=servers)(lambda: None)
+    described = app.openapi()["components"]["schemas"][servers.__name__]
+    known = mine.model_json_schema(mode="serialization")
+    assert set(known["properties"]) == set(described["properties"])
+    assert set(mine.model_json_schema()["required"]) <= set(described["required"])
+    for name, about in described["properties"].items():
+        assert _is_nullable(known["properties"][name]) == _is_nullable(about), name
+
+
+def _is_nullable(schema: dict[str, Any]) -> bool:
+    return {"type": "null"} in schema.get("anyOf", [])
+
+
+def test_answers_are_typed_and_keep_what_a_newer_server_adds(server: FakeServer) -> None:
+    newer = {
+        **PHOTO,
+        "job_id": None,
+        "media_type": "image/jpeg",
+        "sha256": "ab",
+        "searchable": True,
+    }
+    server.will_answer(200, {**newer, "storeys": 5})
+    with placewise.connect(server.url) as places:
+        photo = places.photo("abc")
+    assert photo.image_id == UUID(str(PHOTO["image_id"]))
+    assert photo.upload_time.utcoffset() is not None
+    assert photo.model_extra == {"storeys": 5}
+
+
+def test_every_post_has_a_key_without_being_asked(server: FakeServer) -> None:
+    for _ in range(2):
+        server.will_answer(202, STARTED)
+    with placewise.connect(server.url) as places:
+        places.evaluate()
+        places.fit_vocabulary()
+    keys = [headers.get("Idempotency-Key") for headers in server.headers]
+    assert None not in keys
+    assert len(set(keys)) == 2
+
+
+def test_photos_are_fetched_page_after_page_as_they_are_reached(server: FakeServer) -> None:
+    server.will_answer(200, {"images": [PHOTO, PHOTO], "next_cursor": "more"})
+    server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
+    with placewise.connect(server.url, map="lab") as places:
+        found = places.photos(place="atrium")
+        next(found)
+        assert len(server.asked) == 1
+        assert len(list(found)) == 2
+    assert "cursor=more" in server.asked[1][1]
+    assert all("map=lab" in path and "place=atrium" in path for _, path, _ in server.asked)
+
+
+def test_waiting_raises_what_the_job_has_failed_of(server: FakeServer) -> None:
+    error = {"code": "undecodable_photo", "detail": "It is cut off.", "status": 422}
+    server.will_answer(200, {**JOB, "state": "running"})
+    server.will_answer(200, {**JOB, "state": "failed", "error": error})
+    seen: list[str] = []
+    with (
+        placewise.connect(server.url) as places,
+        pytest.raises(placewise.Unprocessable) as caught,
+    ):
+        places.wait(str(JOB["job_id"]), on_progress=lambda job: seen.append(job.state))
+    assert (caught.value.code, caught.value.detail) == ("undecodable_photo", "It is cut off.")
+    assert seen == ["running", "failed"]
+
+
+def test_waiting_ends_when_its_time_is_over(server: FakeServer) -> None:
+    server.will_answer(200, {**JOB, "state": "running"})
+    with placewise.connect(server.url) as places, pytest.raises(placewise.Unavailable) as caught:
+        places.wait(str(JOB["job_id"]), timeout_seconds=0)
+    assert caught.value.code == "job_unfinished"
+
+
+def test_asynchronous_client_uploads_waits_and_lists(server: FakeServer, tmp_path: Path) -> None:
+    path = tmp_path / "street.jpg"
+    path.write_bytes(b"the photo's bytes" * 100_000)
+    uploaded = {
+        "file_id": PHOTO["image_id"],
+        "job_id": JOB["job_id"],
+        "filename": "street.jpg",
+        "file_size": 5,
+        "upload_time": "2026-11-21T05:46:58Z",
+        "status": "queued",
+        "status_url": "/",
+        "already_there": False,
+        "message": "",
+    }
+    server.will_answer(202, uploaded)
+    server.will_answer(200, JOB)
+    server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
+
+    async def use() -> list[answers.Photo]:
+        async with placewise.connect_async(server.url, key="secret") as places:
+            job = await places.wait(await places.upload(path, latitude=45.5))
+            assert job.finished
+            return [photo async for photo in places.photos()]
+
+    assert [photo.latitude for photo in asyncio.run(use())] == [45.5]
+    assert path.read_bytes() in server.asked[0][2]
+    assert {headers.get("Authorization") for headers in server.headers} == {"Bearer secret"}
+
+
+def test_asynchronous_client_sends_a_direct_upload_in_pieces(
+    server: FakeServer, tmp_path: Path
+) -> None:
+    path = tmp_path / "street.jpg"
+    path.write_bytes(b"x" * 700_000)
+    headers = {"Content-Length": "700000"}
+    put = {"method": "PUT", "url": f"{server.url}/bucket/1", "headers": headers}
+    server.will_answer(201, {**put, "complete_url": "/api/v1/uploads/presign/1/complete"})
+    server.will_answer(200, b"")
+    server.will_answer(404, placewise.NotFound("upload_not_found", "None.").as_problem())
+
+    async def use() -> None:
+        async with placewise.connect_async(server.url) as places:
+            await places.upload_direct(path)
+
+    with pytest.raises(placewise.NotFound) as caught:
+        asyncio.run(use())
+    assert caught.value.code == "upload_not_found"
+    assert server.asked[1] == ("PUT", "/bucket/1", path.read_bytes())
+    assert json.loads(server.asked[0][2])["file_size"] == 700_000
+
+
+def test_package_says_that_it_is_typed() -> None:
+    assert Path(placewise.__file__).with_name("py.typed").is_file()

@@ -1,0 +1,38 @@
+"""The memory of a fit does not depend on how many photos it learns from."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.support.fit_memory import CLUSTERS, PATCHES, WIDTH
+
+REPOSITORY = Path(__file__).parents[4]
+ALL_FEATURES_BYTES = 2000 * PATCHES * WIDTH * 4  # 786 MB
+
+
+def fit_in_its_own_process(photos: int) -> dict[str, int]:
+    child = subprocess.run(
+        [sys.executable, "-m", "tests.support.fit_memory", str(photos)],
+        cwd=REPOSITORY,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert child.returncode == 0, child.stderr
+    said: dict[str, int] = json.loads(child.stdout)
+    assert (said["photos"], said["clusters"]) == (photos, CLUSTERS)
+    return said
+
+
+def test_a_fit_on_two_thousand_photos_takes_no_more_memory_than_one_on_five_hundred() -> None:
+    few, many = fit_in_its_own_process(500), fit_in_its_own_process(2000)
+    assert few["patches"] == 500 * PATCHES, "all of them"
+    assert many["patches"] > 150_000, "a share of each photo's"
+    assert many["peak"] < 2_000_000_000
+    assert many["peak"] - few["peak"] < 50_000_000
+    assert many["peak"] - many["before"] < 200_000_000 < ALL_FEATURES_BYTES / 3

@@ -1,0 +1,354 @@
+"""Multipart bodies, taken apart as they arrive: in any pieces, within limits, leaving nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pytest
+from starlette.requests import ClientDisconnect, Request
+from starlette.types import Message
+
+from services.gateway.uploads.multipart import (
+    MAX_FIELDS_BYTES,
+    OVERHEAD_BYTES,
+    STORE_WRITE_BYTES,
+    store_form_file,
+)
+from shared.errors import InvalidRequest, PlacewiseError, TooLarge, UnsupportedMedia
+from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.storage import FolderStore
+from tests.support.photos import photo_bytes
+
+BOUNDARY = "the-boundary"
+KEY = "originals/test"
+LIMIT = 100_000
+PHOTO = photo_bytes(1)
+
+
+def field(name: str, value: str | bytes) -> bytes:
+    data = value.encode() if isinstance(value, str) else value
+    return part(f'form-data; name="{name}"', data)
+
+
+def file(data: bytes = PHOTO, name: str = "street.jpg", field: str = "file") -> bytes:
+    return part(f'form-data; name="{field}"; filename="{name}"', data, "image/jpeg")
+
+
+def part(disposition: str, data: bytes, media: str | None = None) -> bytes:
+    head = f"--{BOUNDARY}\r\nContent-Disposition: {disposition}\r\n"
+    head += f"Content-Type: {media}\r\n" if media else ""
+    return head.encode() + b"\r\n" + data + b"\r\n"
+
+
+END = f"--{BOUNDARY}--\r\n".encode()
+
+
+class Body:
+    """What a client sends, piece by piece; knows how much of it was asked for."""
+
+    def __init__(self, pieces: Iterable[bytes], *, cut_off: bool = False) -> None:
+        self._pieces = list(pieces)
+        self._cut_off = cut_off
+        self.taken = 0
+
+    @property
+    def left(self) -> int:
+        return len(self._pieces) - self.taken
+
+    async def receive(self) -> Message:
+        if self.taken == len(self._pieces):
+            assert self._cut_off, "the server read on behind the end"
+            return {"type": "http.disconnect"}
+        piece = self._pieces[self.taken]
+        self.taken += 1
+        more = self._cut_off or self.taken < len(self._pieces)
+        return {"type": "http.request", "body": piece, "more_body": more}
+
+
+def in_pieces(data: bytes, size: int) -> list[bytes]:
+    return [data[begin : begin + size] for begin in range(0, len(data), size)]
+
+
+def receive(
+    store: FolderStore,
+    body: Body | bytes,
+    *,
+    headers: dict[str, str] | None = None,
+    max_bytes: int = LIMIT,
+    check_begin: Callable[[bytes], object] = lambda begin: None,
+) -> StoredUpload:
+    if isinstance(body, bytes):
+        body = Body([body])
+    sent = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"} | (headers or {})
+    scope = {
+        "type": "http",
+        "method": "POST",
+        "path": "/api/v1/upload",
+        "query_string": b"",
+        "headers": [(k.encode(), v.encode()) for k, v in sent.items()],
+    }
+    request = Request(scope, body.receive)
+    return asyncio.run(store_form_file(request, store, KEY, max_bytes, check_begin))
+
+
+def refused(store: FolderStore, body: Body | bytes, **options: object) -> PlacewiseError:
+    """The error; nothing is left of the body, neither whole nor half written."""
+    with pytest.raises(PlacewiseError) as caught:
+        receive(store, body, **options)  # type: ignore[arg-type]
+    assert_nothing_left(store)
+    return caught.value
+
+
+def assert_nothing_left(store: FolderStore) -> None:
+    assert [path for path in Path(store.root).rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize("beyond", [-1, 0, 1, 2 * STORE_WRITE_BYTES + 1])
+@pytest.mark.parametrize("piece", [65_536, 10**9])
+def test_file_of_any_size_is_stored_and_opened_whole(
+    store: FolderStore, beyond: int, piece: int
+) -> None:
+    data = (PHOTO + bytes(range(256)) * 10_000)[: STORE_WRITE_BYTES + beyond]
+    received = receive(
+        store, Body(in_pieces(file(data) + END, piece)), max_bytes=10 * STORE_WRITE_BYTES
+    )
+    assert store.get(KEY) == data
+    assert received.sha256 == hashlib.sha256(data).hexdigest()
+    with received.open(store) as opened:
+        assert opened.read() == data
+    assert (received.content is None) == (beyond >= 0), "no more of it is kept in memory"
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 1000, 10**9])
+def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, size: int) -> None:
+    body = field("latitude", "45.07") + file() + field("place", "Café") + field("tags", "") + END
+    received = receive(store, Body(in_pieces(body, size)))
+    assert store.get(KEY) == PHOTO
+    assert received == StoredUpload(
+        key=KEY,
+        filename="street.jpg",
+        size_bytes=len(PHOTO),
+        sha256=hashlib.sha256(PHOTO).hexdigest(),
+        first_bytes=PHOTO[:16],
+        fields={"latitude": "45.07", "place": "Café", "tags": ""},
+        content=PHOTO,
+    )
+
+
+def test_empty_pieces_are_no_end(store: FolderStore) -> None:
+    body = file() + END
+    pieces = [b"", body[:50], b"", b"", body[50:], b""]
+    assert receive(store, Body(pieces)).size_bytes == len(PHOTO)
+
+
+@pytest.mark.parametrize("size", [1, 5, 10**9])
+def test_file_that_is_full_of_almost_boundaries_is_whole(store: FolderStore, size: int) -> None:
+    tricky = b"\xff\xd8\xff" + b"\r\n--the-boundar\r\n--\r\n\r\n-the-boundary--\r\n" * 20
+    receive(store, Body(in_pieces(file(tricky) + END, size)))
+    assert store.get(KEY) == tricky
+
+
+def test_photo_shorter_than_its_signature_is_checked_at_its_end(store: FolderStore) -> None:
+    seen: list[bytes] = []
+    received = receive(store, file(b"BM12") + END, check_begin=seen.append)
+    assert seen == [b"BM12"]
+    assert received.first_bytes == b"BM12"
+
+
+@pytest.mark.parametrize("size", [1, 10, 10**9])
+def test_first_bytes_are_checked_once_and_whole(store: FolderStore, size: int) -> None:
+    seen: list[bytes] = []
+    receive(store, Body(in_pieces(file() + END, size)), check_begin=seen.append)
+    assert seen == [PHOTO[:16]]
+
+
+def test_what_is_no_photo_is_refused_without_reading_the_rest(store: FolderStore) -> None:
+    body = Body(in_pieces(file(b"this is a text, not a photo " * 2000) + END, 200))
+    error = refused(store, body, check_begin=check_photo_signature)
+    assert isinstance(error, UnsupportedMedia)
+    assert error.code == "unsupported_photo"
+    assert body.taken <= 2
+
+
+def test_file_over_the_limit_is_refused_without_reading_the_rest(store: FolderStore) -> None:
+    body = Body(in_pieces(file(bytes(50_000)) + END, 100))
+    error = refused(store, body, max_bytes=1000)
+    assert isinstance(error, TooLarge)
+    assert error.code == "file_too_large"
+    assert error.extra["max_bytes"] == 1000
+    assert body.taken <= 13
+
+
+def test_limit_is_inclusive(store: FolderStore) -> None:
+    assert receive(store, file() + END, max_bytes=len(PHOTO)).size_bytes == len(PHOTO)
+    store.delete(KEY)
+    assert refused(store, file() + END, max_bytes=len(PHOTO) - 1).code == "file_too_large"
+
+
+def test_declared_length_over_the_limit_is_refused_before_anything_is_read(
+    store: FolderStore,
+) -> None:
+    body = Body([file() + END])
+    length = {"content-length": str(LIMIT + OVERHEAD_BYTES + 1)}
+    assert refused(store, body, headers=length).code == "file_too_large"
+    assert body.taken == 0
+
+
+def test_text_fields_over_their_limit_are_refused_without_reading_the_rest(
+    store: FolderStore,
+) -> None:
+    fields = b"".join(field(f"f{number}", "x" * 1000) for number in range(1000))
+    body = Body(in_pieces(fields + file() + END, 1000))
+    assert refused(store, body).code == "fields_too_large"
+    assert body.taken <= MAX_FIELDS_BYTES // 1000 + 100
+
+
+@pytest.mark.parametrize(
+    "endless",
+    [
+        END + b"what follows the form " * 100_000,
+        b"".join(field(f"f{number}", "") for number in range(20_000)),
+    ],
+    ids=["behind the end", "empty fields"],
+)
+def test_body_that_goes_on_for_ever_is_refused(store: FolderStore, endless: bytes) -> None:
+    body = Body(in_pieces(file() + endless, 10_000), cut_off=True)
+    assert refused(store, body).code == "file_too_large"
+    assert body.left > 0
+
+
+def test_part_header_that_goes_on_for_ever_is_refused(store: FolderStore) -> None:
+    endless = f"--{BOUNDARY}\r\nContent-Disposition: ".encode() + b"x" * 1_000_000
+    body = Body(in_pieces(endless, 1000), cut_off=True)
+    assert refused(store, body).code == "malformed_body"
+    assert body.left > 0
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.99])
+def test_body_that_ends_early_is_refused_and_leaves_nothing(
+    store: FolderStore, keep: float
+) -> None:
+    whole = field("place", "hall") + file() + END
+    body = Body([whole[: int(len(whole) * keep)]])
+    error = refused(store, body)
+    assert isinstance(error, InvalidRequest)
+    assert error.code == "malformed_body"
+
+
+def test_client_that_goes_away_leaves_nothing(store: FolderStore) -> None:
+    whole = file(bytes(5000)) + END
+    body = Body(in_pieces(whole[:4000], 500), cut_off=True)
+    with pytest.raises(ClientDisconnect):
+        receive(store, body)
+    assert_nothing_left(store)
+
+
+def test_two_files_are_refused(store: FolderStore) -> None:
+    error = refused(store, file() + file(photo_bytes(2)) + END)
+    assert error.code == "several_files"
+    assert error.status == 400
+
+
+def test_file_in_another_field_is_refused_by_its_name(store: FolderStore) -> None:
+    error = refused(store, file(field="photo") + END)
+    assert error.code == "no_file"
+    assert "'photo'" in error.detail
+    assert "'file'" in error.detail
+
+
+def test_file_sent_as_text_is_no_file(store: FolderStore) -> None:
+    assert refused(store, field("file", "hello") + END).code == "no_file"
+
+
+def test_empty_form_has_no_file(store: FolderStore) -> None:
+    assert refused(store, field("place", "hall") + END).code == "no_file"
+
+
+@pytest.mark.parametrize("name", ["empty.jpg", ""])
+def test_empty_file_is_refused(store: FolderStore, name: str) -> None:
+    assert refused(store, file(b"", name) + END).code == "empty_file"
+
+
+@pytest.mark.parametrize(
+    ("sent", "kept"),
+    [
+        ("street.jpg", "street.jpg"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\\\photos\\\\street.jpg", "street.jpg"),
+        ("/", "photo"),
+        ("naïve café.jpg", "naïve café.jpg"),
+        ("a\x00b\x07c.jpg", "abc.jpg"),
+        ("x" * 300 + ".jpg", "x" * 255),
+    ],
+)
+def test_only_the_last_part_of_the_file_name_is_kept(
+    store: FolderStore, sent: str, kept: str
+) -> None:
+    assert receive(store, file(name=sent) + END).filename == kept
+
+
+@pytest.mark.parametrize(
+    ("content_type", "code"),
+    [
+        ("", "no_file"),
+        ("image/jpeg", "unsupported_body"),
+        ("application/x-www-form-urlencoded", "unsupported_body"),
+        ("multipart/mixed; boundary=the-boundary", "unsupported_body"),
+        ("multipart/form-data", "malformed_body"),
+        ("multipart/form-data; boundary=", "malformed_body"),
+        (f"multipart/form-data; boundary={'x' * 71}", "malformed_body"),
+    ],
+)
+def test_other_kinds_of_body_are_refused_unread(
+    store: FolderStore, content_type: str, code: str
+) -> None:
+    body = Body([file() + END])
+    assert refused(store, body, headers={"content-type": content_type}).code == code
+    assert body.taken == 0
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"this is no multipart body at all",
+        b"--other\r\n\r\n",
+        f"--{BOUNDARY}\r\n\r\nno name\r\n".encode() + END,
+        part("form-data", b"no name") + END,
+        field("place", b"\xff\xfe not UTF-8") + file() + END,
+    ],
+)
+def test_bodies_that_cannot_be_read_are_refused(store: FolderStore, body: bytes) -> None:
+    assert refused(store, body).code == "malformed_body"
+
+
+def test_what_was_there_under_the_key_survives_a_refused_body(store: FolderStore) -> None:
+    store.put(KEY, b"there before")
+    with pytest.raises(InvalidRequest):
+        receive(store, file()[:-100])
+    assert store.get(KEY) == b"there before"
+
+
+@pytest.mark.parametrize(
+    ("media", "expected"),
+    [
+        ("JPEG", "image/jpeg"),
+        ("PNG", "image/png"),
+        ("WEBP", "image/webp"),
+        ("BMP", "image/bmp"),
+        ("TIFF", "image/tiff"),
+    ],
+)
+def test_media_type_is_told_by_the_content(media: str, expected: str) -> None:
+    assert check_photo_signature(photo_bytes(1, media)[:16]) == expected
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [b"", b"GIF89a" + bytes(10), b"BMW is a car, no ", b"RIFF\0\0\0\0WAVEfmt ", b"%PDF-1.7"],
+)
+def test_other_contents_are_unsupported(begin: bytes) -> None:
+    with pytest.raises(UnsupportedMedia):
+        check_photo_signature(begin)

@@ -1,0 +1,78 @@
+"""Which weights a search is asked with, and what its answer says of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from services.gateway.similarity.execute import select_ranking_weights
+from shared.catalog.generations import Generation
+from shared.config.settings import Settings
+from shared.evaluation.calibration import Calibration
+from shared.ids import new_id
+from shared.search_api.protocol import SearchHit
+from shared.word_weights.record import Outcome, WordWeights
+from shared.word_weights.training_pairs import PairSource
+
+PLAIN = SearchHit(photo_id=new_id(), score=0.5)
+WEIGHTED = SearchHit(photo_id=new_id(), score=0.5, weighted_score=0.7)
+
+
+def calibration(threshold: float) -> Calibration:
+    return Calibration(
+        radius_m=25.0,
+        support_threshold=threshold,
+        impostors=100,
+        labelled_queries=0,
+        confidence=None,
+    )
+
+
+def generation(outcome: Outcome | None) -> Generation:
+    """One whose plain threshold is 0.1, and 0.2 with its weights."""
+    record: dict[str, Any] | None = None
+    if outcome is not None:
+        record = WordWeights(
+            outcome=outcome,
+            reason="",
+            taught_by=PairSource.COORDINATES,
+            near_pairs=100,
+            far_pairs=100,
+            seed=0,
+            searchable=100,
+            weights=(1.0, 0.0),
+            calibration=calibration(0.2),
+        ).model_dump(mode="json")
+    return Generation(calibration=calibration(0.1).model_dump(mode="json"), word_weights=record)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "wanted", "setting", "first", "state", "threshold"),
+    [
+        (Outcome.KEPT, True, True, WEIGHTED, "applied", 0.2),
+        (Outcome.KEPT, True, True, None, "applied", 0.2),
+        (Outcome.KEPT, True, True, PLAIN, "none", 0.1),  # the query has none of the words
+        (Outcome.KEPT, False, True, PLAIN, "off", 0.1),
+        (Outcome.KEPT, True, False, PLAIN, "off", 0.1),
+        (Outcome.NOT_KEPT, True, True, PLAIN, "none", 0.1),
+        (Outcome.NOT_KEPT, False, True, PLAIN, "none", 0.1),
+        (None, True, True, PLAIN, "none", 0.1),
+    ],
+)
+def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
+    outcome: Outcome | None,
+    wanted: bool,
+    setting: bool,
+    first: SearchHit | None,
+    state: str,
+    threshold: float,
+) -> None:
+    settings = Settings(_env_file=None).model_copy(update={"word_weights": setting})
+    chosen = select_ranking_weights(generation(outcome), wanted, settings)
+    hits = [first] if first else []
+    assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and wanted and setting else ())
+    assert chosen.state(hits) == state
+    judged_by = chosen.calibration(hits)
+    assert judged_by is not None
+    assert judged_by.support_threshold == threshold
