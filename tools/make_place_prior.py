@@ -21,6 +21,7 @@ from rich.progress import Progress
 
 from services.cli.environment import read_settings
 from services.cli.evaluation.describers import extractor_describer
+from services.cli.output import console
 from shared.evaluation.place_evidence import PhotoLocation
 from shared.evaluation.place_levels import FEATURES, LevelScheme
 from shared.evaluation.place_probability import (
@@ -53,7 +54,7 @@ def sample_city(photos: Sequence[Path], rows: Rows) -> list[PlaceSample]:
         rows: (n, D) their descriptors.
     """
     fields = [photo.name.split("@") for photo in photos]
-    captured_at = [datetime.strptime(f[TIME_FIELD], "%Y%m%d%H%M%S") for f in fields]
+    captured_at = [datetime.strptime(f[TIME_FIELD] + "Z", "%Y%m%d%H%M%S%z") for f in fields]
     spots = [
         PhotoLocation(float(f[LATITUDE_FIELD]), float(f[LONGITUDE_FIELD]), None) for f in fields
     ]
@@ -117,7 +118,7 @@ def main(folders: Sequence[Path]) -> None:
         photos = sorted((folder / "database").iterdir())
         sampled = sample_city(photos, _describe(photos))
         samples += sampled
-        print(f"{folder.name} ({number + 1} of {len(folders)}): {len(sampled)} samples")
+        console.print(f"{folder.name} ({number + 1} of {len(folders)}): {len(sampled)} samples")
     PRIOR_FILE.write_text(fit_prior(samples).model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 

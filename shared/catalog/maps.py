@@ -27,6 +27,7 @@ from sqlalchemy import (
     String,
     Text,
     Uuid,
+    false,
     func,
     literal,
     select,
@@ -57,13 +58,24 @@ class Map(Journaled, Base):
     name: Mapped[str] = mapped_column(String(100), unique=True)
     extractor: Mapped[str] = mapped_column(String(200))
     version: Mapped[int] = mapped_column(BigInteger, default=0)
+    place_labels_are_paths: Mapped[bool] = mapped_column(
+        Boolean, default=False, server_default=false()
+    )
+    """Whether `/` separates the levels of the place labels."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
-def create_map(session: Session, name: str, extractor: str) -> Map:
+def create_map(
+    session: Session, name: str, extractor: str, *, place_labels_are_paths: bool = False
+) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken."""
-    map_ = Map(id=new_id(), name=name, extractor=extractor)
+    map_ = Map(
+        id=new_id(),
+        name=name,
+        extractor=extractor,
+        place_labels_are_paths=place_labels_are_paths,
+    )
     try:
         with session.begin_nested():
             session.add(map_)

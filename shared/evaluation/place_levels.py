@@ -15,7 +15,7 @@ elsewhere (local density, as in the local outlier factor of Breunig et al. 2000)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,6 @@ from shared.evaluation.place_evidence import (
     distance_between_m,
     estimate_location,
 )
-from shared.geodesy import distances_m
 
 PATH_SEPARATOR = "/"
 VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
@@ -79,31 +78,38 @@ class LevelScheme(BaseModel):
 class CandidateLevel:
     """A level of an estimate: a place, or a circle around the estimated position."""
 
-    features: FloatArray
-    """(len(FEATURES),)"""
-    inside: Mask
-    """(k,) which photos of the ranking lie in it"""
     place: str | None = None
-    radius_m: float | None = None
+    is_path: bool = False
+    """whether `place` is a level of label paths, which contains the finer ones"""
     latitude: float | None = None
     longitude: float | None = None
+    radius_m: float | None = None
+    features: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(len(FEATURES),)"""
 
-    def is_right(self, truth: PhotoLocation, scheme: LevelScheme) -> bool | None:
+    def contains(self, location: PhotoLocation) -> bool:
+        """Return whether a location lies in the level."""
+        if self.radius_m is not None:
+            center = PhotoLocation(self.latitude, self.longitude, None)
+            distance = distance_between_m(center, location)
+            return distance is not None and distance <= self.radius_m
+        if self.place is None or not self.is_path:
+            return self.place is not None and location.place == self.place
+        return is_within_level(location.place, self.place)
+
+    def is_right(self, truth: PhotoLocation) -> bool | None:
         """Return whether the level contains the true location; None if the truth does not say.
 
         A label that ends above the level (`tower/floor 7` for `tower/floor 7/elevator`) does not
-        say.
+        say, and neither does a location without a label or without coordinates.
         """
-        if self.radius_m is not None:
-            distance = distance_between_m(PhotoLocation(self.latitude, self.longitude, None), truth)
-            return None if distance is None else distance <= self.radius_m
-        levels = label_levels(truth.place, scheme.labels_are_paths)
-        if not levels or self.place is None:
-            return None
-        if self.place in levels:
+        if self.contains(truth):
             return True
-        ends_above = scheme.labels_are_paths and is_within_level(self.place, levels[0])
-        return None if ends_above else False
+        if self.radius_m is not None:
+            return None if truth.latitude is None else False
+        levels = label_levels(truth.place, self.is_path)
+        ends_above = self.is_path and bool(levels) and is_within_level(self.place, levels[0])
+        return None if ends_above or not levels else False
 
 
 def candidate_levels(
@@ -112,93 +118,82 @@ def candidate_levels(
     scheme: LevelScheme,
     spread: float,
     position_radius_m: float,
+    found: Sequence[RankedPhoto] | None = None,
 ) -> list[CandidateLevel]:
     """Find the levels that a ranking points to, with their features.
 
-    The levels are those of labels if the labels are paths or no photo that counts has coordinates,
-    and otherwise circles.
+    The levels are circles if the best photo has coordinates and labels are no paths, and otherwise
+    those of labels.
 
     Args:
-        ranking: The first photos of the map, best first.
+        ranking: The first photos of the map, best first, for the features.
         neighbours: The ranking of the best photo itself, without it; empty if it is not known.
         scheme: The levels of the map.
         spread: Unit of score differences.
         position_radius_m: Photos within this distance of the best one determine the position.
+        found: The ranking that determines the levels, if a filter restricts it.
 
     Returns:
-        The levels, finest first; empty if the ranking has no location.
+        The levels, finest first; empty if the best photos have no location.
     """
-    if not ranking:
+    found = ranking if found is None else found
+    if not ranking or not found:
         return []
-    scores = _scores(ranking)
-    if not scheme.labels_are_paths and ranking[0].location.latitude is not None:
-        center = estimate_location(ranking, position_radius_m)
-        return _circles(ranking, neighbours, scores, center, scheme.radii_m, spread)
-    return _places(ranking, neighbours, scores, scheme.labels_are_paths, spread)
-
-
-def _circles(
-    ranking: Sequence[RankedPhoto],
-    neighbours: Sequence[RankedPhoto],
-    scores: FloatArray,
-    center: PhotoLocation,
-    radii_m: Sequence[float],
-    spread: float,
-) -> list[CandidateLevel]:
-    away = _distances_m(center, ranking)
-    neighbours_away = _distances_m(center, neighbours)
-    neighbour_scores = _scores(neighbours)
+    if scheme.labels_are_paths or found[0].location.latitude is None:
+        levels = _vote_for_places(found, scheme.labels_are_paths, spread)
+    else:
+        center = estimate_location(found, position_radius_m)
+        levels = [
+            CandidateLevel(latitude=center.latitude, longitude=center.longitude, radius_m=radius)
+            for radius in sorted(scheme.radii_m)
+        ]
+    scores, neighbour_scores = _scores(ranking), _scores(neighbours)
     return [
-        CandidateLevel(
-            level_features(
-                scores, away <= radius, neighbour_scores, neighbours_away <= radius, spread
+        replace(
+            level,
+            features=level_features(
+                scores,
+                _inside(level, ranking),
+                neighbour_scores,
+                _inside(level, neighbours),
+                spread,
             ),
-            away <= radius,
-            radius_m=radius,
-            latitude=center.latitude,
-            longitude=center.longitude,
         )
-        for radius in sorted(radii_m)
+        for level in levels
     ]
 
 
-def _places(
-    ranking: Sequence[RankedPhoto],
-    neighbours: Sequence[RankedPhoto],
-    scores: FloatArray,
-    is_path: bool,
-    spread: float,
+def _vote_for_places(
+    ranking: Sequence[RankedPhoto], is_path: bool, spread: float
 ) -> list[CandidateLevel]:
     """Choose a place at each level, from the coarsest, by the votes inside the one chosen before.
 
-    A photo votes with the weight exp(score / (VOTE_TEMPERATURE * spread)); a photo without a label
-    has no vote. Where the photos whose labels end at a level have most of its votes, the estimate
-    ends there, too.
+    The votes are weighted (`vote_weights`); a photo without a label has none. Where most votes are
+    those of photos whose labels end at a level, the estimate ends there, too.
     """
     paths = [label_levels(r.location.place, is_path)[::-1] for r in ranking]
-    neighbour_paths = [label_levels(r.location.place, is_path)[::-1] for r in neighbours]
-    neighbour_scores = _scores(neighbours)
-    votes = _votes(scores, VOTE_TEMPERATURE * spread)
-    inside = np.ones(len(ranking), dtype=bool)
+    votes = vote_weights(ranking, spread).tolist()
     chosen: list[CandidateLevel] = []
+    voters = [index for index, path in enumerate(paths) if path]
     while True:
         depth = len(chosen)
         counts: dict[str, float] = {}
         ended = 0.0
-        for index in np.flatnonzero(inside).tolist():
+        for index in voters:
             if depth < len(paths[index]):
                 place = paths[index][depth]
-                counts[place] = counts.get(place, 0.0) + float(votes[index])
-            elif depth > 0:
-                ended += float(votes[index])
+                counts[place] = counts.get(place, 0.0) + votes[index]
+            else:
+                ended += votes[index]
         if not counts or max(counts.values()) < ended:
             return chosen[::-1]
         best = max(counts, key=lambda place: counts[place])
-        inside = _at_depth(paths, depth, best)
-        features = level_features(
-            scores, inside, neighbour_scores, _at_depth(neighbour_paths, depth, best), spread
-        )
-        chosen.append(CandidateLevel(features, inside, place=best))
+        chosen.append(CandidateLevel(place=best, is_path=is_path))
+        voters = [i for i in voters if depth < len(paths[i]) and paths[i][depth] == best]
+
+
+def _inside(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> Mask:
+    return np.array([level.contains(r.location) for r in ranking], dtype=bool)
 
 
 FEATURES = (
@@ -294,24 +289,3 @@ def _votes(scores: FloatArray, temperature: float) -> FloatArray:
 def _log_odds(votes: FloatArray, inside: Mask) -> float:
     share = votes[inside].sum() / votes.sum()
     return float(np.log((share + MIN_SHARE) / (1 - share + MIN_SHARE)))
-
-
-def _at_depth(paths: Sequence[tuple[str, ...]], depth: int, place: str) -> Mask:
-    return np.array([depth < len(path) and path[depth] == place for path in paths], dtype=bool)
-
-
-def _distances_m(center: PhotoLocation, ranking: Sequence[RankedPhoto]) -> FloatArray:
-    """Return (k,) distances in metres; infinite for photos without coordinates."""
-    if center.latitude is None or center.longitude is None:
-        return np.full(len(ranking), np.inf)
-    spots = np.array(
-        [
-            (np.nan, np.nan)
-            if r.location.latitude is None
-            else (r.location.latitude, r.location.longitude)
-            for r in ranking
-        ],
-        dtype=np.float64,
-    ).reshape(-1, 2)
-    away = distances_m(center.latitude, center.longitude, spots[:, 0], spots[:, 1])
-    return np.where(np.isnan(away), np.inf, away)

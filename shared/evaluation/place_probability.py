@@ -11,10 +11,10 @@ there are enough, refine the coefficients, with those of the own photos as the p
 
 The estimate *answers* at the finest level whose probability reaches the level's threshold for a
 certainty c. The threshold is the lowest for which the share c of the cross-validated answers at
-this level is right, with one more wrong answer counted, as in conformal selection (Jin and Candes
-2023). An answer at the finest level also needs a probability of "not in the map" that at most the share
-1 - c of the impostors falls below (split conformal prediction, Vovk et al. 2005). Where there are
-too few samples for a threshold, it is c itself.
+this and the finer levels is right, with one more wrong answer counted, as in conformal selection
+(Jin and Candes 2023). An answer at the finest level also needs a probability of "not in the map" below a limit: at most the
+share 1 - c of the impostors may get one (split conformal prediction, Vovk et al. 2005). Where there
+are too few samples for a threshold, it is c itself.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.place_evidence import RankedPhoto
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.place_levels import (
     FEATURES,
     CandidateLevel,
@@ -146,17 +146,6 @@ class PlaceModel(BaseModel):
         """Return this model, or the prior if the map's levels changed since it was fitted."""
         return self if self.scheme in (None, scheme) else PlaceModel()
 
-    def candidate_levels(
-        self,
-        ranking: Sequence[RankedPhoto],
-        neighbours: Sequence[RankedPhoto],
-        scheme: LevelScheme,
-        position_radius_m: float,
-    ) -> list[CandidateLevel]:
-        """Find the levels that a ranking points to, with features in this model's unit."""
-        spread = self.spread or ranking_spread(ranking)
-        return candidate_levels(ranking, neighbours, scheme, spread, position_radius_m)
-
     def probabilities(self, levels: Sequence[CandidateLevel]) -> tuple[list[float], float]:
         """Return the probability of each level, finest first, and that of "not in the map".
 
@@ -184,6 +173,10 @@ class PlaceModel(BaseModel):
             probabilities, not_in_map, certainty, Thresholds(not_in_map=None, levels=())
         )
 
+    def unit(self, ranking: Sequence[RankedPhoto]) -> float:
+        """Return the unit of score differences for a ranking."""
+        return self.spread or ranking_spread(ranking)
+
     def estimate(
         self,
         ranking: Sequence[RankedPhoto],
@@ -191,24 +184,34 @@ class PlaceModel(BaseModel):
         scheme: LevelScheme,
         certainty: float,
         position_radius_m: float,
+        found: Sequence[RankedPhoto] | None = None,
     ) -> PlaceEstimate | None:
         """Estimate the place of a query.
 
         Args:
-            ranking: The first `EVIDENCE_DEPTH` photos of the map, best first.
+            ranking: The first photos of the map, best first; `EVIDENCE_DEPTH` of them count.
             neighbours: The ranking of the best photo itself, without it.
             scheme: The levels of the map.
             certainty: Share of the answers that must be right, above 0 and at most 1.
             position_radius_m: Photos within this distance of the best one determine the position.
+            found: The ranking of a search with a filter; its photos determine the levels.
 
         Returns:
             The estimate; None if the ranking has no location.
         """
-        levels = self.candidate_levels(ranking, neighbours, scheme, position_radius_m)
+        evidence, unit = ranking[:EVIDENCE_DEPTH], self.unit(ranking[:EVIDENCE_DEPTH])
+        shown = ranking if found is None else found
+        levels = candidate_levels(
+            evidence,
+            neighbours[:EVIDENCE_DEPTH],
+            scheme,
+            unit,
+            position_radius_m,
+            shown[:EVIDENCE_DEPTH],
+        )
         if not levels:
             return None
         probabilities, not_in_map = self.probabilities(levels)
-        votes = vote_weights(ranking, self.spread or ranking_spread(ranking))
         return PlaceEstimate(
             levels=levels,
             probabilities=probabilities,
@@ -217,7 +220,7 @@ class PlaceModel(BaseModel):
             radius_68_m=error_radius_m(levels, probabilities, 0.68),
             radius_95_m=error_radius_m(levels, probabilities, 0.95),
             match_probabilities=_match_probabilities(
-                levels[0], probabilities[0], not_in_map, votes
+                shown, levels[0], probabilities[0], not_in_map, vote_weights(shown, unit)
             ),
         )
 
@@ -243,14 +246,39 @@ def error_radius_m(
 
 
 def _match_probabilities(
-    finest: CandidateLevel, probability: float, not_in_map: float, votes: FloatArray
+    ranking: Sequence[RankedPhoto],
+    finest: CandidateLevel,
+    probability: float,
+    not_in_map: float,
+    votes: FloatArray,
 ) -> list[float]:
-    """Give the finest level's photos its probability, and share the rest by votes."""
-    rest = votes[~finest.inside]
-    shares = np.where(finest.inside, 0.0, votes / max(float(rest.sum()), 1e-12))
+    """Give the photos of the finest level its probability; the others share the rest by votes."""
+    inside = np.array([finest.contains(r.location) for r in ranking], dtype=bool)
     remaining = max(0.0, 1 - probability - not_in_map)
-    matches: list[float] = np.where(finest.inside, probability, shares * remaining).tolist()
+    shares = remaining * votes / max(float(votes[~inside].sum()), 1e-12)
+    matches: list[float] = np.where(inside, probability, shares).tolist()
     return matches
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutEstimate:
+    """Probabilities of a sample that the model was not fitted on."""
+
+    probabilities: Sequence[float]
+    not_in_map: float
+    is_right: Sequence[bool | None]
+    left_out: str | None
+    weight: float
+
+
+@dataclass(frozen=True, slots=True)
+class FittedPlaceModel:
+    """A model with the held-out estimates that its thresholds were chosen on."""
+
+    model: PlaceModel
+    held_out: Sequence[HeldOutEstimate]
+    """labelled queries, or the map's own photos; empty for the prior"""
+    impostors: Sequence[HeldOutEstimate]
 
 
 def fit_place_model(
@@ -258,7 +286,7 @@ def fit_place_model(
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
     spread: float,
-) -> PlaceModel:
+) -> FittedPlaceModel:
     """Fit the model of a map.
 
     Args:
@@ -275,11 +303,16 @@ def fit_place_model(
     if len(labelled) < MIN_LABELLED_QUERIES:
         labelled = ()
     if own < MIN_OWN_PHOTOS and not labelled:
-        return PlaceModel()
-    model = _fit_coefficients(samples, labelled, scheme, spread)
-    judged = _held_out(samples, labelled, scheme, spread)
-    thresholds = tuple(_choose_thresholds(*judged, certainty) for certainty in CERTAINTIES)
-    return model.model_copy(update={"thresholds": thresholds, "own_photos": own})
+        return FittedPlaceModel(PlaceModel(), [], [])
+    own_held_out, labelled_held_out = _predict_held_out(samples, labelled, scheme, spread)
+    thresholds = tuple(
+        _choose_thresholds(own_held_out, labelled_held_out, certainty) for certainty in CERTAINTIES
+    )
+    model = _fit_coefficients(samples, labelled, scheme, spread).model_copy(
+        update={"thresholds": thresholds, "own_photos": own}
+    )
+    in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
+    return FittedPlaceModel(model, in_map, [s for s in own_held_out if s.left_out is not None])
 
 
 def _fit_coefficients(
@@ -366,99 +399,131 @@ def fit_map_estimate(
         prior: Standardises the features; the shipped prior by default.
     """
     design = (prior or shipped_prior()).design(table.features)
-    beta = np.array(center)
+    mean = np.array(center)
+    beta = mean.copy()
+
+    def loss(beta: FloatArray) -> float:
+        margin = np.where(table.target > 0.5, 1, -1) * (design @ beta)
+        fit = float(table.weights @ np.logaddexp(0.0, -margin))
+        return fit + PRIOR_PRECISION / 2 * float(((beta - mean) ** 2).sum())
+
     for _ in range(NEWTON_STEPS if len(design) else 0):
         probability = _sigmoid(design @ beta)
         gradient = design.T @ (table.weights * (table.target - probability))
-        gradient -= PRIOR_PRECISION * (beta - np.array(center))
-        variance = table.weights * np.maximum(probability * (1 - probability), 1e-6)
+        gradient -= PRIOR_PRECISION * (beta - mean)
+        variance = table.weights * probability * (1 - probability)
         hessian = (design.T * variance) @ design + PRIOR_PRECISION * np.eye(len(beta))
         step = np.linalg.solve(hessian, gradient)
+        # A full step may overshoot where the prior's predictions are extreme.
+        while loss(beta + step) > loss(beta) and float(np.abs(step).max()) > 1e-8:
+            step /= 2
         beta += step
         if float(np.abs(step).max()) < 1e-8:
             break
     return tuple(beta.tolist())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judged:
-    """A held-out sample with its probabilities."""
-
-    probabilities: Sequence[float]
-    not_in_map: float
-    is_right: Sequence[bool | None]
-    left_out: str | None
-    weight: float
-
-
-def _held_out(
+def _predict_held_out(
     samples: Sequence[PlaceSample],
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
     spread: float,
-) -> tuple[list[_Judged], list[_Judged]]:
-    """Judge the samples and the labelled queries by cross-validation."""
-    judged: tuple[list[_Judged], list[_Judged]] = ([], [])
+) -> tuple[list[HeldOutEstimate], list[HeldOutEstimate]]:
+    """Predict the samples and the labelled queries by cross-validation."""
+    predicted: tuple[list[HeldOutEstimate], list[HeldOutEstimate]] = ([], [])
     for fold in range(FOLDS):
-        fitted_on = [[s for s in each if s.photo % FOLDS != fold] for each in (samples, labelled)]
-        model = _fit_coefficients(*fitted_on, scheme, spread)
-        for each, into in zip((samples, labelled), judged, strict=True):
+        own, queries = (
+            [s for s in each if s.photo % FOLDS != fold] for each in (samples, labelled)
+        )
+        model = _fit_coefficients(own, queries, scheme, spread)
+        for each, into in zip((samples, labelled), predicted, strict=True):
             held_out = [s for s in each if s.photo % FOLDS == fold]
             weights = sample_weights(held_out, OUT_OF_MAP_SHARE)
             into += [
-                _Judged(*model.probabilities(s.levels), s.is_right, s.left_out, weight)
+                HeldOutEstimate(*model.probabilities(s.levels), s.is_right, s.left_out, weight)
                 for s, weight in zip(held_out, weights, strict=True)
             ]
-    return judged
+    return predicted
 
 
 def _choose_thresholds(
-    samples: Sequence[_Judged], labelled: Sequence[_Judged], certainty: float
+    samples: Sequence[HeldOutEstimate], labelled: Sequence[HeldOutEstimate], certainty: float
 ) -> Thresholds:
     """Choose the thresholds of a certainty, from the finest level to the coarsest.
 
-    A level answers what the finer ones leave, so its threshold is chosen on the remaining samples.
+    A level answers what the finer ones leave. Its threshold is the lowest with which enough of the
+    answers so far are right.
     """
-    kinds = {s.left_out for s in samples} - {None}
-    limits = [
-        limit
-        for kind in kinds
-        if (limit := _lower_limit([s.not_in_map for s in samples if s.left_out == kind], certainty))
-        is not None
-    ]
-    limit = min(limits, default=None)
-    remaining = list(labelled or samples)
+    judged = labelled or samples
+    finest = _lowest_threshold(judged, 0, certainty, 0.0, 0.0)
+    cut = certainty if finest is None else finest
+    limit = _upper_limit(
+        [
+            s.not_in_map if s.probabilities[0] >= cut else np.inf
+            for s in samples
+            if s.left_out is not None
+        ],
+        certainty,
+    )
+    remaining = list(judged)
     levels: list[float | None] = []
-    for position in range(max((len(s.probabilities) for s in remaining), default=0)):
+    answered = wrong = 0.0
+    for position in range(max((len(s.probabilities) for s in judged), default=0)):
         eligible = [
             s
             for s in remaining
             if position < len(s.probabilities)
             and (position > 0 or limit is None or s.not_in_map <= limit)
         ]
-        threshold = _lowest_threshold(eligible, position, certainty)
+        threshold = _lowest_threshold(eligible, position, certainty, answered, wrong)
         levels.append(threshold)
         cut = certainty if threshold is None else threshold
-        answered = {id(s) for s in eligible if s.probabilities[position] >= cut}
-        remaining = [s for s in remaining if id(s) not in answered]
+        new = [s for s in eligible if s.probabilities[position] >= cut]
+        answered += sum(s.weight for s in new)
+        wrong += sum(s.weight for s in new if s.is_right[position] is False)
+        answered_ids = {id(s) for s in new}
+        remaining = [s for s in remaining if id(s) not in answered_ids]
     return Thresholds(not_in_map=limit, levels=tuple(levels))
 
 
-def _lower_limit(values: Sequence[float], certainty: float) -> float | None:
-    """Return a limit that at most the share 1 - `certainty` of new values falls below."""
+def _upper_limit(values: Sequence[float], certainty: float) -> float | None:
+    """Return a limit that at most the share 1 - `certainty` of new values does not exceed.
+
+    None with too few values for it.
+    """
     rank = int((1 - certainty) * (len(values) + 1) + 1e-9)
-    return float(np.nextafter(sorted(values)[rank - 1], -np.inf)) if rank > 0 else None
+    if rank == 0:
+        return None
+    return min(1.0, float(np.nextafter(sorted(values)[rank - 1], -np.inf)))
 
 
-def _lowest_threshold(judged: Sequence[_Judged], position: int, certainty: float) -> float | None:
-    """Return the lowest probability above which the share `certainty` of the answers is right."""
-    known = [s for s in judged if s.is_right[position] is not None]
-    known.sort(key=lambda s: -s.probabilities[position])
-    weights = np.array([s.weight for s in known])
-    wrong = np.array([s.weight for s in known]) * [not s.is_right[position] for s in known]
-    share = (np.cumsum(wrong) + 1) / (np.cumsum(weights) + 1)
+def _lowest_threshold(
+    estimates: Sequence[HeldOutEstimate],
+    position: int,
+    certainty: float,
+    answered: float,
+    wrong: float,
+) -> float | None:
+    """Return the lowest probability above which the share `certainty` of all answers is right.
+
+    Args:
+        estimates: Estimates that may be answered at this level.
+        position: The level.
+        certainty: Share of right answers.
+        answered: Weight of the answers at finer levels.
+        wrong: Weight of the wrong ones of these.
+    """
+    known = [
+        (s.probabilities[position], s.weight, s.weight * (not s.is_right[position]))
+        for s in estimates
+        if position < len(s.probabilities) and s.is_right[position] is not None
+    ]
+    known.sort(key=lambda row: -row[0])
+    columns = np.array(known, dtype=np.float64).reshape(-1, 3)
+    # One more wrong answer is counted: a new query may be one.
+    share = (wrong + np.cumsum(columns[:, 2]) + 1) / (answered + np.cumsum(columns[:, 1]) + 1)
     enough = np.flatnonzero(share <= 1 - certainty + 1e-9)
-    return known[int(enough[-1])].probabilities[position] if len(enough) else None
+    return float(columns[enough[-1], 0]) if len(enough) else None
 
 
 def _first_answer(

@@ -68,7 +68,9 @@ class OwnPhotoSampler:
         self._rankings: dict[int, IndexRanking | None] = {}
         self._latitudes = np.array([_or_nan(spot.latitude) for spot in locations])
         self._longitudes = np.array([_or_nan(spot.longitude) for spot in locations])
-        self._seconds = np.array([_or_nan(t and t.timestamp()) for t in captured_at])
+        self._seconds = np.array(
+            [_or_nan(None if t is None else t.timestamp()) for t in captured_at]
+        )
         paths = [label_levels(spot.place, scheme.labels_are_paths) for spot in locations]
         depth = max(map(len, paths), default=0)
         self._labels = [
@@ -90,21 +92,30 @@ class OwnPhotoSampler:
         return median([ranking_spread(ranking) for ranking in rankings] or [1.0])
 
     def samples(self, photos: Sequence[int], spread: float) -> Iterator[PlaceSample]:
-        """Yield the samples of photos: each as it is, and as an impostor of each kind."""
+        """Yield the samples of photos: each as it is, and as an impostor of each kind.
+
+        The last kind stands for queries from far away, for which every level is wrong: they find
+        what an impostor finds.
+        """
         for photo in photos:
             visible = self._visible(photo)
+            levels: list[CandidateLevel] = []
+            left_out = None
             for left_out, missing in self._kinds(photo):
                 levels = self._levels(photo, visible & ~missing, spread)
                 if levels:
-                    right = [
-                        level.is_right(self._locations[photo], self._scheme) for level in levels
-                    ]
+                    right = [level.is_right(self._locations[photo]) for level in levels]
                     yield PlaceSample(photo, levels, right, left_out)
+            if levels and left_out is not None:
+                yield PlaceSample(photo, levels, [False] * len(levels), "everything near")
 
-    def neighbours(self, photo: int, visible: NDArray[np.bool_]) -> list[RankedPhoto]:
-        """Return the ranking of a photo among the visible ones."""
+    def neighbours(self, photo: int, visible: NDArray[np.bool_] | None = None) -> list[RankedPhoto]:
+        """Return the ranking of a photo among the visible ones, by default all."""
         ranking = self.ranking(photo)
-        return self._ranked(ranking, visible) if ranking else []
+        if ranking is None:
+            return []
+        everything = np.ones(len(self._locations), dtype=bool)
+        return self._ranked(ranking, everything if visible is None else visible)
 
     def _levels(
         self, photo: int, visible: NDArray[np.bool_], spread: float
@@ -135,8 +146,11 @@ class OwnPhotoSampler:
         apart = np.abs(self._seconds - self._seconds[photo])
         same_session = apart < SAME_SESSION_PERIOD.total_seconds()
         if (self._at_place(photo) & ~same_session & ~np.isnan(apart)).any():
-            return visible & ~same_session
-        return visible & ~(apart <= BURST_PERIOD.total_seconds())
+            left_out = same_session
+        else:
+            left_out = apart <= BURST_PERIOD.total_seconds()
+        visible[left_out] = False
+        return visible
 
     def _at_place(self, photo: int) -> NDArray[np.bool_]:
         near: NDArray[np.bool_] = self._away_m(photo) <= self._radius_m

@@ -53,6 +53,7 @@ class CompareJobParams(BaseModel):
     request: CompareRequest
     top_k: int
     frame: SimilarityResponse
+    match_probabilities: dict[UUID, float] = {}
 
 
 def check_comparison_supported(
@@ -138,6 +139,7 @@ def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> Sim
             similarity_score=searched[candidate.photo_id].score,
             weighted_score=searched[candidate.photo_id].weighted_score,
             rerank_score=candidate.rerank_score,
+            match_probability=params.match_probabilities.get(candidate.photo_id),
             explanation=_explanation_response(candidate),
             **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
         )
@@ -174,6 +176,7 @@ def _build_compare_job(
         ),
         top_k=search_params.top_k,
         frame=result.response_without_photos,
+        match_probabilities=result.match_probabilities,
     )
     job = Job(
         id=new_id(),

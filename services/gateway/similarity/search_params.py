@@ -135,6 +135,7 @@ class SearchParams(BaseModel):
     word_weights: bool = True
     rerank: int | None = None
     explain: bool = False
+    certainty: float | None = None
     mode: Mode = Mode.AUTO
     most_rows: int | None = None
     most_seconds: float | None = None
@@ -189,6 +190,17 @@ Explain = Annotated[
 ]
 
 
+Certainty = Annotated[
+    float | None,
+    Query(
+        gt=0,
+        le=1,
+        description="Share of the answers that must be right: the estimate answers at the finest "
+        "level that is certain enough. Default: CERTAINTY.",
+    ),
+]
+
+
 def parse_search_params(
     photos: FilterDep,
     top_k: TopK = 10,
@@ -196,6 +208,7 @@ def parse_search_params(
     word_weights: UseWordWeights = True,
     rerank: Rerank = None,
     explain: Explain = False,
+    certainty: Certainty = None,
     mode: ModeParam = Mode.AUTO,
     most_rows: MaxRows = None,
     most_seconds: MaxSeconds = None,
@@ -208,6 +221,7 @@ def parse_search_params(
         word_weights=word_weights,
         rerank=rerank,
         explain=explain,
+        certainty=certainty,
         mode=mode,
         most_rows=most_rows,
         most_seconds=most_seconds,

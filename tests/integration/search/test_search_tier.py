@@ -333,7 +333,7 @@ def test_a_map_is_not_measured_while_a_shard_is_missing(
     tier = tier_of(1, 1)
     with catalog.read() as session:
         generation = session.get_one(Generation, places.generation_id)
-    measure = MapEvaluation(catalog, tier.port, generation, 25.0, lambda: None)
+    measure = MapEvaluation(catalog, tier.port, generation, 25.0, (25.0,), lambda: None)
     sample = [GeotaggedPhoto(next(iter(places.rows)), PhotoLocation(None, None, "hall"), None)]
     measure.evaluate(sample)
     tier.servers[1][0].stop()
