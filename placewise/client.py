@@ -137,7 +137,8 @@ class Client:
             rerank: Number of first results to rerank by comparing patches.
             explain: Add explanations to the results.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `tags` and `ids` (comma-separated).
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated).
+                `certainty` is the share of answers that must be right.
         """
         params = {"top_k": top_k, "min_score": min_score, "rerank": rerank, "explain": explain}
         if isinstance(photo, (Photo, UUID)):
@@ -262,9 +263,17 @@ class Client:
         """List the maps of the server."""
         return [Map(**item) for item in self.raw.maps()]
 
-    def create_map(self, name: str, extractor: str | None = None) -> Map:
+    def create_map(
+        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+    ) -> Map:
         """Create a map; `extractor` defaults to the server's setting."""
-        return Map(**self.raw.create_map(name, extractor))
+        return Map(
+            **self.raw.create_map(name, extractor, place_labels_are_paths=place_labels_are_paths)
+        )
+
+    def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
+        """Change whether `/` separates the levels of the map's place labels."""
+        return Map(**self.raw.update_map(name, place_labels_are_paths=place_labels_are_paths))
 
     def delete_map(self, name: str) -> None:
         """Delete a map and all its photos."""

@@ -167,8 +167,9 @@ class Client(Transport):
             rerank: Number of first results to rerank by comparing patches.
             explain: Add explanations to the results.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `tags` and `ids` (comma-separated);
-                `word_weights=False` ranks by the unweighted cosine similarity.
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
+                share of answers that must be right.
         """
         params = drop_none(
             top_k=top_k,
@@ -307,9 +308,21 @@ class Client(Transport):
         response: Any = self._call("GET", "/maps")
         return list(response)
 
-    def create_map(self, name: str, extractor: str | None = None) -> Json:
+    def create_map(
+        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+    ) -> Json:
         """Create a map; `extractor` defaults to the server's setting."""
-        return self._call("POST", "/maps", json=drop_none(name=name, extractor=extractor))
+        body = drop_none(
+            name=name,
+            extractor=extractor,
+            place_labels_are_paths=place_labels_are_paths or None,
+        )
+        return self._call("POST", "/maps", json=body)
+
+    def update_map(self, name: str, *, place_labels_are_paths: bool) -> Json:
+        """Change whether `/` separates the levels of the map's place labels."""
+        body = {"place_labels_are_paths": place_labels_are_paths}
+        return self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body)
 
     def delete_map(self, name: str) -> Json:
         """Delete a map and all its photos."""

@@ -28,8 +28,8 @@ from shared.evaluation.place_evidence import (
     distance_between_m,
     estimate_location,
 )
+from shared.place_paths import is_within_level, label_levels
 
-PATH_SEPARATOR = "/"
 VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
 WIDE_TEMPERATURE = 0.3
 MIN_SHARE = 1e-3  # of the votes; bounds the log-odds of a level that has all votes or none
@@ -37,32 +37,6 @@ MIN_SPREAD = 1e-6
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-def label_levels(label: str | None, is_path: bool) -> tuple[str, ...]:
-    """Return the levels of a place label, finest first.
-
-    Args:
-        label: The label, or None.
-        is_path: Whether `/` separates levels. Otherwise the whole label is the only level.
-
-    Returns:
-        The prefixes of the path that end in a level with a name: those of `a//b` are `a//b` and
-        `a`. Empty for None and for a path without any name.
-    """
-    if label is None or not is_path:
-        return () if label is None else (label,)
-    parts = label.split(PATH_SEPARATOR)
-    return tuple(
-        PATH_SEPARATOR.join(parts[:depth])
-        for depth in range(len(parts), 0, -1)
-        if parts[depth - 1].strip()
-    )
-
-
-def is_within_level(label: str | None, level: str) -> bool:
-    """Return whether a label path is the level or lies below it."""
-    return label is not None and (label == level or label.startswith(level + PATH_SEPARATOR))
 
 
 class LevelScheme(BaseModel):

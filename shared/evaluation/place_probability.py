@@ -11,10 +11,10 @@ there are enough, refine the coefficients, with those of the own photos as the p
 
 The estimate *answers* at the finest level whose probability reaches the level's threshold for a
 certainty c. The threshold is the lowest for which the share c of the cross-validated answers at
-this and the finer levels is right, with one more wrong answer counted, as in conformal selection
-(Jin and Candes 2023). An answer at the finest level also needs a probability of "not in the map" below a limit: at most the
-share 1 - c of the impostors may get one (split conformal prediction, Vovk et al. 2005). Where there
-are too few samples for a threshold, it is c itself.
+this level is right, with one more wrong answer counted, as in conformal selection
+(Jin and Candes 2023). An answer at the finest level also needs a probability of "not in the map"
+below a limit that at most the share 1 - c of the impostors passes (split conformal prediction, Vovk
+et al. 2005). Where there are too few samples for a threshold, it is c itself.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ MIN_LABELLED_QUERIES = 40
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
 NEWTON_STEPS = 50
 FOLDS = 5
+MAX_ERROR_FACTOR = 5.0  # of an answer's error probability over 1 - certainty
 CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses those of the next higher one."""
 PRIOR_FILE = Path(__file__).with_name("place_prior.json")
@@ -451,11 +452,10 @@ def _choose_thresholds(
 ) -> Thresholds:
     """Choose the thresholds of a certainty, from the finest level to the coarsest.
 
-    A level answers what the finer ones leave. Its threshold is the lowest with which enough of the
-    answers so far are right.
+    A level answers what the finer ones leave, so its threshold is chosen on the remaining ones.
     """
     judged = labelled or samples
-    finest = _lowest_threshold(judged, 0, certainty, 0.0, 0.0)
+    finest = _lowest_threshold(judged, 0, certainty)
     cut = certainty if finest is None else finest
     limit = _upper_limit(
         [
@@ -467,7 +467,6 @@ def _choose_thresholds(
     )
     remaining = list(judged)
     levels: list[float | None] = []
-    answered = wrong = 0.0
     for position in range(max((len(s.probabilities) for s in judged), default=0)):
         eligible = [
             s
@@ -475,14 +474,11 @@ def _choose_thresholds(
             if position < len(s.probabilities)
             and (position > 0 or limit is None or s.not_in_map <= limit)
         ]
-        threshold = _lowest_threshold(eligible, position, certainty, answered, wrong)
+        threshold = _lowest_threshold(eligible, position, certainty)
         levels.append(threshold)
         cut = certainty if threshold is None else threshold
-        new = [s for s in eligible if s.probabilities[position] >= cut]
-        answered += sum(s.weight for s in new)
-        wrong += sum(s.weight for s in new if s.is_right[position] is False)
-        answered_ids = {id(s) for s in new}
-        remaining = [s for s in remaining if id(s) not in answered_ids]
+        answered = {id(s) for s in eligible if s.probabilities[position] >= cut}
+        remaining = [s for s in remaining if id(s) not in answered]
     return Thresholds(not_in_map=limit, levels=tuple(levels))
 
 
@@ -498,20 +494,12 @@ def _upper_limit(values: Sequence[float], certainty: float) -> float | None:
 
 
 def _lowest_threshold(
-    estimates: Sequence[HeldOutEstimate],
-    position: int,
-    certainty: float,
-    answered: float,
-    wrong: float,
+    estimates: Sequence[HeldOutEstimate], position: int, certainty: float
 ) -> float | None:
-    """Return the lowest probability above which the share `certainty` of all answers is right.
+    """Return the lowest probability above which the share `certainty` of the estimates is right.
 
-    Args:
-        estimates: Estimates that may be answered at this level.
-        position: The level.
-        certainty: Share of right answers.
-        answered: Weight of the answers at finer levels.
-        wrong: Weight of the wrong ones of these.
+    It is at least the probability with MAX_ERROR_FACTOR times the error that is allowed on
+    average, and 0.5: queries may be harder than the samples.
     """
     known = [
         (s.probabilities[position], s.weight, s.weight * (not s.is_right[position]))
@@ -521,9 +509,10 @@ def _lowest_threshold(
     known.sort(key=lambda row: -row[0])
     columns = np.array(known, dtype=np.float64).reshape(-1, 3)
     # One more wrong answer is counted: a new query may be one.
-    share = (wrong + np.cumsum(columns[:, 2]) + 1) / (answered + np.cumsum(columns[:, 1]) + 1)
-    enough = np.flatnonzero(share <= 1 - certainty + 1e-9)
-    return float(columns[enough[-1], 0]) if len(enough) else None
+    error = (np.cumsum(columns[:, 2]) + 1) / (np.cumsum(columns[:, 1]) + 1)
+    enough = np.flatnonzero(error <= 1 - certainty + 1e-9)
+    lowest = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
+    return max(lowest, float(columns[enough[-1], 0])) if len(enough) else None
 
 
 def _first_answer(

@@ -25,11 +25,11 @@ from shared.evaluation.place_levels import (
     CandidateLevel,
     LevelScheme,
     candidate_levels,
-    label_levels,
     ranking_spread,
 )
 from shared.evaluation.place_probability import PlaceSample
 from shared.geodesy import distances_m
+from shared.place_paths import label_levels
 
 # A photo taken less than this before or after another one belongs to the same session.
 SAME_SESSION_PERIOD = timedelta(hours=12)

@@ -24,7 +24,7 @@ from services.gateway.schemas import (
     PhotoDetailResponse,
     PhotoResponse,
 )
-from services.gateway.similarity.search_params import FilterDep
+from services.gateway.similarity.search_params import FilterDep, check_place_filter
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map
@@ -238,6 +238,7 @@ def search_photos_by_metadata(
     )
     after = _decode_cursor(cursor) if cursor else None
     with gateway.catalog.read() as session:
+        check_place_filter(photos, get_map(session, map_name).place_labels_are_paths)
         map_id = get_map(session, map_name).id
         matches, total = search_photos(session, map_id, metadata_filter, limit + 1, after)
     page = matches[:limit]

@@ -32,7 +32,11 @@ from services.gateway.similarity.rerank import (
     start_comparison_of_query_photo,
     start_comparison_of_stored_photo,
 )
-from services.gateway.similarity.search_params import SearchParams, SearchParamsDep
+from services.gateway.similarity.search_params import (
+    SearchParams,
+    SearchParamsDep,
+    check_place_filter,
+)
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
@@ -89,6 +93,7 @@ async def search_by_stored_photo(
     """
 
     def search() -> SimilarityResponse | Job:
+        _check_filter(gateway, map_name, search_params)
         if not search_params.needs_comparison:
             return find_similar(
                 gateway, query_from_photo(gateway, map_name, file_id), search_params
@@ -137,6 +142,7 @@ async def search_by_uploaded_photo(
     `Idempotency-Key` gets the 202 of the first one.
     """
     await run_in_threadpool(check_comparison_supported, gateway, map_name, search_params)
+    await run_in_threadpool(_check_filter, gateway, map_name, search_params)
     job_id = new_id()
     key = query_key(job_id)
     with admission.admit_upload(UploadKind.QUERY, request):
@@ -210,6 +216,13 @@ async def _wait_for_result(
         if isinstance(result, SimilarityResponse):
             return result
         job = result
+
+
+def _check_filter(gateway: GatewayContext, map_name: str, search_params: SearchParams) -> None:
+    if search_params.photos.place_under is not None:
+        with gateway.catalog.read() as session:
+            labels_are_paths = get_map(session, map_name).place_labels_are_paths
+        check_place_filter(search_params.photos, labels_are_paths)
 
 
 def _queue_query(

@@ -43,6 +43,14 @@ def parse_photo_filter(
         str | None,
         Query(max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"),
     ] = None,
+    place_under: Annotated[
+        str | None,
+        Query(
+            max_length=MAX_TEXT_CHARACTERS,
+            description="photos whose label is this level or lies below it; only for maps with "
+            "`place_labels_are_paths`",
+        ),
+    ] = None,
     tags: Annotated[
         str | None, Query(max_length=5000, description="separated by commas; photos must have all")
     ] = None,
@@ -58,15 +66,32 @@ def parse_photo_filter(
     """
     if place is not None and "\0" in place:
         raise invalid_field_error("place", "contains a NUL character")
+    if place_under is not None and ("\0" in place_under or not place_under.strip("/ ")):
+        raise invalid_field_error("place_under", "names no level of a path")
     return PhotoFilter(
         near=_parse_circle(near) if near is not None else None,
         box=_parse_box(box) if box is not None else None,
         captured_after=parse_time("captured_after", captured_after) if captured_after else None,
         captured_before=parse_time("captured_before", captured_before) if captured_before else None,
         place=place or None,
+        place_under=place_under.rstrip("/") if place_under is not None else None,
         tags=tuple(parse_tags(tags.split(","))) if tags else (),
         ids=_parse_ids(ids) if ids is not None else None,
     )
+
+
+def check_place_filter(photo_filter: PhotoFilter, labels_are_paths: bool) -> None:
+    """Checks that the map has the levels that the filter names.
+
+    Raises:
+        Unprocessable: `invalid_field`, for `place_under` in a map whose labels are no paths.
+    """
+    if photo_filter.place_under is not None and not labels_are_paths:
+        raise invalid_field_error(
+            "place_under",
+            "needs a map whose place labels are paths: PATCH /api/v1/maps/{name} with "
+            "`place_labels_are_paths`",
+        )
 
 
 FilterDep = Annotated[PhotoFilter, Depends(parse_photo_filter)]
