@@ -455,15 +455,14 @@ def _choose_thresholds(
     A level answers what the finer ones leave, so its threshold is chosen on the remaining ones.
     """
     judged = labelled or samples
-    finest = _lowest_threshold(judged, 0, certainty)
+    impostors = [s for s in samples if s.left_out is not None]
+    # The limit that holds for all impostors is loosened to one for those that get an answer.
+    limit = _upper_limit([s.not_in_map for s in impostors], certainty)
+    within = [s for s in judged if limit is None or s.not_in_map <= limit]
+    finest = _lowest_threshold(within, 0, certainty)
     cut = certainty if finest is None else finest
     limit = _upper_limit(
-        [
-            s.not_in_map if s.probabilities[0] >= cut else np.inf
-            for s in samples
-            if s.left_out is not None
-        ],
-        certainty,
+        [s.not_in_map if s.probabilities[0] >= cut else np.inf for s in impostors], certainty
     )
     remaining = list(judged)
     levels: list[float | None] = []
