@@ -45,7 +45,7 @@ test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real p
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
-	PLACEWISE_TEST_NO_SERVERS=1 $(BIN)/python -m pytest tests/unit tests/contract --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest tests/unit tests/contract -m "not servers" --numprocesses logical --dist loadfile
 
 test-deploy: $(INSTALLED) ## tests of the files for containers and Kubernetes (part of `make test`)
 	$(BIN)/python -m pytest tests/deploy

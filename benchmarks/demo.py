@@ -13,20 +13,22 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image, ImageDraw, ImageFont
 
+from benchmarks.generated_city import generate_city
+from placewise.answers import Estimate
+from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
-from shared.client import Client, Json
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
-from shared.synthetic_city.plan import CityOptions, make_plan
-from shared.synthetic_city.write import NOT_COMPARABLE, write_city
+from shared.synthetic_city.plan import CityOptions
+from shared.synthetic_city.write import NOT_COMPARABLE
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -44,7 +46,7 @@ class QueryOutcome:
     best: str
     """File name of the most similar photo."""
     best_is_correct: bool
-    estimate: Json
+    estimate: Estimate
     error_m: float | None
     """Distance of the estimate from the ground truth; None without an estimated location."""
 
@@ -58,35 +60,35 @@ def query_with_photo(
 ) -> QueryOutcome:
     """Query with a photo that is not stored, and compare the result with its ground truth."""
     truth = _location(query.fields)
-    answer = client.similar_to_file(query.path, top_k=1)
-    best, estimate = answer["similar_images"][0], answer["estimate"]
+    answer = client.similar(query.path, top_k=1)
+    best, estimate = answer.similar_images[0], answer.estimate
     return QueryOutcome(
         query=query.path,
         in_map=any(_is_near(truth, _location(photo.fields)) for photo in database),
-        best=best["original_filename"],
-        best_is_correct=_is_near(truth, _location(best)),
+        best=best.original_filename,
+        best_is_correct=_is_near(truth, _location(dict(best))),
         estimate=estimate,
-        error_m=distance_between_m(truth, _location(estimate)),
+        error_m=distance_between_m(truth, _location(dict(estimate))),
     )
 
 
-def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
+def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
     """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
     inside = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
-    accepted = [a for a in outcomes if a.estimate["in_map"]]
+    accepted = [a for a in outcomes if a.estimate.in_map]
     errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    confidences = [a.estimate["confidence"] for a in outcomes]
+    confidences = [a.estimate.confidence for a in outcomes if a.estimate.confidence is not None]
     # Without an estimated location, the best photo decides whether the result is correct.
-    right = [a.right or (a.estimate["in_map"] is False and a.best_is_correct) for a in outcomes]
-    is_calibrated = None not in confidences
+    right = [a.right or (a.estimate.in_map is False and a.best_is_correct) for a in outcomes]
+    is_calibrated = len(confidences) == len(outcomes)
     return {
         "queries": len(outcomes),
         "out_of_map": len(outside),
         "R@1": _ratio(sum(a.best_is_correct for a in inside), len(inside)),
         "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
-        "accepted_in_map": _ratio(sum(bool(a.estimate["in_map"]) for a in inside), len(inside)),
-        "false_accepts": _ratio(sum(bool(a.estimate["in_map"]) for a in outside), len(outside)),
+        "accepted_in_map": _ratio(sum(bool(a.estimate.in_map) for a in inside), len(inside)),
+        "false_accepts": _ratio(sum(bool(a.estimate.in_map) for a in outside), len(outside)),
         "median_error_m": median(errors) if errors else None,
         "calibration_error": (
             expected_calibration_error(confidences, right) if is_calibrated else None
@@ -98,7 +100,7 @@ def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
     }
 
 
-def _location(fields: Json) -> PhotoLocation:
+def _location(fields: Mapping[str, Any]) -> PhotoLocation:
     latitude, longitude = fields.get("latitude"), fields.get("longitude")
     if latitude is None or longitude is None:
         return PhotoLocation(None, None, None)
@@ -137,10 +139,10 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
     for number, answer in enumerate(chosen):
         left = GAP + number % COLUMNS * (CELL[0] + GAP)
         top = GAP + number // COLUMNS * block
-        frame = OUT_OF_MAP_COLOUR if answer.estimate["in_map"] is False else WRONG_COLOUR
+        frame = OUT_OF_MAP_COLOUR if answer.estimate.in_map is False else WRONG_COLOUR
         frame = CORRECT_COLOUR if answer.best_is_correct and frame == WRONG_COLOUR else frame
         _paste(sheet, answer.query, left, top)
-        pen.text((left, top + CELL[1] + 2), "asked", fill="black", font=font)
+        pen.text((left, top + CELL[1] + 2), "query", fill="black", font=font)
         below = top + CELL[1] + CAPTION
         right, bottom = left + CELL[0], below + CELL[1]
         pen.rectangle((left - EDGE, below - EDGE, right + EDGE, bottom + EDGE), frame)
@@ -151,30 +153,23 @@ def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path
 
 
 def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
-    """Choose two rows: mostly confident and correct, then wrong, then from outside the map."""
-    given = [a for a in outcomes if a.estimate["in_map"]]
-    right = [a for a in given if a.best_is_correct]
-    wrong = [a for a in given if not a.best_is_correct]
-    refused = [a for a in outcomes if a.estimate["in_map"] is False]
-    strangers = [a for a in refused if not a.in_map]
-    missed = [a for a in refused if a.in_map]
-    return [
-        *_evenly_spaced(right, COLUMNS + 1),
-        *_evenly_spaced(wrong, 1),
-        *_evenly_spaced(missed, 1),
-        *_evenly_spaced(strangers, 3),
-    ][: 2 * COLUMNS]
-
-
-def _evenly_spaced(found: Sequence[QueryOutcome], count: int) -> list[QueryOutcome]:
-    step = max(1, len(found) // count) if count else 1
-    return list(found[::step][:count])
+    """Choose two rows: mostly accepted and correct, then wrong, then rejected queries."""
+    accepted = [a for a in outcomes if a.estimate.in_map]
+    rejected = [a for a in outcomes if a.estimate.in_map is False]
+    groups = (
+        ([a for a in accepted if a.best_is_correct], COLUMNS + 1),
+        ([a for a in accepted if not a.best_is_correct], 1),
+        ([a for a in rejected if a.in_map], 1),
+        ([a for a in rejected if not a.in_map], 3),
+    )
+    chosen = [group[:: max(1, len(group) // count)][:count] for group, count in groups]
+    return [outcome for group in chosen for outcome in group][: 2 * COLUMNS]
 
 
 def _caption(answer: QueryOutcome) -> str:
-    if answer.estimate["in_map"] is False:
+    if answer.estimate.in_map is False:
         return "not in this map" + (" (it is)" if answer.in_map else "")
-    sure = answer.estimate["confidence"]
+    sure = answer.estimate.confidence
     error = f"{answer.error_m:.0f} m off" if answer.error_m is not None else "no place"
     return error if sure is None else f"{error}, {sure:.0%} sure"
 
@@ -195,7 +190,21 @@ def main() -> None:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo evaluates when it wants to print
         city = Path(folder, "city")
-        _draw_city(options, city, progress)
+        generate_city(
+            CityOptions(
+                options.places,
+                options.views,
+                options.queries,
+                options.seed,
+                0,
+                options.out_of_map,
+                320,
+                240,
+                train=False,
+            ),
+            city,
+            progress,
+        )
         with connect(None, None) as client:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
@@ -219,24 +228,6 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> None:
-    plan = make_plan(
-        CityOptions(
-            places=options.places,
-            views=options.views,
-            queries=options.queries,
-            seed=options.seed,
-            catalogue_seed=0,
-            out_of_map=options.out_of_map,
-            width=320,
-            height=240,
-            train=False,
-        )
-    )
-    bar = progress.add_task("drawing the city", total=len(plan.photos))
-    write_city(plan, city, lambda count: progress.advance(bar, count))
-
-
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
     """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
     from services.cli.client import wait_for_job
@@ -253,8 +244,8 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     for vocabulary in ("foreign", "own"):
         if vocabulary == "own":
             fit_and_wait(client, {}, progress)
-        job = wait_for_job(client, client.evaluate()["job_id"], progress, "evaluating")
-        found = job["result"]["labelled_queries"]
+        job = wait_for_job(client, client.evaluate(), progress, "evaluating")
+        found = (job.result or {})["labelled_queries"]
         shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
         print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
     bar = progress.add_task("querying", total=len(queries[1::2]))
@@ -267,27 +258,19 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
 
 def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
     summary = summarise_outcomes(outcomes)
-    right_of_accepted = _format_percent(summary["right_of_accepted"])
     print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
-    print(f"  R@1 of queries in the map                 {summary['R@1']:.1%}")
-    print(f"  precision of the accepted estimates       {right_of_accepted}")
-    print(
-        f"  accepted queries in the map               {_format_percent(summary['accepted_in_map'])}"
-    )
-    print(
-        f"  false accepts from outside the map        {_format_percent(summary['false_accepts'])}"
-    )
-    print(f"  median error of the correct estimates     {summary['median_error_m']:.1f} m")
-    if summary["calibration_error"] is not None:
-        print(f"  calibration error (ECE)                   {summary['calibration_error']:.3f}")
-        print(f"  AUROC                                     {summary['auroc']:.3f}")
-        print(
-            f"  recall at 99 % precision                  {summary['recall_at_99_precision']:.1%}"
-        )
-
-
-def _format_percent(share: float | None) -> str:
-    return "-" if share is None else f"{share:.1%}"
+    for name, label, style in (
+        ("R@1", "R@1 of queries in the map", ".1%"),
+        ("right_of_accepted", "precision of the accepted estimates", ".1%"),
+        ("accepted_in_map", "accepted queries in the map", ".1%"),
+        ("false_accepts", "false accepts from outside the map", ".1%"),
+        ("median_error_m", "median error of the correct estimates, m", ".1f"),
+        ("calibration_error", "calibration error (ECE)", ".3f"),
+        ("auroc", "AUROC", ".3f"),
+        ("recall_at_99_precision", "recall at 99 % precision", ".1%"),
+    ):
+        value = summary[name]
+        print(f"  {label:42s}{'-' if value is None else format(value, style)}")
 
 
 if __name__ == "__main__":

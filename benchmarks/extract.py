@@ -1,12 +1,14 @@
-"""Benchmark of descriptor extraction: Placewise, AnyLoc as published, and the device's peak rate.
+"""Descriptor extraction against AnyLoc as published, and against the device's peak rate.
 
-JPEG bytes go in, descriptors come out. Both implementations process the same photos in alternating
-rounds, so that other load on the machine affects both; on a busy CPU, compare their CPU times. The
-peak rate is that of large matrix products in the same precision.
+    placewise bench extract [--extractor anyloc-vits14] [--photos 32] [--device auto] [--rounds 3]
 
-Extractors use the weights that are installed, or random weights if there are none. Random weights
-need the same time and memory, and allow the numerical difference of the implementations to be
-measured; their retrieval results are meaningless.
+JPEG bytes go in, descriptors come out, in alternating rounds of both implementations; on a busy
+CPU, compare their CPU times. Reported: photos per second and CPU time per photo of both; their
+median ratio; the numerical difference of the descriptors; the rate of floating-point operations
+relative to that of large matrix products; peak memory.
+
+Extractors use the weights that are installed, or random weights if there are none: these need the
+same time and memory, but their retrieval results are meaningless.
 
 The AnyLoc baseline follows the description in the authors' paper and code: one photo at a time,
 float32, the whole network although a hook takes the features from the middle, and VLAD as a loop
@@ -26,6 +28,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -38,7 +41,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import normalize
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.load_generator import make_jpegs
+from benchmarks.fleet.load_generator import make_jpegs
 from benchmarks.report import Report
 from services.cli.environment import read_settings
 from services.extractor.decoder_pool import DecoderPool
@@ -52,7 +55,7 @@ from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import Misconfigured, PlacewiseError
 from shared.extractor_config.configs import FACETS, ExtractorConfig
 from shared.imaging.preprocessing import Pixels, get_preprocessing
-from tests.support.fit_memory import memory_bytes
+from tests.support.memory import memory_bytes
 from tests.support.vit import random_weights, save
 
 if TYPE_CHECKING:
@@ -77,7 +80,7 @@ class BenchmarkedExtractor:
             Misconfigured: the extractor or the device is not available.
         """
         settings = read_settings()
-        recipe = settings.recipe(extractor)
+        recipe = settings.extractor_config(extractor)
         weights, random = settings.dino_weights, False
         if recipe.depth is not None:
             size = recipe.backbone.removeprefix("dinov2-")
@@ -133,8 +136,10 @@ class ReferenceAnyLoc:
         for block in blocks:
             block.attn.fused_attn = device.type == "cuda"
         hooked = blocks[recipe.layer]
-        (hooked if self._third is None else hooked.attn.qkv).register_forward_hook(self._keep)
-        self._kept = torch.empty(0)
+        (hooked if self._third is None else hooked.attn.qkv).register_forward_hook(
+            self._store_output
+        )
+        self._output = torch.empty(0)
 
     def describe(self, photos: Sequence[bytes]) -> NDArray[np.float32]:
         """JPEGs -> (n, K * width), rows of length 1."""
@@ -146,14 +151,14 @@ class ReferenceAnyLoc:
             pixels = self._preprocessing.apply(image.convert("RGB"))
         with autocast("float32", self._device):
             self._network.features(torch.from_numpy(np.array(pixels))[None])
-            found = self._kept[0, 1:]
+            found = self._output[0, 1:]
             if self._third is not None:
                 found = found.chunk(3, dim=-1)[self._third]
             row: NDArray[np.float32] = vlad_in_loops(normalize(found, dim=-1), self._centres)
         return row
 
-    def _keep(self, _module: Any, _arguments: Any, output: torch.Tensor) -> None:
-        self._kept = output
+    def _store_output(self, _module: Any, _arguments: Any, output: torch.Tensor) -> None:
+        self._output = output
 
 
 def vlad_in_loops(features: torch.Tensor, centres: torch.Tensor) -> NDArray[np.float32]:
@@ -219,43 +224,42 @@ def _run_rounds(
     files: Sequence[bytes],
     rounds: int,
 ) -> None:
-    published = measured.recipe.depth is not None and measured.recipe.aggregator == "vlad"
     bar = progress.add_task("rounds", total=rounds)
     pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
-    ours, theirs = RoundTimings(), RoundTimings()
-    _reset_peak_memory(measured.device)
-    rows = ours.take(lambda: pipeline.describe(files))
-    peak_bytes = _peak_memory_bytes(measured.device)
-    reference, wanted = None, rows
-    if published:
+    ours, published = RoundTimings(), RoundTimings()
+    reference, expected = None, None
+    if measured.recipe.depth is not None and measured.recipe.aggregator == "vlad":
         assert pipeline.centres is not None
         reference = ReferenceAnyLoc(measured, pipeline.centres.array)
-        reference.describe(files[:1])  # warm, as ours
-        wanted = theirs.take(lambda: reference.describe(files))
-    for _ in range(rounds - 1):
-        ours.take(lambda: pipeline.describe(files))
+        reference.describe(files[:1])
+    _reset_peak_memory(measured.device)
+    rows = ours.run(lambda: pipeline.describe(files))
+    peak_bytes = _peak_memory_bytes(measured.device)
+    for number in range(rounds):
+        if number:
+            ours.run(lambda: pipeline.describe(files))
         if reference is not None:
-            theirs.take(lambda: reference.describe(files))
+            expected = published.run(partial(reference.describe, files))
         progress.advance(bar)
-    progress.advance(bar)
     rate = len(files) / statistics.median(ours.seconds)
     report.add("this pipeline", rate, "photos/s")
     if measured.device.type == "cpu":
         report.add("CPU time of a photo", ours.cpu_milliseconds(len(files)), "ms")
-    if reference is not None:
-        report.add("as published", len(files) / statistics.median(theirs.seconds), "photos/s")
+    if expected is not None:
+        report.add("as published", len(files) / statistics.median(published.seconds), "photos/s")
         if measured.device.type == "cpu":
-            published_ms = theirs.cpu_milliseconds(len(files))
-            report.add("CPU time of a photo as published", published_ms, "ms")
-        ratios = [slow / quick for slow, quick in zip(theirs.seconds, ours.seconds, strict=True)]
-        report.add("times as fast", statistics.median(ratios), at_least=TARGET_SPEEDUP)
-        report.add("largest difference of two numbers", float(np.abs(rows - wanted).max()))
-        report.add("least cosine of two descriptors", float((rows * wanted).sum(axis=1).min()))
+            milliseconds = published.cpu_milliseconds(len(files))
+            report.add("CPU time of a photo as published", milliseconds, "ms")
+        pairs = zip(published.seconds, ours.seconds, strict=True)
+        speedup = statistics.median(slow / quick for slow, quick in pairs)
+        report.add("times as fast", speedup, at_least=TARGET_SPEEDUP)
+        report.add("largest difference of two numbers", float(np.abs(rows - expected).max()))
+        report.add("least cosine of two descriptors", float((rows * expected).sum(axis=1).min()))
     flop = _count_flops(pipeline.made, pipeline.pixels(files[:1])[0])
     ceiling = _matmul_flops_per_second(measured.device, pipeline.made.precision)
     report.add("forward pass of a photo", flop / 1e9, "GFLOP")
     report.add("matrix products on this device", ceiling / 1e9, "GFLOP/s")
-    report.add("of them, this pipeline", rate * flop / ceiling)
+    report.add("share of it that this pipeline reaches", rate * flop / ceiling)
     report.add("peak memory", peak_bytes / 1e6, "MB")
 
 
@@ -292,11 +296,11 @@ class ExtractionPipeline:
 
 @contextlib.contextmanager
 def _open_pipeline(
-    measured: BenchmarkedExtractor, precision: Precision, batch: int, learnt_from: Sequence[bytes]
+    measured: BenchmarkedExtractor, precision: Precision, batch: int, fit_photos: Sequence[bytes]
 ) -> Iterator[ExtractionPipeline]:
     with contextlib.closing(DecoderPool(measured.settings)) as decoders:
         pipeline = ExtractionPipeline(measured.load(precision), decoders, batch)
-        pipeline.centres = fit_or_load_centres(pipeline.made, pipeline.pixels(learnt_from))
+        pipeline.centres = fit_or_load_centres(pipeline.made, pipeline.pixels(fit_photos))
         yield pipeline
 
 
@@ -308,7 +312,7 @@ class RoundTimings:
     cpu_seconds: list[float] = field(default_factory=list)
     """With those of the decoding children."""
 
-    def take(self, do: Callable[[], Rows]) -> Rows:
+    def run(self, do: Callable[[], Rows]) -> Rows:
         """Return the descriptors on the CPU, which also waits for the GPU."""
         started_at, cpu_begun = time.perf_counter(), _cpu_seconds()
         rows = do()

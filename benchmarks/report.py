@@ -1,39 +1,45 @@
-"""Benchmark report: measured values, their bounds, and latency percentiles."""
+"""Benchmark report: measurements with their targets and the load average, and latency percentiles.
+
+The table of a report has these columns: what was measured; the value; its target, if it has one;
+whether the target was met; and the load average of the machine (the number of processes that were
+running or waiting, over the last minute) when the value was added. On two cores, a load average
+well above 2 means that other work slowed the measurement down.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import median
+from typing import Any
 
 from rich.table import Table
-
-from shared.client import Json
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A measured value. `wanted` is its bound: a minimum if `at_least`, else a maximum."""
+    """A measured value. `target` is a minimum if `at_least`, else a maximum."""
 
     what: str
     measured: float
     unit: str = ""
-    wanted: float | None = None
+    target: float | None = None
     at_least: bool = False
+    load_average: float = field(default_factory=lambda: os.getloadavg()[0])
 
     @property
     def missed(self) -> bool:
-        if self.wanted is None:
+        if self.target is None:
             return False
-        return self.measured < self.wanted if self.at_least else self.measured > self.wanted
+        return self.measured < self.target if self.at_least else self.measured > self.target
 
     @property
     def bound(self) -> str:
-        if self.wanted is None:
+        if self.target is None:
             return ""
-        return (
-            f"at {'least' if self.at_least else 'most'} {_format_number(self.wanted)} "
-            f"{self.unit}".strip()
-        )
+        limit = "at least" if self.at_least else "at most"
+        return f"{limit} {_format_number(self.target)} {self.unit}".strip()
 
 
 @dataclass(slots=True)
@@ -42,8 +48,8 @@ class Report:
 
     title: str
     figures: list[Figure] = field(default_factory=list)
-    details: Json = field(default_factory=dict)
-    """What else a program may want to read; not shown in the table."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """Further values of the JSON output; not shown in the table."""
     tables: list[Table] = field(default_factory=list)
     """Shown before that of the figures."""
 
@@ -56,38 +62,52 @@ class Report:
         at_most: float | None = None,
         at_least: float | None = None,
     ) -> None:
-        wanted = at_most if at_least is None else at_least
-        self.figures.append(Figure(what, measured, unit, wanted, at_least is not None))
+        target = at_most if at_least is None else at_least
+        self.figures.append(Figure(what, measured, unit, target, at_least is not None))
+
+    def add_latency(
+        self,
+        what: str,
+        seconds: Sequence[float],
+        *,
+        p95_at_most_ms: float | None = None,
+        worst_at_most_ms: float | None = None,
+    ) -> None:
+        """Add p50, p95 and the maximum of durations in seconds, as milliseconds."""
+        found = LatencySummary.of(seconds)
+        self.add(f"{what}, p50", 1000 * found.median, "ms")
+        self.add(f"{what}, p95", 1000 * found.p95, "ms", at_most=p95_at_most_ms)
+        self.add(f"{what}, worst", 1000 * found.worst, "ms", at_most=worst_at_most_ms)
 
     @property
     def missed(self) -> bool:
-        """Whether any value violates its bound."""
+        """Whether any value misses its target."""
         return any(figure.missed for figure in self.figures)
 
-    def as_json(self) -> Json:
-        return {
-            "title": self.title,
-            "missed": self.missed,
-            "figures": [
-                {
-                    "what": figure.what,
-                    "measured": figure.measured,
-                    "unit": figure.unit,
-                    "wanted": figure.bound or None,
-                    "missed": figure.missed,
-                }
-                for figure in self.figures
-            ],
-            **self.details,
-        }
+    def as_json(self) -> dict[str, Any]:
+        figures = [
+            {
+                "what": figure.what,
+                "measured": figure.measured,
+                "unit": figure.unit,
+                "target": figure.bound or None,
+                "missed": figure.missed,
+                "load_average": figure.load_average,
+            }
+            for figure in self.figures
+        ]
+        return {"title": self.title, "missed": self.missed, "figures": figures, **self.details}
 
     def table(self) -> Table:
-        table = Table("what", "measured", "wanted", "", title=self.title)
+        table = Table("what", "measured", "target", "", "load", title=self.title)
         for figure in self.figures:
-            verdict = "" if figure.wanted is None else "missed" if figure.missed else "met"
-            measured = f"{_format_number(figure.measured)} {figure.unit}".strip()
             table.add_row(
-                figure.what, measured, figure.bound, verdict, style="red" if figure.missed else None
+                figure.what,
+                f"{_format_number(figure.measured)} {figure.unit}".strip(),
+                figure.bound,
+                "" if figure.target is None else "missed" if figure.missed else "met",
+                f"{figure.load_average:.1f}",
+                style="red" if figure.missed else None,
             )
         return table
 
@@ -101,7 +121,7 @@ class LatencySummary:
     worst: float
 
     @classmethod
-    def of(cls, seconds: list[float]) -> LatencySummary:
+    def of(cls, seconds: Sequence[float]) -> LatencySummary:
         """Summarise durations in seconds; ValueError if there are none."""
         if not seconds:
             raise ValueError("nothing was timed")

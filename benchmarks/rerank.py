@@ -1,8 +1,10 @@
-"""Benchmark of reranking by local features: recall gained and time per photo.
+"""Reranking by local features: recall gained, and CPU time per photo.
 
-Runs on a generated city, smaller than that of the README, with the default extractor and both of
-its vocabularies; and on the real photos of PLACEWISE_TEST_DATA, if it is set. Times are of one
-core, and include the effect of other load on the machine.
+    placewise bench rerank [--places 150] [--seed 0]
+
+Runs on a generated city with the default extractor and both of its vocabularies; and on the real
+photos of PLACEWISE_TEST_DATA, if it is set. Reported for each vocabulary: R@1, R@5 and R@10 without
+reranking and with `rerank=10`, 25 and 50 (25 m rule), and CPU time on one core.
 """
 
 from __future__ import annotations
@@ -19,18 +21,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
+from benchmarks.generated_city import generate_city, load_pixels
 from benchmarks.report import Report
 from shared.descriptors.aggregation import vlad
 from shared.descriptors.extractor import Extractor, choose_device
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.reranking import LocalFeatures, rerank_score
-from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.evaluation.recall import rank_by_similarity, recall_at_k
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS
 from shared.imaging.preprocessing import Pixels
-from shared.synthetic_city.plan import CityOptions, PlannedPhoto, make_plan
-from shared.synthetic_city.write import write_city
+from shared.synthetic_city.plan import CityOptions
 from tests.e2e.test_real_photos import TRUE_MATCH
 
 if TYPE_CHECKING:
@@ -62,45 +63,25 @@ def measure(progress: Progress, *, places: int, seed: int) -> Report:
     extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
     report = Report(f"Reranking {places} generated places, seed {seed}")
     with tempfile.TemporaryDirectory() as folder:
-        database, queries, positives = _draw_city(Path(folder), places, seed, progress)
-        bar = progress.add_task("describing", total=len(database) + len(queries))
-        described = _describe_city(extractor, database, queries, lambda n: progress.advance(bar, n))
-        recompute = _time_features(extractor, database[: max(RERANK_DEPTHS)])
-    bar = progress.add_task("reranking", total=len(queries) * 2)
+        options = CityOptions(places, 4, max(1, places // 2), seed, 0, 0.1, 320, 240, train=False)
+        city = generate_city(options, Path(folder), progress)
+        bar = progress.add_task("describing", total=len(city.database) + len(city.queries))
+        described = _describe_city(
+            extractor, city.database, city.queries, lambda n: progress.advance(bar, n)
+        )
+        seconds_per_photo = _time_features(extractor, city.database[: max(RERANK_DEPTHS)])
+    bar = progress.add_task("reranking", total=len(city.queries) * 2)
     for vocabulary in ("shipped", "fitted"):
         _report_city(
-            report, extractor, described, vocabulary, positives, lambda: progress.advance(bar)
+            report, extractor, described, vocabulary, city.positives, lambda: progress.advance(bar)
         )
     for depth in RERANK_DEPTHS:
-        report.add(f"local features of {depth} photos, made anew", recompute * depth, "s of a core")
+        report.add(f"computing features of {depth} photos", seconds_per_photo * depth, "s of CPU")
     if "PLACEWISE_TEST_DATA" in os.environ:
         _report_real_photos(
             report, extractor, Path(os.environ["PLACEWISE_TEST_DATA"]) / "toy-places"
         )
     return report
-
-
-def _draw_city(
-    folder: Path, places: int, seed: int, progress: Progress
-) -> tuple[list[Path], list[Path], list[Indices]]:
-    """Return paths of database and queries, and the positives of each query."""
-    plan = make_plan(CityOptions(places, 4, max(1, places // 2), seed, 0, 0.1, 320, 240, False))
-    bar = progress.add_task("drawing", total=len(plan.photos))
-    write_city(plan, folder, lambda count: progress.advance(bar, count))
-    database = [shot for shot in plan.photos if shot.role == "database"]
-    queries = [s for s in plan.photos if s.role == "query" and s.kind != "out_of_map"]
-
-    def paths(shots: Sequence[PlannedPhoto]) -> list[Path]:
-        return [folder / shot.folder / shot.name for shot in shots]
-
-    def positions(shots: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
-        return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
-
-    return (
-        paths(database),
-        paths(queries),
-        positives_within(positions(queries), positions(database)),
-    )
 
 
 def _describe_city(
@@ -178,7 +159,7 @@ def _report_city(
             report.add(f"R@{k}, {vocabulary} vocabulary, {how}", 100 * share, "%")
     for depth in RERANK_DEPTHS:
         report.add(
-            f"comparing {depth} photos, {vocabulary}, median", median(took) * depth, "s of a core"
+            f"comparing {depth} photos, {vocabulary}, median", median(took) * depth, "s of CPU"
         )
 
 
@@ -220,13 +201,15 @@ def _report_real_photos(report: Report, extractor: Extractor, folder: Path) -> N
     """Report the ranks of the true matches before and after reranking all photos."""
     database = sorted((folder / "database").glob("*.jpg"))
     queries = [folder / "queries" / name for name in TRUE_MATCH]
-    photos, asked = _describe_city(extractor, database, queries, lambda count: None)
+    photos, query_photos = _describe_city(extractor, database, queries, lambda count: None)
     truth = [[path.name for path in database].index(match) for match in TRUE_MATCH.values()]
     for vocabulary in ("shipped", "fitted"):
-        ranked = rank_by_similarity(asked.rows[vocabulary], photos.rows[vocabulary], len(database))
+        ranked = rank_by_similarity(
+            query_photos.rows[vocabulary], photos.rows[vocabulary], len(database)
+        )
         scores = np.array(
             [
-                _rerank_scores(extractor, asked, query, photos, ranked[query], vocabulary)
+                _rerank_scores(extractor, query_photos, query, photos, ranked[query], vocabulary)
                 for query in range(len(queries))
             ]
         )
@@ -241,8 +224,4 @@ def _report_real_photos(report: Report, extractor: Extractor, folder: Path) -> N
 
 def _batches(extractor: Extractor, paths: Sequence[Path]) -> Iterator[list[Pixels]]:
     for begin in range(0, len(paths), BATCH):
-        batch = []
-        for path in paths[begin : begin + BATCH]:
-            with Image.open(path) as image:
-                batch.append(extractor.preprocessing.apply(image.convert("RGB")))
-        yield batch
+        yield [load_pixels(extractor, path) for path in paths[begin : begin + BATCH]]

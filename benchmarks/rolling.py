@@ -1,8 +1,11 @@
-"""Benchmark of a rolling restart under load: every process is restarted, one after the other.
+"""Rolling restart under load: every process is stopped with SIGTERM and started again, in turn.
 
-Each gateway, extractor, search worker and steward is stopped with SIGTERM and started again, under
-uploads, queries and reads. The client behaves as one of two gateways: if one does not respond, it
-tries the other once, and it waits once for the time of a `Retry-After`.
+    placewise bench rolling
+
+Two gateways, extractors, search workers and stewards run under uploads, queries and reads. The
+client behaves as one of two gateways: if one does not respond, it tries the other once, and it
+waits once for the time of a `Retry-After`. Reported: requests, retries, failed requests, lost jobs,
+and the longest stop of a process.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from uuid import UUID
 from sqlalchemy import select
 
 from benchmarks.fleet import Fleet, Servers, start_servers
-from benchmarks.load_generator import (
+from benchmarks.fleet.load_generator import (
     CONTENT_TYPE,
     HttpCaller,
     HttpResponse,
@@ -53,30 +56,23 @@ class LoadClients:
         self._callers = [HttpCaller(url) for url in urls]
         self._photos = photos
         self._stop = threading.Event()
-        self._lock = threading.Lock()
         self.uploaded: list[tuple[str, str]] = []
         """(photo, job) of each upload that was acknowledged."""
         self.findable: list[str] = []
         """Photos whose job has been seen to succeed."""
         self.requests: Counter[str] = Counter()
-        self.again: Counter[str] = Counter()
-        """What was tried a second time, and why."""
+        self.retries: Counter[str] = Counter()
+        """Retries by request and reason."""
         self.failed: list[str] = []
-        works: list[Callable[[random.Random], None]] = [
-            *(self._upload, self._query_new_photo, self._query_stored_photo, self._read),
-        ]
-        self._threads = [
-            threading.Thread(target=self._run, args=(work, number), name=work.__name__)
-            for number, work in enumerate(works)
-        ]
+        loops = (self._upload, self._query_new_photo, self._query_stored_photo, self._read)
+        self._threads = [threading.Thread(target=self._run, args=(loop,)) for loop in loops]
 
     def begin(self, photos: int) -> None:
         """Upload the first photos, so that queries have results."""
-        chance = random.Random(-1)
         for _ in range(photos):
-            self._upload(chance)
+            self._upload()
         for photo_id, job_id in list(self.uploaded):
-            self._call(0, "job", "GET", f"/api/v1/jobs/{job_id}?wait=30")
+            self._call("job", "GET", f"/api/v1/jobs/{job_id}?wait=30")
             self.findable.append(photo_id)
         for thread in self._threads:
             thread.start()
@@ -89,95 +85,75 @@ class LoadClients:
         for caller in self._callers:
             caller.close()
 
-    def _run(self, work: Callable[[random.Random], None], number: int) -> None:
-        chance = random.Random(number)
+    def _run(self, request: Callable[[], None]) -> None:
         while not self._stop.wait(PAUSE_SECONDS):
-            work(chance)
+            request()
 
-    def _upload(self, chance: random.Random) -> None:
-        form = multipart_form(chance.choice(self._photos))
-        answer = self._call(
-            chance.randrange(2), "upload", "POST", "/api/v1/upload", form, **CONTENT_TYPE
-        )
+    def _upload(self) -> None:
+        form = multipart_form(random.choice(self._photos))
+        answer = self._call("upload", "POST", "/api/v1/upload", form, **CONTENT_TYPE)
         if answer is not None:
-            body = answer.json()
-            self.uploaded.append((body["file_id"], body["job_id"]))
+            self.uploaded.append((answer.json()["file_id"], answer.json()["job_id"]))
 
-    def _query_new_photo(self, chance: random.Random) -> None:
-        form = multipart_form(chance.choice(self._photos))
-        answer = self._call(
-            chance.randrange(2),
-            "query by new photo",
-            "POST",
-            "/api/v1/similarity?top_k=3",
-            form,
-            Prefer="wait=30",
-            **CONTENT_TYPE,
-        )
+    def _query_new_photo(self) -> None:
+        name, form = "query by new photo", multipart_form(random.choice(self._photos))
+        path, headers = "/api/v1/similarity?top_k=3", {"Prefer": "wait=30", **CONTENT_TYPE}
+        answer = self._call(name, "POST", path, form, **headers)
         if answer is not None and answer.status == 202:
-            # A gateway that stops answers so, sooner than it was asked to.
-            body = answer.json()
-            self._call(chance.randrange(2), "job", "GET", f"{body['status_url']}?wait=30")
-            answer = self._call(chance.randrange(2), "result", "GET", body["result_url"])
-        if answer is not None and answer.json()["missing"]:
-            self._record_failure(f"query by new photo: {answer.body!r}")
+            # A gateway that stops does not wait for the result.
+            self._call("job", "GET", f"{answer.json()['status_url']}?wait=30")
+            answer = self._call("result", "GET", answer.json()["result_url"])
+        self._check_complete(name, answer)
 
-    def _query_stored_photo(self, chance: random.Random) -> None:
-        photo_id = chance.choice(self.findable)
-        answer = self._call(
-            chance.randrange(2),
-            "query by stored photo",
-            "POST",
-            f"/api/v1/similarity/{photo_id}?top_k=3",
-        )
-        if answer is not None and answer.json()["missing"]:
-            self._record_failure(f"query by stored photo: {answer.body!r}")
+    def _query_stored_photo(self) -> None:
+        path = f"/api/v1/similarity/{random.choice(self.findable)}?top_k=3"
+        name = "query by stored photo"
+        self._check_complete(name, self._call(name, "POST", path))
 
-    def _read(self, chance: random.Random) -> None:
-        photo_id, job_id = chance.choice(self.uploaded)
-        path = chance.choice(
+    def _check_complete(self, name: str, answer: HttpResponse | None) -> None:
+        if answer is not None and answer.json()["missing"]:
+            self.failed.append(f"{name}: {answer.body!r}")
+
+    def _read(self) -> None:
+        photo_id, job_id = random.choice(self.uploaded)
+        path = random.choice(
             (
-                f"/api/v1/uploads/{photo_id}",
-                f"/api/v1/uploads/{photo_id}/image",
-                f"/api/v1/jobs/{job_id}",
-                "/api/v1/search?limit=5",
-                "/api/v1/database/stats",
+                f"uploads/{photo_id}",
+                f"uploads/{photo_id}/image",
+                f"jobs/{job_id}",
+                "search?limit=5",
+                "database/stats",
             )
         )
-        self._call(chance.randrange(2), "read", "GET", path)
+        self._call("read", "GET", f"/api/v1/{path}")
 
     def _call(
-        self, first: int, what: str, method: str, path: str, body: bytes | None = None, **head: str
+        self, what: str, method: str, path: str, body: bytes | None = None, **headers: str
     ) -> HttpResponse | None:
-        """Return the response; record a failure and return None if the retry fails too."""
+        """Return the response; record a failure and return None if the retries fail too."""
         self.requests[what] += 1
-        at, other_left, wait_left = first, True, True
+        gateway, can_switch, can_wait = random.randrange(2), True, True
         while True:
-            why = ""
             try:
-                answer = self._callers[at].call(method, path, body, **head)
+                answer = self._callers[gateway].call(method, path, body, **headers)
             except (OSError, HTTPException) as error:
-                why = f"{type(error).__name__}: {error}"
-                if other_left:
-                    at, other_left = 1 - at, False
-                    self.again[f"{what}: {type(error).__name__}"] += 1
+                reason = f"{type(error).__name__}: {error}"
+                if can_switch:
+                    gateway, can_switch = 1 - gateway, False
+                    self.retries[f"{what}: {type(error).__name__}"] += 1
                     continue
             else:
                 if answer.status < 300:
                     return answer
-                why = f"{answer.status} {answer.body!r}"
+                reason = f"{answer.status} {answer.body!r}"
                 pause = answer.headers.get("Retry-After")
-                if pause is not None and wait_left:
-                    wait_left = False
-                    self.again[f"{what}: {answer.status}, Retry-After {pause}"] += 1
+                if pause is not None and can_wait:
+                    can_wait = False
+                    self.retries[f"{what}: {answer.status}, Retry-After {pause}"] += 1
                     time.sleep(float(pause))
                     continue
-            self._record_failure(f"{what}: {method} {path}: {why}")
+            self.failed.append(f"{what}: {method} {path}: {reason}")
             return None
-
-    def _record_failure(self, reason: str) -> None:
-        with self._lock:
-            self.failed.append(reason)
 
 
 def measure(progress: Progress) -> Report:
@@ -227,15 +203,19 @@ def restart_under_load(
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
         lost = _count_undescribed(fleet, [UUID(photo_id) for photo_id, _ in clients.uploaded])
         logs = fleet.logs()
-        fell = list(fleet.crashed)
+        crashed = list(fleet.crashed)
     for what, count in clients.requests.items():
         report.add(f"requests: {what}", count)
-    for why, count in clients.again.items():
-        report.add(f"tried again: {why}", count)
+    for why, count in clients.retries.items():
+        report.add(f"retried: {why}", count)
     report.add("requests failed", len(clients.failed), at_most=0)
     report.add("jobs lost", lost, at_most=0)
-    report.add("services that ended badly", sum(code != 0 for code in codes.values()), at_most=0)
-    report.add("services that fell", len(fell), at_most=0)
+    report.add(
+        "services with another exit code than 0",
+        sum(code != 0 for code in codes.values()),
+        at_most=0,
+    )
+    report.add("services that crashed", len(crashed), at_most=0)
     report.add("longest stop", max(stopping.values()), "s")
     report.details = {
         "failed": clients.failed,

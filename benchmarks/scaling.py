@@ -1,23 +1,24 @@
-"""Benchmark of horizontal scaling: throughput of 1, 2, 4 ... extractors, and duplicate work.
+"""Horizontal scaling: throughput of 1, 2, 4 ... extractors, and duplicate work.
+
+    placewise bench scaling [--workers 1,2,4,8] [--photos 60] [--milliseconds 500] [--batch 4]
 
 The extractors sleep instead of computing, so that many fit on one machine. What remains is the cost
-of the job table, the Celery hints and publishing.
+of the job table, the Celery messages and publishing. Reported: photos per second for each number of
+extractors; that rate relative to linear scaling; and photos described twice or not at all.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
-from benchmarks.fleet import Fleet, ServiceProcess, start_servers
-from benchmarks.load_generator import (
+from benchmarks.fleet import Fleet, ServiceProcess, open_fleet
+from benchmarks.fleet.load_generator import (
     count_descriptions,
     load_jobs,
     make_jpegs,
-    multipart_form,
+    multipart_forms,
     upload_all,
     wait_for_jobs,
 )
@@ -45,20 +46,14 @@ def measure(
 
     Workers sleep `milliseconds` per photo and take batches of `batch`.
     """
-    report = Report("Extractors that sleep")
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        start_servers() as servers,
-        Fleet(
-            Path(folder),
-            servers,
-            extractors=max(workers),
-            extractor=f"test-slow-avg:milliseconds={milliseconds},width=16",
-            batch_photos=batch,
-            compact_chunks=COMPACTION_DISABLED,
-            slot_rows=COMPACTION_DISABLED,
-        ) as fleet,
-    ):
+    report = Report("Scaling of extractors")
+    with open_fleet(
+        extractors=max(workers),
+        extractor=f"test-slow-avg:milliseconds={milliseconds},width=16",
+        batch_photos=batch,
+        compact_chunks=COMPACTION_DISABLED,
+        slot_rows=COMPACTION_DISABLED,
+    ) as fleet:
         fleet.start("search-0-0", "gateway-0", "steward-0")
         sent = 0
         rates: dict[int, float] = {}
@@ -82,14 +77,14 @@ def measure(
         for count, rate in rates.items():
             if count > least:
                 report.add(
-                    f"{count} extractors, of linear",
+                    f"{count} extractors / linear",
                     rate / (rates[least] * count / least),
                     at_least=TARGET_EFFICIENCY,
                 )
         times = count_descriptions(fleet.store)
         report.add("photos described more than once", sum(n > 1 for n in times.values()), at_most=0)
-        report.add("photos stored and not described", sent - len(times), at_most=0)
-        report.add("services that fell", len(fleet.crashed), at_most=0)
+        report.add("photos not described", sent - len(times), at_most=0)
+        report.add("services that crashed", len(fleet.crashed), at_most=0)
     report.details = {"milliseconds": milliseconds, "batch": batch, "photos_each": photos}
     return report
 
@@ -106,13 +101,12 @@ def _warm_up(fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int) ->
         if expected_workers <= served:
             return photos * (round_ + 1)
     raise AssertionError(
-        f"{len(expected_workers - served)} extractors take no work: {fleet.logs()}"
+        f"{len(expected_workers - served)} extractors claim no jobs: {fleet.logs()}"
     )
 
 
 def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:
-    small = make_jpegs(8, (64, 48), 1500)
-    forms = [multipart_form(small[number % len(small)]) for number in range(photos)]
+    forms = multipart_forms(make_jpegs(8, (64, 48), 1500), photos)
     return upload_all(fleet.gateway_urls[0], forms, CLIENTS)
 
 

@@ -1,9 +1,12 @@
-"""Benchmark under slow-client attacks: latency of `GET /maps` and of uploads.
+"""Latency of `GET /maps` and of uploads under slow-client attacks.
+
+    placewise bench slow-clients [--seconds 30] [--idle 1100] [--bodies 32] [--streams 500]
 
 Three attacks, one after the other and then at once: idle connections, uploads of one byte a second,
 and event streams. Server and clients run on this machine. The idle connections come from the
 address of the timed calls, the others from addresses of their own (127.0.0.0/8). All are reopened
-when the server closes them.
+when the server closes them. Reported for each attack: p50, p95 and maximum of both calls, failed
+calls, and the growth of the server's log.
 """
 
 from __future__ import annotations
@@ -12,11 +15,8 @@ import asyncio
 import contextlib
 import json
 import multiprocessing
-import os
 import random
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -27,17 +27,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from benchmarks.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
+from benchmarks.fleet.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
+from benchmarks.fleet.service import start_embedded_server
 from benchmarks.report import LatencySummary, Report
-from shared.client import Client
-from shared.config.embedded_home import RunningServer, find_running_server
+from placewise.client import Client
 from shared.errors import Unavailable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_RATIO = 5.0  # maximum p95 relative to the p95 without an attack
-WANTED_LOG_BYTES_PER_MINUTE = 1_000_000
+MAX_P95_RATIO = 5.0  # maximum p95 relative to the p95 without an attack
+MAX_LOG_BYTES_PER_MINUTE = 1_000_000
 START_SECONDS = 60.0
 SETTLE_SECONDS = 10.0  # time for the attack to open its connections
 CALL_SECONDS = 30.0  # timeout of a call
@@ -89,83 +89,55 @@ def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, strea
         "all at once": (idle, bodies, streams),
     }
     found: dict[str, Calls] = {}
-    with tempfile.TemporaryDirectory() as folder:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        start_embedded_server(
+            Path(folder),
+            max_open_files=OPEN_FILES,
+            HOST=ADDRESS,
+            ADMIN_KEY="the-admin-key-of-the-measurement",
+            EXTRACTOR=EXTRACTOR,
+            ALLOW_TEST_EXTRACTORS="true",
+        ) as server,
+    ):
         log = Path(folder, "server.log")
-        with _server(Path(folder, "home"), log) as running:
-            port = urlsplit(running.url).port
-            assert port is not None
-            with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
-                ours, slow, *watching = (
-                    client.create_key(f"{number}", ["read", "write"])["key"]
-                    for number in range(2 + CALLERS)
-                )
-            jobs = tuple(_upload(port, ours, photo) for _ in range(WATCHED_JOBS))
-            bar = progress.add_task("phases", total=len(phases))
-            for name, (idle_now, bodies_now, streams_now) in phases.items():
-                attack = Attack(
-                    port, idle_now, bodies_now, streams_now, slow, tuple(watching), jobs
-                )
-                with _under(attack):
-                    found[name] = _timed(port, ours, photo, seconds, log)
-                progress.advance(bar)
-    least = found["no attack"]
-    for name, calls in found.items():
-        for what, mine, theirs in (
-            ("GET /maps", calls.maps, least.maps),
-            ("upload", calls.uploads, least.uploads),
-        ):
-            bound = None if calls is least else WANTED_RATIO * LatencySummary.of(theirs).p95 * 1000
-            report.add(f"{name}: {what}, median", LatencySummary.of(mine).median * 1000, "ms")
-            report.add(
-                f"{name}: {what}, p95", LatencySummary.of(mine).p95 * 1000, "ms", at_most=bound
+        port = urlsplit(server.url).port
+        assert port is not None
+        with Client(server.url, key=server.key, patience_seconds=START_SECONDS) as client:
+            ours, slow, *watching = (
+                client.create_key(f"{number}", ["read", "write"]).key
+                for number in range(2 + CALLERS)
             )
-        report.add(f"{name}: calls that failed", len(calls.failed), at_most=0)
+        jobs = tuple(_upload(port, ours, photo) for _ in range(WATCHED_JOBS))
+        bar = progress.add_task("phases", total=len(phases))
+        for name, numbers in phases.items():
+            with _under(Attack(port, *numbers, slow, tuple(watching), jobs)):
+                found[name] = _timed(port, ours, photo, seconds, log)
+            progress.advance(bar)
+    baseline = found["no attack"]
+    for name, calls in found.items():
+        for what, measured, without_attack in (
+            ("GET /maps", calls.maps, baseline.maps),
+            ("upload", calls.uploads, baseline.uploads),
+        ):
+            limit_ms = 1000 * MAX_P95_RATIO * LatencySummary.of(without_attack).p95
+            report.add_latency(
+                f"{name}: {what}",
+                measured,
+                p95_at_most_ms=None if calls is baseline else limit_ms,
+            )
+        report.add(f"{name}: failed calls", len(calls.failed), at_most=0)
         report.add(
             f"{name}: log",
             calls.log_bytes_per_minute / 1000,
             "kB a minute",
-            at_most=WANTED_LOG_BYTES_PER_MINUTE / 1000,
+            at_most=MAX_LOG_BYTES_PER_MINUTE / 1000,
         )
     report.details = {
         "failed": {name: calls.failed[:10] for name, calls in found.items()},
         "calls": {name: len(calls.maps) + len(calls.uploads) for name, calls in found.items()},
-        "load_average": os.getloadavg(),
     }
-    report.add("load average at the end", os.getloadavg()[0])
     return report
-
-
-@contextlib.contextmanager
-def _server(home: Path, log: Path) -> Iterator[RunningServer]:
-    command = [str(Path(sys.executable).with_name("placewise")), "serve"]
-    environment = {
-        **os.environ,
-        "PLACEWISE_HOME": str(home),
-        "HOST": ADDRESS,
-        "PORT": "0",
-        "ADMIN_KEY": "the-admin-key-of-the-measurement",
-        "EXTRACTOR": EXTRACTOR,
-        "ALLOW_TEST_EXTRACTORS": "true",
-    }
-
-    def limit_files() -> None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
-
-    with (
-        log.open("wb") as out,
-        subprocess.Popen(  # noqa: S603
-            command, env=environment, stderr=out, cwd=home.parent, preexec_fn=limit_files
-        ) as server,
-    ):
-        try:
-            deadline = time.monotonic() + START_SECONDS
-            while (running := find_running_server(home)) is None:
-                if server.poll() is not None or time.monotonic() > deadline:
-                    raise Unavailable("server_unreachable", "The server did not start.")
-                time.sleep(0.1)
-            yield running
-        finally:
-            server.terminate()
 
 
 def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Calls:
@@ -173,18 +145,15 @@ def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Call
     calls = Calls()
     size, started_at = log.stat().st_size, time.monotonic()
     while (now := time.monotonic()) < started_at + seconds or not calls.uploads:
+        timings = calls.maps if len(calls.maps) <= len(calls.uploads) else calls.uploads
         try:
-            if len(calls.maps) <= len(calls.uploads):
+            if timings is calls.maps:
                 _call(port, key, "GET", "/api/v1/maps")
-                calls.maps.append(time.monotonic() - now)
             else:
                 _upload(port, key, photo)
-                calls.uploads.append(time.monotonic() - now)
         except (OSError, HTTPException, Unavailable) as error:
             calls.failed.append(repr(error))
-            (calls.maps if len(calls.maps) <= len(calls.uploads) else calls.uploads).append(
-                time.monotonic() - now
-            )
+        timings.append(time.monotonic() - now)
     calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - started_at) * 60
     return calls
 
@@ -192,8 +161,7 @@ def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Call
 def _upload(port: int, key: str, photo: bytes) -> str:
     """Upload and return the id of the photo's job."""
     answer = _call(port, key, "POST", "/api/v1/upload", multipart_form(photo), **CONTENT_TYPE)
-    job_id: str = answer["job_id"]
-    return job_id
+    return str(answer["job_id"])
 
 
 def _call(

@@ -1,121 +1,78 @@
-"""Benchmark of the embedded server: upload, describe, search by stored photo and by new photo."""
+"""Latency of the embedded server: upload, search by a stored photo, search by a new photo.
+
+    placewise bench spine [--photos 200] [--queries 50]        (or: make bench)
+
+`placewise serve` runs in a process of its own on an empty folder, with the default extractor. Four
+clients upload photos of 320 x 240 pixels; then one client searches. Reported: p50, p95 and maximum
+of each call, calls per second, and the time from the first upload until all photos are searchable.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
-import statistics
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-from PIL import Image
-
+from benchmarks.fleet.load_generator import make_jpegs
+from benchmarks.fleet.service import START_TIMEOUT_SECONDS, start_embedded_server
 from benchmarks.report import Report
-from shared.client import Client, Json
-from shared.config.embedded_home import RunningServer, find_running_server
-from shared.errors import Unavailable
+from placewise.client import Client
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-START_TIMEOUT_SECONDS = 60.0
+CLIENTS = 4
+
+Answer = TypeVar("Answer")
 
 
 def measure(progress: Progress, *, photos: int, queries: int) -> Report:
-    """Measure on an empty embedded server, with random textures of 320 x 240 pixels as photos."""
+    """Upload `photos` and search with `queries` of them, once as stored and once as new photos."""
+    report = Report("Embedded server")
     with tempfile.TemporaryDirectory() as folder:
-        made = _draw_photos(Path(folder, "photos"), photos)
+        files = [Path(folder, f"{number:05d}.jpg") for number in range(photos)]
+        for file, jpeg in zip(files, make_jpegs(photos, (320, 240), 10_000), strict=True):
+            file.write_bytes(jpeg)
         with (
-            _start_server(Path(folder, "home")) as running,
-            Client(running.url, key=running.key) as client,
+            start_embedded_server(Path(folder)) as server,
+            Client(server.url, key=server.key, patience_seconds=START_TIMEOUT_SECONDS) as client,
         ):
-            figures = _run_timed_calls(client, made, queries, progress)
-    report = Report("The main job, embedded", details=figures)
-    for name, timing in figures["timings"].items():
-        report.add(f"{name}, median", timing["median_ms"], "ms")
-        report.add(f"{name}, p95", timing["p95_ms"], "ms")
-        report.add(f"{name}, rate", timing["per_second"], "/s")
-    report.add(f"{photos} photos searchable after", figures["searchable_after_seconds"], "s")
+            client.stats()
+            _measure_calls(report, client, files, queries, progress)
     return report
 
 
-@contextlib.contextmanager
-def _start_server(home: Path) -> Iterator[RunningServer]:
-    """Start a server in a process of its own, so that it does not share the GIL with the client."""
-    command = [str(Path(sys.executable).with_name("placewise")), "serve"]
-    environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
-        try:
-            deadline = time.monotonic() + START_TIMEOUT_SECONDS
-            while (running := find_running_server(home)) is None:
-                if server.poll() is not None or time.monotonic() > deadline:
-                    raise Unavailable("server_unreachable", "The server did not start.")
-                time.sleep(0.1)
-            with Client(
-                running.url, key=running.key, patience_seconds=START_TIMEOUT_SECONDS
-            ) as client:
-                client.stats()
-            yield running
-        finally:
-            server.terminate()
+def _measure_calls(
+    report: Report, client: Client, files: list[Path], queries: int, progress: Progress
+) -> None:
+    bar = progress.add_task("calls", total=len(files) + 2 * queries)
 
-
-def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress: Progress) -> Json:
-    bar = progress.add_task("photos", total=len(photos) + 2 * queries)
-
-    def timed(call) -> tuple[float, Json]:  # type: ignore[no-untyped-def]
-        started = time.perf_counter()
-        answer = call()
+    def timed(call: Callable[[], Answer]) -> tuple[float, Answer]:
+        started_at = time.perf_counter()
+        response = call()
         progress.advance(bar)
-        return time.perf_counter() - started, answer
+        return time.perf_counter() - started_at, response
 
     started_at = time.perf_counter()
-    with ThreadPoolExecutor(4) as pool:
-        uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
-    uploaded = time.perf_counter() - started_at
-    for _, answer in uploads:
-        client.wait_for(answer["job_id"])
-    searchable = time.perf_counter() - started_at
+    with ThreadPoolExecutor(CLIENTS) as pool:
+        uploads = list(pool.map(lambda file: timed(partial(client.upload, file)), files))
+    uploaded_at = time.perf_counter()
+    for _, response in uploads:
+        client.wait(response)
+    searchable_at = time.perf_counter()
     stored = [
-        timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
+        timed(partial(client.similar, response.file_id))[0] for _, response in uploads[:queries]
     ]
-    new = [timed(lambda p=photo: client.similar_to_file(p)) for photo in photos[:queries]]
-    return {
-        "photos": len(photos),
-        "searchable_after_seconds": searchable,
-        "timings": {
-            "upload, 4 at once": _timing_summary([s for s, _ in uploads], uploaded),
-            "query by stored photo": _timing_summary([s for s, _ in stored]),
-            "query by new photo": _timing_summary([s for s, _ in new]),
-        },
-    }
-
-
-def _timing_summary(seconds: list[float], wall_seconds: float | None = None) -> Json:
-    ordered = sorted(seconds)
-    return {
-        "median_ms": statistics.median(ordered) * 1000,
-        "p95_ms": ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))] * 1000,
-        "per_second": len(ordered) / (wall_seconds or sum(ordered)),
-    }
-
-
-def _draw_photos(folder: Path, count: int) -> list[Path]:
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    made = []
-    for number in range(count):
-        coarse = Image.fromarray(rng.integers(0, 256, (15, 20, 3), dtype=np.uint8))
-        buffer = io.BytesIO()
-        coarse.resize((320, 240), Image.Resampling.BICUBIC).save(buffer, "JPEG", quality=90)
-        made.append(folder / f"{number:05d}.jpg")
-        made[-1].write_bytes(buffer.getvalue())
-    return made
+    new = [timed(partial(client.similar, file))[0] for file in files[:queries]]
+    for name, seconds, rate in (
+        ("upload, 4 clients", [s for s, _ in uploads], len(files) / (uploaded_at - started_at)),
+        ("query by stored photo", stored, len(stored) / sum(stored)),
+        ("query by new photo", new, len(new) / sum(new)),
+    ):
+        report.add_latency(name, seconds)
+        report.add(f"{name}, rate", rate, "/s")
+    report.add(f"{len(files)} photos searchable after", searchable_at - started_at, "s")

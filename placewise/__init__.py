@@ -18,9 +18,7 @@ PlacewiseError with the attributes `status`, `code` and `detail`.
 from placewise.answers import Answer, Job, Photo, Similar
 from placewise.async_client import AsyncClient
 from placewise.client import Client
-from shared.client.async_calls import AsyncClient as _AsyncRaw
-from shared.client.calls import Client as _Raw
-from shared.client.sending import TIMEOUT_SECONDS
+from placewise.protocol import TIMEOUT_SECONDS
 from shared.errors import (
     Conflict,
     Forbidden,
@@ -90,9 +88,7 @@ def connect(
     Raises:
         InvalidRequest: `bad_address`, `bad_key`.
     """
-    return Client(
-        _Raw(url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds)
-    )
+    return Client(url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds)
 
 
 def connect_async(
@@ -108,5 +104,5 @@ def connect_async(
     Files to upload are read in the thread of the event loop.
     """
     return AsyncClient(
-        _AsyncRaw(url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds)
+        url, map, key, patience_seconds=patience_seconds, timeout_seconds=timeout_seconds
     )

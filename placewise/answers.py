@@ -12,13 +12,20 @@ from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict
 
-from shared.client import FINISHED
+from shared.errors import Unprocessable
+
+FINISHED = ("succeeded", "failed", "cancelled")
+"""The states in which a job ends."""
 
 
 class Answer(BaseModel):
     """Base class of all responses."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")
+    model_config = ConfigDict(frozen=True, extra="allow", defer_build=True)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the response as the server sent it, for `json.dumps`."""
+        return self.model_dump(mode="json", exclude_unset=True)
 
 
 class Photo(Answer):
@@ -195,6 +202,16 @@ class Job(Answer):
         """Whether the job has succeeded, failed or been cancelled."""
         return self.state in FINISHED
 
+    @property
+    def failure(self) -> str:
+        """Why the job did not succeed: the detail of its error, or its state."""
+        return str((self.error or {}).get("detail", f"The job {self.job_id} is {self.state}."))
+
+    def raise_for_failure(self) -> None:
+        """Raise Unprocessable with the job's `code` (or `job_ended`) if it failed."""
+        if self.finished and self.state != "succeeded":
+            raise Unprocessable((self.error or {}).get("code", "job_ended"), self.failure)
+
 
 class Started(Answer):
     """A job that was queued; wait for it with `wait(started)`."""
@@ -252,6 +269,21 @@ class Generation(Answer):
     ended_at: datetime | None
 
 
+class WordWeights(Answer):
+    """The word weights that were fitted for a generation, one per word of its vocabulary."""
+
+    generation_id: UUID
+    outcome: str
+    reason: str
+    taught_by: str
+    near_pairs: int
+    far_pairs: int
+    seed: int
+    searchable: int
+    held_out: dict[str, Any] | None
+    weights: list[float]
+
+
 class Evaluation(Answer):
     """Retrieval metrics of a generation."""
 
@@ -296,6 +328,14 @@ class Map(Answer):
     created_at: datetime
 
 
+class DeletedMap(Answer):
+    """Response to the deletion of a map."""
+
+    success: bool
+    message: str
+    deleted_map: str
+
+
 class Stats(Answer):
     """Statistics of a map."""
 
@@ -317,3 +357,51 @@ class Stats(Answer):
     max_processing_time_ms: float | None
     jobs: dict[str, int]
     counted_at: datetime
+
+
+class AddedModel(Answer):
+    """A trained model that was added to the server; maps refer to it as `extractor`."""
+
+    name: str
+    extractor: str
+    fingerprint: str
+    dimension: int
+    image_size: tuple[int, int]
+    config: dict[str, Any]
+    size_bytes: int
+    sha256: str
+    licence: str
+    note: str | None
+    about: dict[str, Any]
+    added_at: datetime
+    maps: list[str]
+
+
+class RemovedModel(Answer):
+    """Response to the removal of a model."""
+
+    success: bool
+    message: str
+    removed_model: str
+
+
+class Key(Answer):
+    """An API key without its secret; None for a limit that the server's settings decide."""
+
+    id: UUID
+    name: str
+    prefix: str
+    scopes: list[str]
+    requests_per_minute: int | None
+    upload_bytes_per_day: int | None
+    max_photos: int | None
+    created_at: datetime
+    expires_at: datetime | None
+    last_used_at: datetime | None
+    revoked_at: datetime | None
+
+
+class CreatedKey(Key):
+    """A new API key; `key` is its secret."""
+
+    key: str

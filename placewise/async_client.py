@@ -6,32 +6,49 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO
+from urllib.parse import quote
 from uuid import UUID
 
 from placewise.answers import (
+    AddedModel,
     BatchItem,
     BatchStarted,
+    CreatedKey,
     Deleted,
+    DeletedMap,
     Evaluation,
     Generation,
     Job,
+    Key,
     Map,
     OnePhoto,
     Photo,
+    RemovedModel,
     Search,
     Similar,
     Started,
     Stats,
     Uploaded,
     Vocabulary,
+    WordWeights,
 )
-from shared.client.async_calls import AsyncClient as AsyncRawClient
-from shared.client.sending import POLL_SECONDS
+from placewise.async_transport import AsyncTransport
+from placewise.protocol import (
+    API,
+    POLL_SECONDS,
+    Json,
+    ReadProgressFile,
+    drop_none,
+    open_file,
+    printable_name,
+    size_and_sha256,
+    to_jsonl,
+)
 from shared.errors import Unavailable, Unprocessable
 
 Id = UUID | str
@@ -39,26 +56,8 @@ Work = Uploaded | Started | Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
 
 
-class AsyncClient:
-    """Client of one server and one map. `raw` provides the same calls with plain JSON."""
-
-    def __init__(self, raw: AsyncRawClient) -> None:
-        self.raw = raw
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        await self.aclose()
-
-    async def aclose(self) -> None:
-        """Close all connections."""
-        await self.raw.aclose()
+class AsyncClient(AsyncTransport):
+    """Client of one server and one map."""
 
     async def upload(
         self, photo: str | Path, filename: str | None = None, **fields: Any
@@ -77,7 +76,8 @@ class AsyncClient:
             TooLarge: The file exceeds the server's limit.
             Unprocessable: A field or the image is invalid.
         """
-        return Uploaded(**await self.raw.upload(Path(photo), filename, **fields))
+        data = {name: str(value) for name, value in drop_none(**fields).items()}
+        return Uploaded(**await self._send_file("/upload", Path(photo), filename, data=data))
 
     async def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
@@ -89,37 +89,68 @@ class AsyncClient:
         Raises:
             Conflict: `no_direct_uploads` if the server stores photos in a folder.
         """
-        return Uploaded(**await self.raw.upload_direct(Path(photo), filename, **fields))
+        with open_file(Path(photo)) as file:
+            size, sha256 = size_and_sha256(file)
+            body = {
+                "filename": filename or printable_name(Path(photo)),
+                "file_size": size,
+                "sha256": sha256,
+                **drop_none(**fields),
+            }
+            presigned = await self._call("POST", "/uploads/presign", json=body)
+            await self._put_presigned(presigned, file)
+        complete_path = presigned["complete_url"].removeprefix(API)
+        return Uploaded(**await self._call("POST", complete_path))
 
     async def upload_archive(
         self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
     ) -> BatchStarted:
         """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
-        return BatchStarted(**await self.raw.upload_archive(Path(archive), on_sent))
+        with open_file(Path(archive)) as file:
+            stream = ReadProgressFile(file, on_sent)
+            return await self._start_batch(
+                files={"archive": (printable_name(Path(archive)), stream)}
+            )
 
     async def upload_files(
-        self, photos: Sequence[str | Path], manifest: Sequence[dict[str, Any]] = ()
+        self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
     ) -> BatchStarted:
         """Start a batch upload of photo files.
 
         Each manifest entry contains a `filename` and fields of `upload`.
         """
-        return BatchStarted(**await self.raw.upload_files([Path(p) for p in photos], manifest))
+        with contextlib.ExitStack() as stack:
+            files: list[tuple[str, Any]] = [
+                ("file", (printable_name(Path(photo)), stack.enter_context(open_file(Path(photo)))))
+                for photo in photos
+            ]
+            if manifest:
+                files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
+            return await self._start_batch(files=files)
 
-    async def import_objects(self, manifest: Sequence[dict[str, Any]]) -> BatchStarted:
+    async def import_objects(self, manifest: Sequence[Json]) -> BatchStarted:
         """Start a batch import of objects in the server's store.
 
         Each manifest entry contains an object `key` and fields of `upload`.
         """
-        return BatchStarted(**await self.raw.import_objects(manifest))
+        return await self.import_manifest(to_jsonl(manifest))
+
+    async def import_manifest(self, manifest: bytes) -> BatchStarted:
+        """Start a batch import like `import_objects`, with the manifest as JSONL."""
+        headers = {"Content-Type": "application/x-ndjson"}
+        return await self._start_batch(content=manifest, headers=headers)
 
     async def import_prefix(self, prefix: str) -> BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
-        return BatchStarted(**await self.raw.import_prefix(prefix))
+        return await self._start_batch(files={"prefix": (None, prefix)})
+
+    async def _start_batch(self, **body: Any) -> BatchStarted:
+        return BatchStarted(**await self._call("POST", "/upload/batch", **body))
 
     async def batch_items(self, work: Work, *states: str) -> AsyncIterator[BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
-        async for item in self.raw.batch_items(_job_id(work), *states):
+        path = f"/jobs/{_job_id(work)}/items"
+        async for item in self._iterate(path, "items", state=list(states) or None):
             yield BatchItem(**item)
 
     async def similar(
@@ -129,6 +160,7 @@ class AsyncClient:
         min_score: float | None = None,
         rerank: int | None = None,
         explain: bool = False,
+        wait_seconds: int = 60,
         **filters: Any,
     ) -> Similar:
         """Find the most similar photos and estimate the place.
@@ -139,53 +171,67 @@ class AsyncClient:
             min_score: Minimum cosine similarity.
             rerank: Number of first results to rerank by comparing patches.
             explain: Add explanations to the results.
+            wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
+                polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated).
-                `certainty` is the share of answers that must be right.
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
+                share of answers that must be right.
         """
-        params = {"top_k": top_k, "min_score": min_score, "rerank": rerank, "explain": explain}
+        options: Json = {
+            "params": drop_none(
+                top_k=top_k,
+                min_score=min_score,
+                rerank=rerank,
+                explain=explain or None,
+                **filters,
+            ),
+            "headers": {"Prefer": f"wait={wait_seconds}"},
+        }
         if isinstance(photo, (Photo, UUID)):
             file_id = photo.image_id if isinstance(photo, Photo) else photo
-            return Similar(**await self.raw.similar_to(file_id, **{**params, **filters}))
-        return Similar(**await self.raw.similar_to_file(Path(photo), **{**params, **filters}))
+            answer = await self._call("POST", f"/similarity/{file_id}", **options)
+        else:
+            answer = await self._send_file("/similarity", Path(photo), **options)
+        while "result_url" in answer:  # one job may lead to another
+            async for _ in self.watch(answer["job_id"]):
+                pass
+            answer = await self._call("GET", answer["result_url"].removeprefix(API))
+        return Similar(**answer)
 
     async def job(self, work: Work, wait_seconds: float = 0) -> Job:
         """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
-        return Job(**await self.raw.job(_job_id(work), wait_seconds))
+        path = f"/jobs/{_job_id(work)}"
+        return Job(**await self._call("GET", path, params={"wait": wait_seconds}))
 
     async def jobs(self, **filters: Any) -> AsyncIterator[Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
-        async for job in self.raw.each("/jobs", "jobs", **filters):
+        async for job in self._iterate("/jobs", "jobs", **filters):
             yield Job(**job)
 
-    async def wait(
+    async def watch(
         self,
         work: Work,
         timeout_seconds: float | None = None,
-        on_progress: Callable[[Job], object] = lambda job: None,
-    ) -> Job:
-        """Wait until a job succeeds.
+        poll_seconds: float = POLL_SECONDS,
+    ) -> AsyncIterator[Job]:
+        """Poll a job and iterate over its states; the last one is its end, also if it failed.
 
         Args:
             work: The job.
             timeout_seconds: Maximum time to wait; None for no limit.
-            on_progress: Called with the job after every poll.
+            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
 
         Raises:
-            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
             Unavailable: `job_unfinished` if the timeout expires.
         """
         deadline = None if timeout_seconds is None else time.monotonic() + timeout_seconds
         while True:
-            remaining = POLL_SECONDS if deadline is None else deadline - time.monotonic()
-            job = await self.job(work, max(0.0, min(remaining, POLL_SECONDS)))
-            on_progress(job)
-            if job.state == "succeeded":
-                return job
+            remaining = poll_seconds if deadline is None else deadline - time.monotonic()
+            job = await self.job(work, max(0.0, min(remaining, poll_seconds)))
+            yield job
             if job.finished:
-                error = job.error or {}
-                detail = error.get("detail", f"The job {job.job_id} is {job.state}.")
-                raise Unprocessable(error.get("code", "job_ended"), detail)
+                return
             if deadline is not None and time.monotonic() >= deadline:
                 raise Unavailable(
                     "job_unfinished",
@@ -194,99 +240,226 @@ class AsyncClient:
             if job.waiting_for:
                 await asyncio.sleep(1.0)  # the server does not hold long polls of such jobs
 
+    async def wait(
+        self,
+        work: Work,
+        timeout_seconds: float | None = None,
+        on_progress: Callable[[Job], object] = lambda job: None,
+        poll_seconds: float = POLL_SECONDS,
+    ) -> Job:
+        """Wait until a job succeeds.
+
+        Args:
+            work: The job.
+            timeout_seconds: Maximum time to wait; None for no limit.
+            on_progress: Called with the job after every poll.
+            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
+
+        Raises:
+            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
+            Unavailable: `job_unfinished` if the timeout expires.
+        """
+        async for job in self.watch(work, timeout_seconds, poll_seconds):
+            on_progress(job)
+        job.raise_for_failure()
+        return job
+
     async def cancel(self, work: Work) -> Job:
         """Cancel a job."""
-        return Job(**await self.raw.cancel_job(_job_id(work)))
+        return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
     async def retry(self, work: Work) -> Job:
         """Queue a failed job again; for a batch, its failed items."""
-        return Job(**await self.raw.retry_job(_job_id(work)))
+        return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
     async def photo(self, file_id: Id) -> OnePhoto:
         """Get a stored photo's metadata and state."""
-        return OnePhoto(**await self.raw.photo(file_id))
+        return OnePhoto(**await self._call("GET", f"/uploads/{file_id}"))
 
     async def image(self, file_id: Id) -> bytes:
         """Download the original bytes of a photo."""
-        return await self.raw.image(file_id)
+        return await self._get_bytes(f"/uploads/{file_id}/image")
 
     async def photos(self, **filters: Any) -> AsyncIterator[Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        async for photo in self.raw.each("/search", "images", **filters):
+        async for photo in self._iterate("/search", "images", **filters):
             yield Photo(**photo)
 
     async def patch_photo(self, file_id: Id, **fields: Any) -> OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
-        return OnePhoto(**await self.raw.patch_photo(file_id, **fields))
+        return OnePhoto(**await self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
     async def delete_photo(self, file_id: Id) -> Deleted:
         """Delete a photo."""
-        return Deleted(**await self.raw.delete_photo(file_id))
+        return Deleted(**await self._call("DELETE", f"/uploads/{file_id}"))
 
     async def fit_vocabulary(self, **options: int) -> Started:
         """Start fitting a vocabulary on the map's photos.
 
         Options are `clusters`, `sample` and `seed`.
         """
-        return Started(**await self.raw.fit_vocabulary(**options))
+        return Started(**await self._call("POST", "/vocabularies", json=options))
 
     async def import_vocabulary(self, file: str | Path) -> Started:
         """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return Started(**await self.raw.import_vocabulary(Path(file)))
+        return Started(**await self._send_file("/vocabularies/import", Path(file)))
 
     async def vocabularies(self) -> list[Vocabulary]:
         """List the map's vocabularies, newest first."""
-        return [Vocabulary(**item) for item in await self.raw.vocabularies()]
+        return [Vocabulary(**item) for item in await self._call("GET", "/vocabularies")]
+
+    async def vocabulary_file(self, vocabulary_id: Id) -> bytes:
+        """Download a vocabulary file that `import_vocabulary` accepts.
+
+        The format is `.npz` (starting with `PK`), or `.npy` if its provenance is unknown.
+        """
+        return await self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 
     async def start_generation(
-        self, *, vocabulary_id: Id | None = None, pca: int | None = None
+        self,
+        *,
+        vocabulary_id: Id | None = None,
+        pca: int | None = None,
+        extractor: str | None = None,
     ) -> Started:
-        """Start reindexing with one of the map's vocabularies or to `pca` dimensions."""
-        return Started(**await self.raw.start_generation(vocabulary_id=vocabulary_id, pca=pca))
+        """Start a new generation of the map's descriptors.
+
+        Without arguments, PCA is undone for an extractor without a vocabulary.
+
+        Args:
+            vocabulary_id: One of the map's vocabularies.
+            pca: Number of dimensions to reduce to by PCA whitening.
+            extractor: Another extractor.
+        """
+        body = drop_none(
+            vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
+        )
+        return Started(**await self._call("POST", "/generations", json=body))
 
     async def generations(self) -> list[Generation]:
         """List the map's generations, newest first."""
-        return [Generation(**item) for item in await self.raw.generations()]
+        return [Generation(**item) for item in await self._call("GET", "/generations")]
+
+    async def export_descriptors(
+        self,
+        generation_id: Id,
+        file: BinaryIO,
+        on_received: Callable[[int], object] = lambda received_bytes: None,
+    ) -> None:
+        """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
+
+        Args:
+            generation_id: A generation of the map.
+            file: Seekable and writable; overwritten from its beginning.
+            on_received: Called with the number of bytes received so far.
+        """
+        path = f"/generations/{generation_id}/descriptors"
+        await self._download(path, file, on_received)
+
+    async def learn_word_weights(self, generation_id: Id, **options: int) -> Started:
+        """Start fitting word weights of the active generation; options are `sample` and `seed`."""
+        path = f"/generations/{generation_id}/word-weights"
+        return Started(**await self._call("POST", path, json=options))
+
+    async def word_weights(self, generation_id: Id) -> WordWeights:
+        """Get the word weights that were fitted for a generation."""
+        path = f"/generations/{generation_id}/word-weights"
+        return WordWeights(**await self._call("GET", path))
 
     async def evaluate(self, **options: int) -> Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""
-        return Started(**await self.raw.evaluate(**options))
+        return Started(**await self._call("POST", "/evaluations", json=options))
 
     async def evaluations(self) -> AsyncIterator[Evaluation]:
         """Iterate over the map's evaluations, newest first."""
-        async for evaluation in self.raw.each("/evaluations", "evaluations"):
+        async for evaluation in self._iterate("/evaluations", "evaluations"):
             yield Evaluation(**evaluation)
 
     async def searches(self) -> AsyncIterator[Search]:
         """Iterate over the search history, newest first."""
-        async for search in self.raw.each("/searches", "searches"):
+        async for search in self._iterate("/searches", "searches"):
             yield Search(**search)
 
     async def maps(self) -> list[Map]:
         """List the maps of the server."""
-        return [Map(**item) for item in await self.raw.maps()]
+        return [Map(**item) for item in await self._call("GET", "/maps")]
 
     async def create_map(
         self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
     ) -> Map:
         """Create a map; `extractor` defaults to the server's setting."""
-        return Map(
-            **await self.raw.create_map(
-                name, extractor, place_labels_are_paths=place_labels_are_paths
-            )
+        body = drop_none(
+            name=name,
+            extractor=extractor,
+            place_labels_are_paths=place_labels_are_paths or None,
         )
+        return Map(**await self._call("POST", "/maps", json=body))
 
     async def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
         """Change whether `/` separates the levels of the map's place labels."""
-        return Map(**await self.raw.update_map(name, place_labels_are_paths=place_labels_are_paths))
+        body = {"place_labels_are_paths": place_labels_are_paths}
+        return Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
-    async def delete_map(self, name: str) -> None:
+    async def delete_map(self, name: str) -> DeletedMap:
         """Delete a map and all its photos."""
-        await self.raw.delete_map(name)
+        return DeletedMap(**await self._call("DELETE", f"/maps/{quote(name, safe='')}"))
 
     async def stats(self) -> Stats:
         """Get statistics of the map."""
-        return Stats(**await self.raw.stats())
+        return Stats(**await self._call("GET", "/database/stats"))
+
+    async def add_model(
+        self,
+        checkpoint: str | Path,
+        name: str,
+        *,
+        licence: str | None = None,
+        note: str | None = None,
+        on_sent: Callable[[int], object] = lambda sent_bytes: None,
+    ) -> Started:
+        """Start adding a checkpoint of `placewise train` as an extractor.
+
+        Args:
+            checkpoint: The file.
+            name: Permanent name; maps refer to it as `gsv:NAME`.
+            licence: Licence of the weights.
+            note: Free text.
+            on_sent: Called with the number of bytes sent so far.
+        """
+        data = drop_none(name=name, licence=licence, note=note)
+        with open_file(Path(checkpoint)) as file:
+            files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
+            return Started(**await self._call("POST", "/models", files=files, data=data))
+
+    async def models(self) -> list[AddedModel]:
+        """List the added models."""
+        page = await self._call("GET", "/models")
+        return [AddedModel(**item) for item in page["models"]]
+
+    async def remove_model(self, name: str) -> RemovedModel:
+        """Remove a model that no map uses."""
+        path = f"/models/{quote(name, safe='')}"
+        return RemovedModel(**await self._call("DELETE", path))
+
+    async def keys(self) -> list[Key]:
+        """List the API keys of the server, without their secrets (admin only)."""
+        return [Key(**item) for item in await self._call("GET", "/keys")]
+
+    async def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> CreatedKey:
+        """Create an API key (admin only). Its secret is shown only in this response.
+
+        Args:
+            name: Owner or purpose.
+            scopes: `read`, `write`, `admin`.
+            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+                `upload_bytes_per_day`, `max_photos`.
+        """
+        body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
+        return CreatedKey(**await self._call("POST", "/keys", json=body))
+
+    async def revoke_key(self, key_id: Id) -> Key:
+        """Revoke an API key (admin only)."""
+        return Key(**await self._call("DELETE", f"/keys/{key_id}"))
 
 
 def _job_id(work: Work) -> Id:

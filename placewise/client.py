@@ -5,32 +5,49 @@ Generated from `async_client.py` by `make client`. Edit that file.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO
+from urllib.parse import quote
 from uuid import UUID
 
 from placewise.answers import (
+    AddedModel,
     BatchItem,
     BatchStarted,
+    CreatedKey,
     Deleted,
+    DeletedMap,
     Evaluation,
     Generation,
     Job,
+    Key,
     Map,
     OnePhoto,
     Photo,
+    RemovedModel,
     Search,
     Similar,
     Started,
     Stats,
     Uploaded,
     Vocabulary,
+    WordWeights,
 )
-from shared.client.calls import Client as RawClient
-from shared.client.sending import POLL_SECONDS
+from placewise.protocol import (
+    API,
+    POLL_SECONDS,
+    Json,
+    ReadProgressFile,
+    drop_none,
+    open_file,
+    printable_name,
+    size_and_sha256,
+    to_jsonl,
+)
+from placewise.transport import Transport
 from shared.errors import Unavailable, Unprocessable
 
 Id = UUID | str
@@ -38,26 +55,8 @@ Work = Uploaded | Started | Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
 
 
-class Client:
-    """Client of one server and one map. `raw` provides the same calls with plain JSON."""
-
-    def __init__(self, raw: RawClient) -> None:
-        self.raw = raw
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close all connections."""
-        self.raw.close()
+class Client(Transport):
+    """Client of one server and one map."""
 
     def upload(self, photo: str | Path, filename: str | None = None, **fields: Any) -> Uploaded:
         """Upload a photo, streamed from its file.
@@ -74,7 +73,8 @@ class Client:
             TooLarge: The file exceeds the server's limit.
             Unprocessable: A field or the image is invalid.
         """
-        return Uploaded(**self.raw.upload(Path(photo), filename, **fields))
+        data = {name: str(value) for name, value in drop_none(**fields).items()}
+        return Uploaded(**self._send_file("/upload", Path(photo), filename, data=data))
 
     def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
@@ -86,37 +86,66 @@ class Client:
         Raises:
             Conflict: `no_direct_uploads` if the server stores photos in a folder.
         """
-        return Uploaded(**self.raw.upload_direct(Path(photo), filename, **fields))
+        with open_file(Path(photo)) as file:
+            size, sha256 = size_and_sha256(file)
+            body = {
+                "filename": filename or printable_name(Path(photo)),
+                "file_size": size,
+                "sha256": sha256,
+                **drop_none(**fields),
+            }
+            presigned = self._call("POST", "/uploads/presign", json=body)
+            self._put_presigned(presigned, file)
+        complete_path = presigned["complete_url"].removeprefix(API)
+        return Uploaded(**self._call("POST", complete_path))
 
     def upload_archive(
         self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
     ) -> BatchStarted:
         """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
-        return BatchStarted(**self.raw.upload_archive(Path(archive), on_sent))
+        with open_file(Path(archive)) as file:
+            stream = ReadProgressFile(file, on_sent)
+            return self._start_batch(files={"archive": (printable_name(Path(archive)), stream)})
 
     def upload_files(
-        self, photos: Sequence[str | Path], manifest: Sequence[dict[str, Any]] = ()
+        self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
     ) -> BatchStarted:
         """Start a batch upload of photo files.
 
         Each manifest entry contains a `filename` and fields of `upload`.
         """
-        return BatchStarted(**self.raw.upload_files([Path(p) for p in photos], manifest))
+        with contextlib.ExitStack() as stack:
+            files: list[tuple[str, Any]] = [
+                ("file", (printable_name(Path(photo)), stack.enter_context(open_file(Path(photo)))))
+                for photo in photos
+            ]
+            if manifest:
+                files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
+            return self._start_batch(files=files)
 
-    def import_objects(self, manifest: Sequence[dict[str, Any]]) -> BatchStarted:
+    def import_objects(self, manifest: Sequence[Json]) -> BatchStarted:
         """Start a batch import of objects in the server's store.
 
         Each manifest entry contains an object `key` and fields of `upload`.
         """
-        return BatchStarted(**self.raw.import_objects(manifest))
+        return self.import_manifest(to_jsonl(manifest))
+
+    def import_manifest(self, manifest: bytes) -> BatchStarted:
+        """Start a batch import like `import_objects`, with the manifest as JSONL."""
+        headers = {"Content-Type": "application/x-ndjson"}
+        return self._start_batch(content=manifest, headers=headers)
 
     def import_prefix(self, prefix: str) -> BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
-        return BatchStarted(**self.raw.import_prefix(prefix))
+        return self._start_batch(files={"prefix": (None, prefix)})
+
+    def _start_batch(self, **body: Any) -> BatchStarted:
+        return BatchStarted(**self._call("POST", "/upload/batch", **body))
 
     def batch_items(self, work: Work, *states: str) -> Iterator[BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
-        for item in self.raw.batch_items(_job_id(work), *states):
+        path = f"/jobs/{_job_id(work)}/items"
+        for item in self._iterate(path, "items", state=list(states) or None):
             yield BatchItem(**item)
 
     def similar(
@@ -126,6 +155,7 @@ class Client:
         min_score: float | None = None,
         rerank: int | None = None,
         explain: bool = False,
+        wait_seconds: int = 60,
         **filters: Any,
     ) -> Similar:
         """Find the most similar photos and estimate the place.
@@ -136,53 +166,67 @@ class Client:
             min_score: Minimum cosine similarity.
             rerank: Number of first results to rerank by comparing patches.
             explain: Add explanations to the results.
+            wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
+                polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated).
-                `certainty` is the share of answers that must be right.
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
+                share of answers that must be right.
         """
-        params = {"top_k": top_k, "min_score": min_score, "rerank": rerank, "explain": explain}
+        options: Json = {
+            "params": drop_none(
+                top_k=top_k,
+                min_score=min_score,
+                rerank=rerank,
+                explain=explain or None,
+                **filters,
+            ),
+            "headers": {"Prefer": f"wait={wait_seconds}"},
+        }
         if isinstance(photo, (Photo, UUID)):
             file_id = photo.image_id if isinstance(photo, Photo) else photo
-            return Similar(**self.raw.similar_to(file_id, **{**params, **filters}))
-        return Similar(**self.raw.similar_to_file(Path(photo), **{**params, **filters}))
+            answer = self._call("POST", f"/similarity/{file_id}", **options)
+        else:
+            answer = self._send_file("/similarity", Path(photo), **options)
+        while "result_url" in answer:  # one job may lead to another
+            for _ in self.watch(answer["job_id"]):
+                pass
+            answer = self._call("GET", answer["result_url"].removeprefix(API))
+        return Similar(**answer)
 
     def job(self, work: Work, wait_seconds: float = 0) -> Job:
         """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
-        return Job(**self.raw.job(_job_id(work), wait_seconds))
+        path = f"/jobs/{_job_id(work)}"
+        return Job(**self._call("GET", path, params={"wait": wait_seconds}))
 
     def jobs(self, **filters: Any) -> Iterator[Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
-        for job in self.raw.each("/jobs", "jobs", **filters):
+        for job in self._iterate("/jobs", "jobs", **filters):
             yield Job(**job)
 
-    def wait(
+    def watch(
         self,
         work: Work,
         timeout_seconds: float | None = None,
-        on_progress: Callable[[Job], object] = lambda job: None,
-    ) -> Job:
-        """Wait until a job succeeds.
+        poll_seconds: float = POLL_SECONDS,
+    ) -> Iterator[Job]:
+        """Poll a job and iterate over its states; the last one is its end, also if it failed.
 
         Args:
             work: The job.
             timeout_seconds: Maximum time to wait; None for no limit.
-            on_progress: Called with the job after every poll.
+            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
 
         Raises:
-            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
             Unavailable: `job_unfinished` if the timeout expires.
         """
         deadline = None if timeout_seconds is None else time.monotonic() + timeout_seconds
         while True:
-            remaining = POLL_SECONDS if deadline is None else deadline - time.monotonic()
-            job = self.job(work, max(0.0, min(remaining, POLL_SECONDS)))
-            on_progress(job)
-            if job.state == "succeeded":
-                return job
+            remaining = poll_seconds if deadline is None else deadline - time.monotonic()
+            job = self.job(work, max(0.0, min(remaining, poll_seconds)))
+            yield job
             if job.finished:
-                error = job.error or {}
-                detail = error.get("detail", f"The job {job.job_id} is {job.state}.")
-                raise Unprocessable(error.get("code", "job_ended"), detail)
+                return
             if deadline is not None and time.monotonic() >= deadline:
                 raise Unavailable(
                     "job_unfinished",
@@ -191,97 +235,226 @@ class Client:
             if job.waiting_for:
                 time.sleep(1.0)  # the server does not hold long polls of such jobs
 
+    def wait(
+        self,
+        work: Work,
+        timeout_seconds: float | None = None,
+        on_progress: Callable[[Job], object] = lambda job: None,
+        poll_seconds: float = POLL_SECONDS,
+    ) -> Job:
+        """Wait until a job succeeds.
+
+        Args:
+            work: The job.
+            timeout_seconds: Maximum time to wait; None for no limit.
+            on_progress: Called with the job after every poll.
+            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
+
+        Raises:
+            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
+            Unavailable: `job_unfinished` if the timeout expires.
+        """
+        for job in self.watch(work, timeout_seconds, poll_seconds):
+            on_progress(job)
+        job.raise_for_failure()
+        return job
+
     def cancel(self, work: Work) -> Job:
         """Cancel a job."""
-        return Job(**self.raw.cancel_job(_job_id(work)))
+        return Job(**self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
     def retry(self, work: Work) -> Job:
         """Queue a failed job again; for a batch, its failed items."""
-        return Job(**self.raw.retry_job(_job_id(work)))
+        return Job(**self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
     def photo(self, file_id: Id) -> OnePhoto:
         """Get a stored photo's metadata and state."""
-        return OnePhoto(**self.raw.photo(file_id))
+        return OnePhoto(**self._call("GET", f"/uploads/{file_id}"))
 
     def image(self, file_id: Id) -> bytes:
         """Download the original bytes of a photo."""
-        return self.raw.image(file_id)
+        return self._get_bytes(f"/uploads/{file_id}/image")
 
     def photos(self, **filters: Any) -> Iterator[Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        for photo in self.raw.each("/search", "images", **filters):
+        for photo in self._iterate("/search", "images", **filters):
             yield Photo(**photo)
 
     def patch_photo(self, file_id: Id, **fields: Any) -> OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
-        return OnePhoto(**self.raw.patch_photo(file_id, **fields))
+        return OnePhoto(**self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
     def delete_photo(self, file_id: Id) -> Deleted:
         """Delete a photo."""
-        return Deleted(**self.raw.delete_photo(file_id))
+        return Deleted(**self._call("DELETE", f"/uploads/{file_id}"))
 
     def fit_vocabulary(self, **options: int) -> Started:
         """Start fitting a vocabulary on the map's photos.
 
         Options are `clusters`, `sample` and `seed`.
         """
-        return Started(**self.raw.fit_vocabulary(**options))
+        return Started(**self._call("POST", "/vocabularies", json=options))
 
     def import_vocabulary(self, file: str | Path) -> Started:
         """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return Started(**self.raw.import_vocabulary(Path(file)))
+        return Started(**self._send_file("/vocabularies/import", Path(file)))
 
     def vocabularies(self) -> list[Vocabulary]:
         """List the map's vocabularies, newest first."""
-        return [Vocabulary(**item) for item in self.raw.vocabularies()]
+        return [Vocabulary(**item) for item in self._call("GET", "/vocabularies")]
+
+    def vocabulary_file(self, vocabulary_id: Id) -> bytes:
+        """Download a vocabulary file that `import_vocabulary` accepts.
+
+        The format is `.npz` (starting with `PK`), or `.npy` if its provenance is unknown.
+        """
+        return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 
     def start_generation(
-        self, *, vocabulary_id: Id | None = None, pca: int | None = None
+        self,
+        *,
+        vocabulary_id: Id | None = None,
+        pca: int | None = None,
+        extractor: str | None = None,
     ) -> Started:
-        """Start reindexing with one of the map's vocabularies or to `pca` dimensions."""
-        return Started(**self.raw.start_generation(vocabulary_id=vocabulary_id, pca=pca))
+        """Start a new generation of the map's descriptors.
+
+        Without arguments, PCA is undone for an extractor without a vocabulary.
+
+        Args:
+            vocabulary_id: One of the map's vocabularies.
+            pca: Number of dimensions to reduce to by PCA whitening.
+            extractor: Another extractor.
+        """
+        body = drop_none(
+            vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
+        )
+        return Started(**self._call("POST", "/generations", json=body))
 
     def generations(self) -> list[Generation]:
         """List the map's generations, newest first."""
-        return [Generation(**item) for item in self.raw.generations()]
+        return [Generation(**item) for item in self._call("GET", "/generations")]
+
+    def export_descriptors(
+        self,
+        generation_id: Id,
+        file: BinaryIO,
+        on_received: Callable[[int], object] = lambda received_bytes: None,
+    ) -> None:
+        """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
+
+        Args:
+            generation_id: A generation of the map.
+            file: Seekable and writable; overwritten from its beginning.
+            on_received: Called with the number of bytes received so far.
+        """
+        path = f"/generations/{generation_id}/descriptors"
+        self._download(path, file, on_received)
+
+    def learn_word_weights(self, generation_id: Id, **options: int) -> Started:
+        """Start fitting word weights of the active generation; options are `sample` and `seed`."""
+        path = f"/generations/{generation_id}/word-weights"
+        return Started(**self._call("POST", path, json=options))
+
+    def word_weights(self, generation_id: Id) -> WordWeights:
+        """Get the word weights that were fitted for a generation."""
+        path = f"/generations/{generation_id}/word-weights"
+        return WordWeights(**self._call("GET", path))
 
     def evaluate(self, **options: int) -> Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""
-        return Started(**self.raw.evaluate(**options))
+        return Started(**self._call("POST", "/evaluations", json=options))
 
     def evaluations(self) -> Iterator[Evaluation]:
         """Iterate over the map's evaluations, newest first."""
-        for evaluation in self.raw.each("/evaluations", "evaluations"):
+        for evaluation in self._iterate("/evaluations", "evaluations"):
             yield Evaluation(**evaluation)
 
     def searches(self) -> Iterator[Search]:
         """Iterate over the search history, newest first."""
-        for search in self.raw.each("/searches", "searches"):
+        for search in self._iterate("/searches", "searches"):
             yield Search(**search)
 
     def maps(self) -> list[Map]:
         """List the maps of the server."""
-        return [Map(**item) for item in self.raw.maps()]
+        return [Map(**item) for item in self._call("GET", "/maps")]
 
     def create_map(
         self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
     ) -> Map:
         """Create a map; `extractor` defaults to the server's setting."""
-        return Map(
-            **self.raw.create_map(name, extractor, place_labels_are_paths=place_labels_are_paths)
+        body = drop_none(
+            name=name,
+            extractor=extractor,
+            place_labels_are_paths=place_labels_are_paths or None,
         )
+        return Map(**self._call("POST", "/maps", json=body))
 
     def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
         """Change whether `/` separates the levels of the map's place labels."""
-        return Map(**self.raw.update_map(name, place_labels_are_paths=place_labels_are_paths))
+        body = {"place_labels_are_paths": place_labels_are_paths}
+        return Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
-    def delete_map(self, name: str) -> None:
+    def delete_map(self, name: str) -> DeletedMap:
         """Delete a map and all its photos."""
-        self.raw.delete_map(name)
+        return DeletedMap(**self._call("DELETE", f"/maps/{quote(name, safe='')}"))
 
     def stats(self) -> Stats:
         """Get statistics of the map."""
-        return Stats(**self.raw.stats())
+        return Stats(**self._call("GET", "/database/stats"))
+
+    def add_model(
+        self,
+        checkpoint: str | Path,
+        name: str,
+        *,
+        licence: str | None = None,
+        note: str | None = None,
+        on_sent: Callable[[int], object] = lambda sent_bytes: None,
+    ) -> Started:
+        """Start adding a checkpoint of `placewise train` as an extractor.
+
+        Args:
+            checkpoint: The file.
+            name: Permanent name; maps refer to it as `gsv:NAME`.
+            licence: Licence of the weights.
+            note: Free text.
+            on_sent: Called with the number of bytes sent so far.
+        """
+        data = drop_none(name=name, licence=licence, note=note)
+        with open_file(Path(checkpoint)) as file:
+            files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
+            return Started(**self._call("POST", "/models", files=files, data=data))
+
+    def models(self) -> list[AddedModel]:
+        """List the added models."""
+        page = self._call("GET", "/models")
+        return [AddedModel(**item) for item in page["models"]]
+
+    def remove_model(self, name: str) -> RemovedModel:
+        """Remove a model that no map uses."""
+        path = f"/models/{quote(name, safe='')}"
+        return RemovedModel(**self._call("DELETE", path))
+
+    def keys(self) -> list[Key]:
+        """List the API keys of the server, without their secrets (admin only)."""
+        return [Key(**item) for item in self._call("GET", "/keys")]
+
+    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> CreatedKey:
+        """Create an API key (admin only). Its secret is shown only in this response.
+
+        Args:
+            name: Owner or purpose.
+            scopes: `read`, `write`, `admin`.
+            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+                `upload_bytes_per_day`, `max_photos`.
+        """
+        body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
+        return CreatedKey(**self._call("POST", "/keys", json=body))
+
+    def revoke_key(self, key_id: Id) -> Key:
+        """Revoke an API key (admin only)."""
+        return Key(**self._call("DELETE", f"/keys/{key_id}"))
 
 
 def _job_id(work: Work) -> Id:

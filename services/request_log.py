@@ -96,7 +96,7 @@ class RequestLogMiddleware:
         self._on_start()
         with (
             request_id_context(request_id),
-            span(method, [headers.get("traceparent")], request_id=request_id) as describe,
+            span(method, [headers.get("traceparent")], request_id=request_id) as current_span,
         ):
             try:
                 await self._app(scope, counted_receive, send_with_request_id)
@@ -104,7 +104,8 @@ class RequestLogMiddleware:
                 if disconnected or CLOSED_STATUS_SCOPE_KEY in scope:
                     record.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)
                 record.route = _route_template(scope)
-                describe(f"{method} {record.route}", status=record.status)
+                current_span.update_name(f"{method} {record.route}")
+                current_span.set_attribute("status", record.status)
                 self._on_end(record)
                 self._log(record, scope, time.perf_counter() - started)
 

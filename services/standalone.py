@@ -20,12 +20,10 @@ import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import uvicorn
 from prometheus_client import CollectorRegistry
 
-from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.authentication import (
     ApiKeyAuthenticator,
@@ -45,18 +43,19 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
-from shared.catalog.file_checks import sqlite_file
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
+from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import delete_dead_search_workers
-from shared.catalog.schema import migrate
+from shared.catalog.schema import migrate, sqlite_file
 from shared.catalog.session import Catalog, TransactionTimeouts
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
+from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
+from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
 from shared.telemetry.metrics_server import serve_metrics
 
@@ -75,31 +74,35 @@ class Standalone:
     """The first admin key if this start has created it. It can't be shown again later."""
     local_key: str | None
     """Key for the CLI of this user; None on loopback without ADMIN_KEY, where no key is needed."""
-    failed: threading.Event
-    """Set when a service thread has crashed: the process must end with an error."""
+    error: PlacewiseError | None = None
+    """Why a service thread could not continue: the process must end with this error."""
 
-    def stop(self) -> None:
-        """Stops the server after a service thread has crashed."""
-        self.failed.set()
+    def stop(self, error: PlacewiseError | None = None) -> None:
+        """Stops the server because a service thread has failed; by default, with `part_died`."""
+        self.error = error or Misconfigured(
+            "part_died", "A service thread crashed. Its exception is in the log above."
+        )
         self.server.should_exit = True
 
     def serve(self) -> None:
         """Serves HTTP until the process is stopped by a signal.
 
         Raises:
-            Misconfigured: `part_died`, if a service thread has crashed.
+            Misconfigured: `part_died`, if a service thread has crashed; also as the extractor's
+                start raises it.
         """
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
-        if self.failed.is_set():
-            raise Misconfigured(
-                "part_died", "A service thread crashed. Its exception is in the log above."
-            )
+        if self.error is not None:
+            raise self.error
 
 
 @contextlib.contextmanager
-def run_standalone(settings: Settings) -> Iterator[Standalone]:
+def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Iterator[Standalone]:
     """Context manager that starts all services and stops them at the end.
+
+    The extractor is loaded in its own thread, because importing torch takes seconds: at once, or
+    with `lazy_extractor` when the first of its jobs is queued.
 
     Locks PLACEWISE_HOME and releases the leases of a killed process first. If HOST is not a
     loopback address, or ADMIN_KEY is set, every request needs a key; the first admin key is created
@@ -146,9 +149,6 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
         heartbeat = WorkerHeartbeat(catalog, search, name)
-        extractor = ExtractorWorker(
-            catalog, store, settings, name=name, only_worker=True, registry=registry
-        )
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, hints, settings, steward_metrics)
         evaluator = EvaluationWorker(catalog, store, search, settings, name, steward_metrics)
@@ -162,7 +162,25 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
         stack.enter_context(serve_metrics(settings, registry))
-        running = Standalone(url, server, listener, first_admin_key, local_key, threading.Event())
+        running = Standalone(url, server, listener, first_admin_key, local_key)
+
+        def run_extractor(stop: threading.Event) -> None:
+            if lazy_extractor:
+                _wait_for_extractor_jobs(catalog, settings, hints, stop)
+            if stop.is_set():
+                return
+            from services.extractor.worker import ExtractorWorker
+
+            try:
+                extractor = ExtractorWorker(
+                    catalog, store, settings, name, only_worker=True, registry=registry
+                )
+            except PlacewiseError as error:
+                running.stop(error)
+                return
+            with contextlib.closing(extractor):
+                extractor.run(stop, hints)
+
         stop = threading.Event()
         threads = [
             start_service_thread(thread_name, run, stop, running.stop)
@@ -170,7 +188,7 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
                 ("search", search.run),
                 ("search of building generations", search.run_building),
                 ("search heartbeat", heartbeat.run),
-                ("extractor", partial(extractor.run, hints=hints)),
+                ("extractor", run_extractor),
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
                 ("batches", batches.run),
@@ -184,7 +202,14 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
             hints.send()
             for thread in threads:
                 thread.join()
-            extractor.close()
+
+
+def _wait_for_extractor_jobs(
+    catalog: Catalog, settings: Settings, hints: InProcessWakeups, stop: threading.Event
+) -> None:
+    runner = JobRunner(catalog, settings, "extractor", EXTRACTOR_JOBS, lambda *_: None)
+    while not stop.is_set() and not runner.run_once(runner.has_jobs, stop):
+        hints.wait(IDLE_POLL_SECONDS)
 
 
 def _create_authenticator(

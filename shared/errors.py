@@ -13,7 +13,7 @@ PlacewiseError
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
 ├── TooManyRequests 429         queue_full, too_many_requests, ... (retry after `Retry-After`)
-├── Unavailable 503             search_behind, codes_being_made, ... (transient, retryable)
+├── Unavailable 503             search_behind, catalog_busy, ... (transient, retryable)
 │   │                       object_store_unavailable, catalog_damaged, ...
 │   └── StorageFull 507         disk_full, object_store_full
 └── Misconfigured 500           weights_missing, no_gpu, ... (an operator must act)

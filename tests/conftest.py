@@ -1,4 +1,4 @@
-"""What every kind of test may use. See CONTRIBUTING in docs/ for what belongs where."""
+"""Fixtures and markers of all tests. docs/CONTRIBUTING.md says what belongs where."""
 
 from __future__ import annotations
 
@@ -7,6 +7,12 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+
+# Before NumPy and PyTorch are imported. Tests and the processes that they start share few cores:
+# more threads than one in each would wait for each other, which costs a quarter of the CPU time.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import pytest
 from sqlalchemy.engine import make_url
@@ -27,52 +33,53 @@ from tests.support.spare_databases import SpareDatabases
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
-NO_SERVERS = "PLACEWISE_TEST_NO_SERVERS"
 SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
-# Some wait for other processes, the others calculate; the longest of each come first, as one that
-# begins last is waited for alone.
-WAITING = ("faults", "deploy", "e2e", "browser")
-CALCULATING = ("integration", "contract", "unit")
-
-# As the command does before torch is loaded; see services/cli/__init__.py.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# The kinds with the longest files first: a long file that starts last runs alone.
+WAITING = ("faults", "deploy", "e2e", "browser")  # for other processes
+COMPUTING = ("integration", "contract", "unit")
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: something always waits."""
-    return (os.cpu_count() or 1) + 1
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """`auto` is one more than there are cores, because some test always waits; `logical` is one
+    for each core."""
+    waiting = config.getoption("numprocesses") == "auto"
+    return (os.cpu_count() or 1) + int(waiting)
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` reads the markers
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files that wait lie evenly among those that calculate, so that both go on at any time.
-    Without the real photos, the tests that need them are deselected, and so are those in a browser
-    where none is asked for; one line says so."""
-    places = {**_places(items, WAITING), **_places(items, CALCULATING)}
+    """Mix files that wait with files that compute, and mark tests that need a server.
+
+    Tests on real photos and in a browser are deselected unless they are enabled.
+    """
+    places = {**_places(items, WAITING), **_places(items, COMPUTING)}
     items.sort(key=lambda item: places[item.path])
-    without = [
-        item
-        for item in items
-        if (item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS))
-        or (_kind(item) == "browser" and not os.environ.get(BROWSER))
-        or (os.environ.get(NO_SERVERS) and _needs_server(item))
-    ]
-    if without:
-        config.hook.pytest_deselected(items=without)
-        items[:] = [item for item in items if item not in without]
+    selected: list[pytest.Item] = []
+    deselected: list[pytest.Item] = []
+    for item in items:
+        if _needs_server(item):
+            item.add_marker("servers")
+        disabled = (item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS)) or (
+            _kind(item) == "browser" and not os.environ.get(BROWSER)
+        )
+        (deselected if disabled else selected).append(item)
+    if deselected:
+        config.hook.pytest_deselected(items=deselected)
+        items[:] = selected
 
 
 def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
-    """For each file with tests of the kinds, how much of them lies before it: from 0 to 1."""
+    """The relative position of each file among those of these kinds, from 0 to 1."""
     files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
     ordered = sorted(files, key=files.__getitem__)
     return {file: place / len(ordered) for place, file in enumerate(ordered)}
 
 
 def _needs_server(item: pytest.Item) -> bool:
-    """Whether the test starts PostgreSQL, Redis or an S3 server, by its fixtures or parameters."""
+    """Whether a fixture or parameter of the test starts PostgreSQL, Redis or an S3 server."""
     fixtures = set(getattr(item, "fixturenames", ()))
     callspec = getattr(item, "callspec", None)
     parameters = set() if callspec is None else {str(value) for value in callspec.params.values()}
@@ -135,7 +142,7 @@ def s3() -> Iterator[S3Server]:
 
 @pytest.fixture(scope="session")
 def migrated_sqlite(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A migrated catalog to copy: migrating anew for each test would take most of their time."""
+    """A migrated catalog to copy: a migration for each test would take most of its time."""
     path = tmp_path_factory.mktemp("template") / "catalog.sqlite"
     _migrate(f"sqlite:///{path}")
     return path

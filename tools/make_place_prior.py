@@ -22,6 +22,11 @@ from rich.progress import Progress
 from services.cli.environment import read_settings
 from services.cli.evaluation.describers import extractor_describer
 from services.cli.output import console
+from shared.datasets.open_dataset import (
+    EvaluationSet,
+    evaluation_set_names,
+    open_evaluation_set,
+)
 from shared.evaluation.place_evidence import PhotoLocation
 from shared.evaluation.place_levels import FEATURES, LevelScheme
 from shared.evaluation.place_probability import (
@@ -36,7 +41,6 @@ from shared.evaluation.place_probability import (
 )
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.ranking import describe_to_matrix
-from shared.extractor_config.configs import get_extractor_config
 
 RADII_M = (25.0, 100.0, 500.0, 2000.0)
 SQUARES_M = (400.0, 100.0, 25.0)
@@ -115,18 +119,19 @@ def main(folders: Sequence[Path]) -> None:
     """Describe and sample the cities, and write the prior."""
     samples: list[PlaceSample] = []
     for number, folder in enumerate(folders):
-        photos = sorted((folder / "database").iterdir())
-        sampled = sample_city(photos, _describe(photos))
+        city = open_evaluation_set(folder, evaluation_set_names(folder)[0])
+        photos = [photo.path for photo in city.database]
+        sampled = sample_city(photos, _describe(city, photos))
         samples += sampled
         console.print(f"{folder.name} ({number + 1} of {len(folders)}): {len(sampled)} samples")
     PRIOR_FILE.write_text(fit_prior(samples).model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
-def _describe(photos: Sequence[Path]) -> Rows:
+def _describe(city: EvaluationSet, photos: Sequence[Path]) -> Rows:
     settings = read_settings()
-    recipe = get_extractor_config(settings.new_map_extractor, allow_test_extractors=False)
+    extractor = settings.new_map_extractor
     with Progress() as progress:
-        describer = extractor_describer(recipe, None, photos, settings, progress, fit=True)
+        describer = extractor_describer(extractor, None, city, settings, progress, fit=True)
         with describe_to_matrix(describer.describe, photos) as rows:
             return np.array(rows)
 

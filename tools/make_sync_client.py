@@ -1,6 +1,6 @@
 """Generates the synchronous client from the asynchronous one: `make client`.
 
-Both clients share one implementation: the generator removes `await` and replaces names according to
+Both forms share one implementation: the generator removes `await` and replaces names according to
 REPLACEMENTS.
 """
 
@@ -14,8 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 GENERATED_FILES = {
-    "shared/client/async_wire.py": "shared/client/wire.py",
-    "shared/client/async_calls.py": "shared/client/calls.py",
+    "placewise/async_transport.py": "placewise/transport.py",
     "placewise/async_client.py": "placewise/client.py",
 }
 # Applied in this order, each to the result of the ones before.
@@ -31,8 +30,8 @@ REPLACEMENTS = (
     (r"\b__aenter__\b", "__enter__"),
     (r"\b__aexit__\b", "__exit__"),
     (r"\ba(close|read|iter_bytes)\b", r"\1"),
-    (r"\bAsync(Transport|Client|RawClient)\b", r"\1"),
-    (r"\basync_(wire|calls|client)\b", r"\1"),
+    (r"\bAsync(Transport|Client)\b", r"\1"),
+    (r"\basync_(transport|client)\b", r"\1"),
     (r"\bconnect_async\b", "connect"),
     (r"for (\w+) in (.+):\n\s+yield \1$", r"yield from \2"),
     (r"\bThe asynchronous client\b", "The client"),

@@ -1,6 +1,9 @@
-"""Benchmark of the catalog: explains every SQL statement of the services on a large database.
+"""Query plans: checks that no statement of the services scans a large table.
 
-`fill` creates the data, `command` calls the services' own functions, `explain` captures and
-explains the statements that these functions send. The statements are therefore complete and
-identical to those in production.
+    DATABASE_URL=postgresql+psycopg://... placewise bench catalog [--photos 1000000]
+
+`fill` creates the rows in a temporary database, `command` calls the services' own functions, and
+`explain` captures and explains the statements that these functions send, which are therefore those
+of production. Columns: the call, server time, rows read and returned, and the plan's scans. The
+exit code is 1 if a statement scans a large table or reads far more rows than it returns.
 """

@@ -1,20 +1,18 @@
-"""Command `placewise bench catalog`: makes every catalog call of the services and explains it."""
+"""Makes every catalog call of the services on a filled database, and explains its statements."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
 import psycopg
-import typer
 from PIL import Image
 from psycopg.sql import SQL, Identifier
 from rich.table import Table
@@ -24,8 +22,8 @@ from starlette.testclient import TestClient
 
 from benchmarks.catalog.explain import Explainer
 from benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog, fill_catalog
+from benchmarks.report import Report
 from services.cli.environment import read_settings
-from services.cli.output import JsonOption, console, err_console, print_json, report_errors
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
@@ -48,8 +46,11 @@ from shared.jobs.transitions import release_job
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
 from shared.storage import FolderStore
 
-# They read a whole map, and that is known: a count every so often, an evaluation, and parts of file
-# names that are too short for an index.
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+# Calls that may read a whole map: a periodic count, an evaluation, and substrings of file names
+# that are too short for an index.
 KNOWN_FULL_SCANS = (
     "steward: count large maps",
     "evaluation: located photos",
@@ -114,9 +115,9 @@ def _all_calls(
         base_url="http://localhost",
     )
     steward = Scheduler(catalog, store, InProcessWakeups(), settings)
-    # First, because requests read what it has counted; so does it, wherever it has run before.
-    for duty in sorted(steward.tasks, key=lambda duty: duty.name != "count large maps"):
-        yield f"steward: {duty.name}", duty.run
+    # First, because requests read its counts.
+    for task in sorted(steward.tasks, key=lambda task: task.name != "count large maps"):
+        yield f"steward: {task.name}", task.run
     yield from _gateway_requests(client, catalog, filled, ids)
     yield from _extractor_calls(catalog)
     yield from _search_calls(catalog, filled)
@@ -136,7 +137,7 @@ def _gateway_requests(
     days_ago = {n: (datetime.now(UTC) - timedelta(days=n)).isoformat() for n in (1, 29)}
     near = f"{photo.latitude},{photo.longitude}"
 
-    def ask(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
+    def request(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
         own_params = options.pop("params", {})
         params = own_params if path.startswith("/maps") else {"map": LARGEST_MAP, **own_params}
         query = "&".join(f"{name}={str(value)[:40]}" for name, value in own_params.items())
@@ -175,10 +176,10 @@ def _gateway_requests(
         {"role": "query"},
         {"place": "place-100", "tags": "night", "near": f"{near},2000"},
     ):
-        yield ask("GET", "/search", params=found)
+        yield request("GET", "/search", params=found)
     one = f"/uploads/{photo.id}"
     for path in ("/maps", f"/maps/{LARGEST_MAP}", "/database/stats", one, "/generations"):
-        yield ask("GET", path)
+        yield request("GET", path)
     for found in (
         {},
         {"state": "failed"},
@@ -187,64 +188,64 @@ def _gateway_requests(
         {"kind": "index", "state": "failed"},
         {"cursor": str(jobs[JobState.FAILED])},
     ):
-        yield ask("GET", "/jobs", params=found)
-    yield ask("GET", "/searches")
-    yield ask("GET", "/evaluations")
-    yield ask("GET", "/vocabularies")
-    yield ask("GET", f"/jobs/{jobs[JobState.QUEUED]}")
-    yield ask("POST", f"/jobs/{jobs[JobState.QUEUED]}/cancel")
-    yield ask("POST", f"/jobs/{jobs[JobState.FAILED]}/retry")
-    yield ask("POST", f"/similarity/{photo.id}", params={"top_k": 10})
-    yield ask("PATCH", one, json={"place": "elsewhere"})
-    yield ask("DELETE", f"/uploads/{ids[60]}")
+        yield request("GET", "/jobs", params=found)
+    yield request("GET", "/searches")
+    yield request("GET", "/evaluations")
+    yield request("GET", "/vocabularies")
+    yield request("GET", f"/jobs/{jobs[JobState.QUEUED]}")
+    yield request("POST", f"/jobs/{jobs[JobState.QUEUED]}/cancel")
+    yield request("POST", f"/jobs/{jobs[JobState.FAILED]}/retry")
+    yield request("POST", f"/similarity/{photo.id}", params={"top_k": 10})
+    yield request("PATCH", one, json={"place": "elsewhere"})
+    yield request("DELETE", f"/uploads/{ids[60]}")
     buffer = io.BytesIO()
     Image.new("RGB", (64, 48), "gray").save(buffer, "JPEG")
-    yield ask("POST", "/upload", files={"file": ("a.jpg", buffer.getvalue())})
-    yield ask("POST", "/evaluations", json={})
+    yield request("POST", "/upload", files={"file": ("a.jpg", buffer.getvalue())})
+    yield request("POST", "/evaluations", json={})
 
 
 def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
     claimed: list[Job] = []
 
-    def take() -> None:
+    def claim_batch() -> None:
         with catalog.write() as session:
             claimed[:] = claim_jobs(
                 session, worker="bench", limit=16, lease_seconds=60, started=False
             )
 
-    def keep() -> None:
+    def extend() -> None:
         token = claimed[0].lease_token
         assert token is not None
         with catalog.write() as session:
             mark_started(session, token, len(claimed))
             extend_lease(session, token, 60)
 
-    def give_back() -> None:
+    def release() -> None:
         token = claimed[0].lease_token
         assert token is not None
         with catalog.write() as session:
             for job in lock_leased_jobs(session, token, claimed):
                 release_job(job)
 
-    def take_queries() -> None:
+    def claim_queries() -> None:
         with catalog.write() as session:
             claim_jobs(session, worker="bench", limit=16, lease_seconds=60, min_priority=100)
 
-    def take_evaluations() -> None:
+    def claim_evaluations() -> None:
         with catalog.write() as session:
             claim_jobs(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
 
-    yield "extractor: claim a batch", take
-    yield "extractor: hold the lease", keep
-    yield "extractor: give back", give_back
-    yield "extractor: claim queries", take_queries
-    yield "evaluator: claim", take_evaluations
+    yield "extractor: claim a batch", claim_batch
+    yield "extractor: hold the lease", extend
+    yield "extractor: give back", release
+    yield "extractor: claim queries", claim_queries
+    yield "evaluator: claim", claim_evaluations
 
 
 def _search_calls(
     catalog: Catalog, filled: SyntheticCatalog
 ) -> Iterator[tuple[str, Callable[[], object]]]:
-    def follow() -> None:
+    def sync() -> None:
         versions = read_generation_versions(catalog)
         assert filled.generation in versions
         with catalog.read() as session:
@@ -252,7 +253,7 @@ def _search_calls(
             list_live_filter_values(session, chunks[0].id)
             list_photos_changed_since(session, filled.big, filled.photos - 100)
 
-    def tell() -> None:
+    def register() -> None:
         with catalog.write() as session:
             upsert_search_worker(session, new_id(), "bench", None, SINGLE_SHARD, {})
 
@@ -261,8 +262,8 @@ def _search_calls(
             read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.QUERY)
             read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.DATABASE)
 
-    yield "search: follow", follow
-    yield "search: register", tell
+    yield "search: follow", sync
+    yield "search: register", register
     yield "evaluation: located photos", evaluate
 
 
@@ -270,61 +271,43 @@ def _path_template(path: str) -> str:
     return "/".join("{id}" if len(part) == 36 else part for part in path.split("/"))
 
 
-def bench_catalog(
-    photos: Annotated[
-        int, typer.Option(min=100_000, help="Number of photos to create.")
-    ] = 1_000_000,
-    as_json: JsonOption = False,
-) -> None:
-    """Fill a PostgreSQL database with photos and explain every statement that the services send.
+def measure(progress: Progress, *, photos: int) -> Report:
+    """Fill a temporary database on the server of DATABASE_URL, and explain all statements.
 
-    Uses a temporary database on the server of DATABASE_URL, which is dropped at the end. The exit
-    code is 1 if a statement scans a large table sequentially or reads far more rows than it
-    returns.
+    Raises:
+        Misconfigured: `postgres_missing`, if DATABASE_URL is not a PostgreSQL.
     """
-    with report_errors(as_json):
-        url = make_url(read_settings().catalog_url())
-        if url.get_backend_name() != "postgresql":
-            raise Misconfigured("postgres_missing", "Set DATABASE_URL to a PostgreSQL to fill.")
-        with _create_database(url) as own, tempfile.TemporaryDirectory() as folder:
-            catalog = Catalog(
-                own, PoolConfig(name="placewise-bench"), TransactionTimeouts(3600, 3600)
-            )
-            try:
-                migrate(catalog)
-                started = time.perf_counter()
-                filled = fill_catalog(catalog, photos)
-                err_console.print(
-                    f"{photos:,} photos made in {time.perf_counter() - started:.0f} s"
-                )
-                explainer = Explainer(catalog)
-                for name in run_all_calls(catalog, filled, explainer, Path(folder)):
-                    err_console.print(f"  {name}", soft_wrap=True)
-            finally:
-                catalog.close()
+    url = make_url(read_settings().catalog_url())
+    if url.get_backend_name() != "postgresql":
+        raise Misconfigured("postgres_missing", "Set DATABASE_URL to a PostgreSQL to fill.")
+    bar = progress.add_task("filling the catalog", total=None)
+    with _create_database(url) as own, tempfile.TemporaryDirectory() as folder:
+        catalog = Catalog(own, PoolConfig(name="placewise-bench"), TransactionTimeouts(3600, 3600))
+        try:
+            migrate(catalog)
+            filled = fill_catalog(catalog, photos)
+            explainer = Explainer(catalog)
+            for name in run_all_calls(catalog, filled, explainer, Path(folder)):
+                progress.update(bar, description=name)
+        finally:
+            catalog.close()
     faulty = [e for e in explainer.found if e.faults() and e.call not in KNOWN_FULL_SCANS]
-    if as_json:
-        statements = [{**asdict(e), "faults": e.faults()} for e in explainer.found]
-        print_json({"photos": photos, "tables": filled.tables, "statements": statements})
-    else:
-        table = Table("call", "ms", "read", "returned", "scans")
-        for e in explainer.found:
-            style = "red" if e in faulty else None
-            table.add_row(
-                e.call,
-                f"{e.milliseconds:.1f}",
-                f"{e.read:,}",
-                f"{e.returned:,}",
-                ", ".join(e.scans),
-                style=style,
-            )
-        console.print(table)
-        for name, size_bytes in sorted(filled.tables.items(), key=lambda item: -item[1]):
-            console.print(f"{name}: {size_bytes / photos:,.0f} bytes per photo")
-        for e in faulty:
-            console.print(f"[red]{e.call}[/red]: {'; '.join(e.faults())}\n  {e.sql}")
-    if faulty:
-        raise typer.Exit(1)
+    report = Report(f"Statements of the services, {photos:,} photos")
+    table = Table("call", "ms", "rows read", "rows returned", "scans")
+    for e in explainer.found:
+        cells = (e.call, f"{e.milliseconds:.1f}", f"{e.read:,}", f"{e.returned:,}")
+        table.add_row(*cells, ", ".join(e.scans), style="red" if e in faulty else None)
+    report.tables.append(table)
+    for name, size_bytes in sorted(filled.tables.items(), key=lambda item: -item[1]):
+        report.add(f"{name}: bytes per photo", size_bytes / photos, "B")
+    for e in faulty:
+        report.add(f"{e.call}: {'; '.join(e.faults())}: {e.sql}", 1, at_most=0)
+    report.details = {
+        "photos": photos,
+        "tables": filled.tables,
+        "statements": [{**asdict(e), "faults": e.faults()} for e in explainer.found],
+    }
+    return report
 
 
 @contextlib.contextmanager

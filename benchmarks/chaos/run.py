@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import random
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy import ColumnElement, func, select
@@ -16,6 +18,7 @@ from sqlalchemy import ColumnElement, func, select
 from benchmarks.chaos.faults import CLOCK_OFFSETS_SECONDS, Fault, all_faults
 from benchmarks.chaos.traffic import Traffic
 from benchmarks.fleet import Fleet, start_servers
+from benchmarks.report import Report
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import UNFINISHED_STATES, JobKind, JobState
@@ -26,6 +29,9 @@ from shared.jobs import Job
 from shared.storage import ObjectStore
 from shared.storage.chunks import manifest_key
 from tests.support.clock import clock_off_by
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 @dataclass(slots=True)
@@ -129,11 +135,11 @@ class FaultOutcome:
     fault: str
     counts: InvariantViolations
     wrong: int
-    """Answers that did not begin with the photo that was asked with, or had one twice."""
+    """Results that did not begin with the query photo, or contained a photo twice."""
     unexpected: int
-    """Answers that were neither a result nor a request to try again, and calls without one."""
+    """Responses that were neither a result nor retryable, and calls without a response."""
     crashed: list[str]
-    """Services that ended although the fault did not kill them."""
+    """Services that exited although the fault did not kill them."""
     refused: int
     """Calls that had to be repeated."""
     recovery_seconds: float
@@ -149,10 +155,10 @@ class ChaosRun:
     """Results of a run, by fault."""
 
     outcomes: list[FaultOutcome] = field(default_factory=list)
-    asked: int = 0
-    """Answers that were compared with what they had to be."""
+    compared: int = 0
+    """Number of search results that were checked."""
     details: list[str] = field(default_factory=list)
-    """Where something was not as it has to be: what, and the end of each service's log."""
+    """Violations, and the end of each service's log."""
 
     @property
     def good(self) -> bool:
@@ -208,7 +214,7 @@ def run_chaos(
                 if not outcome.good:
                     run.details += [*traffic.details, *outcome.counts.details, fleet.logs()]
                     break
-            run.asked = traffic.answers["right"] + traffic.answers["wrong"]
+            run.compared = traffic.answers["right"] + traffic.answers["wrong"]
     return run
 
 
@@ -233,7 +239,7 @@ def _run_fault(
 ) -> FaultOutcome:
     """Upload photos before, during and after the fault, then check the invariants."""
     before = traffic.answers.copy()
-    fell = len(fleet.crashed)
+    crashed = len(fleet.crashed)
     upload(1)
     time.sleep(moments.uniform(0, MAX_FAULT_DELAY_SECONDS))
     with fault.inject(fleet, seconds):
@@ -252,15 +258,15 @@ def _run_fault(
         _wait_until(deadline, lambda: not count_unfinished_jobs(fleet.catalog))
         counts = check_invariants(fleet.catalog, fleet.store, traffic.acknowledged)
     for known in moments.sample(traffic.known, min(QUERIES_PER_FAULT, len(traffic.known))):
-        traffic.ask(known)
+        traffic.query(known)
     change = traffic.answers - before
     return FaultOutcome(
         fault=fault.name,
         counts=counts,
         wrong=change["wrong"],
         unexpected=change["unexpected"],
-        crashed=fleet.crashed[fell:],
-        refused=change["away"],
+        crashed=fleet.crashed[crashed:],
+        refused=change["retried"],
         recovery_seconds=recovery_seconds,
     )
 
@@ -268,3 +274,37 @@ def _run_fault(
 def _wait_until(deadline: float, done: Callable[[], bool]) -> None:
     while not done() and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
+
+
+def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int) -> Report:
+    """Inject every fault once, in a random order that is determined by the seed."""
+    faults = all_faults()
+    bar = progress.add_task("injecting faults", total=len(faults))
+
+    def show(outcome: FaultOutcome) -> None:
+        progress.update(bar, advance=1, description=outcome.fault)
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = run_chaos(
+            Path(folder), photos=photos, fault_seconds=fault_seconds, seed=seed, on_outcome=show
+        )
+    report = Report(f"{photos} photos, {len(run.outcomes)} faults of {len(faults)}, seed {seed}")
+    for outcome in run.outcomes:
+        report.add(f"recovered after: {outcome.fault}", outcome.recovery_seconds, "s")
+    report.add("calls repeated", sum(outcome.refused for outcome in run.outcomes))
+    report.add("responses compared", run.compared)
+    for what, values in (
+        ("photos lost", [outcome.counts.lost for outcome in run.outcomes]),
+        ("photos searchable twice", [outcome.counts.twice for outcome in run.outcomes]),
+        ("jobs stuck", [outcome.counts.stuck for outcome in run.outcomes]),
+        ("jobs failed", [outcome.counts.failed for outcome in run.outcomes]),
+        ("chunks torn", [outcome.counts.torn for outcome in run.outcomes]),
+        ("wrong matches", [outcome.wrong for outcome in run.outcomes]),
+        ("unexpected responses", [outcome.unexpected for outcome in run.outcomes]),
+    ):
+        report.add(what, sum(values), at_most=0)
+    report.details = {
+        "crashed": [name for outcome in run.outcomes for name in outcome.crashed],
+        "violations": run.details,
+    }
+    return report

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 from typing import Any, Self
 from uuid import UUID
 
@@ -22,7 +21,6 @@ UPLOADERS = 4
 CALL_TIMEOUT_SECONDS = 60.0
 RETRY_SECONDS = 0.1
 MIN_SELF_SCORE = 0.9999
-# What a caller is told to try again: anything else that is not an answer is a fault of ours.
 RETRYABLE_STATUSES = (429, 503, 507)
 
 
@@ -44,31 +42,26 @@ class Traffic:
         self._released = 0
         self._next = 0
         self._stop = threading.Event()
-        self._asking = threading.Lock()
+        self._querying = threading.Lock()
         self._numbers: dict[UUID, int] = {}
         self.acknowledged: dict[str, UUID] = {}
         self.known: list[int] = []
-        """Numbers of photos that were searchable when all was well: an answer has to know them."""
+        """Numbers of photos that every result must contain."""
         self.answers: Counter[str] = Counter()
-        """How calls went: `acknowledged`, `right`, `wrong`, `unexpected`, `away`."""
+        """How calls went: `acknowledged`, `right`, `wrong`, `unexpected`, `retried`."""
         self.details: list[str] = []
         self._threads = [
             threading.Thread(target=self._upload, args=(caller,), name="uploader", daemon=True)
             for caller in range(UPLOADERS)
         ]
-        self._threads.append(threading.Thread(target=self._query_loop, name="asker", daemon=True))
+        self._threads.append(threading.Thread(target=self._query_loop, name="querier", daemon=True))
 
     def __enter__(self) -> Self:
         for thread in self._threads:
             thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         for thread in self._threads:
             thread.join()
@@ -91,7 +84,7 @@ class Traffic:
     @contextlib.contextmanager
     def pause_queries(self) -> Iterator[None]:
         """Context manager during which no query is in progress."""
-        with self._asking:
+        with self._querying:
             yield
 
     def _upload(self, caller: int) -> None:
@@ -124,10 +117,10 @@ class Traffic:
             with self._lock:
                 number = self._random.choice(self.known) if self.known else None
             if number is not None:
-                with self._asking:
-                    self.ask(number)
+                with self._querying:
+                    self.query(number)
 
-    def ask(self, number: int) -> None:
+    def query(self, number: int) -> None:
         """Query with the bytes of an acknowledged photo and check the result."""
         body = self._call(
             self._random.randrange(len(self._clients)),
@@ -138,7 +131,7 @@ class Traffic:
             headers={"Prefer": "wait=10"},
         )
         if body is None or "similar_images" not in body or body["missing"]:
-            return  # away, not ready in time, or an answer that says that it is not whole
+            return  # retried, not ready in time, or a shard is missing
         found = body["similar_images"]
         ids = [photo["image_id"] for photo in found]
         right = (
@@ -149,10 +142,10 @@ class Traffic:
         )
         self.answers["right" if right else "wrong"] += 1
         if not right:
-            self.details.append(f"asked with photo {number}, answered {found[:2]}")
+            self.details.append(f"query with photo {number}: {found[:2]}")
 
     def _call(
-        self, caller: int, path: str, wanted: Sequence[int], **options: Any
+        self, caller: int, path: str, expected: Sequence[int], **options: Any
     ) -> dict[str, Any] | None:
         """Return the response body; None if the caller should retry."""
         number = caller % len(self._clients)
@@ -160,17 +153,17 @@ class Traffic:
         try:
             answer = self._clients[number].post(path, **options)
         except httpx2.TransportError as error:
-            self.answers["away"] += 1
+            self.answers["retried"] += 1
             if isinstance(error, httpx2.ReadTimeout):
                 self.answers["unexpected"] += 1
                 seconds = time.monotonic() - started_at
                 self.details.append(f"{path} did not answer in {seconds:.0f} s")
             return None
-        if answer.status_code in wanted:
+        if answer.status_code in expected:
             body: dict[str, Any] = answer.json()
             return body
         if answer.status_code in RETRYABLE_STATUSES:
-            self.answers["away"] += 1
+            self.answers["retried"] += 1
         else:
             self.answers["unexpected"] += 1
             self.details.append(f"{path} answered {answer.status_code}: {answer.text[:500]}")

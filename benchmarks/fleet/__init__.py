@@ -1,6 +1,6 @@
 """Starts a complete Placewise on this machine: real servers, and each service in its own process.
 
-    with start_servers() as servers, Fleet(folder, servers, extractors=3) as fleet:
+    with open_fleet(extractors=3) as fleet:
         fleet.start()
         fleet["extractor-1"].kill()
 
@@ -8,7 +8,7 @@ The benchmarks and the fault-injection suite use it. It needs a checkout with th
 because the servers are those of the tests.
 """
 
-from benchmarks.fleet.fleet import Fleet, Servers, start_servers
+from benchmarks.fleet.fleet import Fleet, Servers, open_fleet, start_servers
 from benchmarks.fleet.service import ServiceProcess
 
-__all__ = ["Fleet", "Servers", "ServiceProcess", "start_servers"]
+__all__ = ["Fleet", "Servers", "ServiceProcess", "open_fleet", "start_servers"]

@@ -11,7 +11,6 @@ import enum
 import re
 import threading
 from collections.abc import AsyncIterator, Iterator
-from types import TracebackType
 from typing import Self
 
 from redis import Redis
@@ -65,12 +64,7 @@ class FaultProxy:
         self._server = started.result()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

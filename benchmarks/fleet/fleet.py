@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -193,12 +193,7 @@ class Fleet:
         migrate(self.catalog)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         if self._supervisor.is_alive():
             self._supervisor.join()
@@ -245,3 +240,12 @@ class Fleet:
 
     def logs(self) -> str:
         return "\n".join(f"--- {name}\n{one.log()}" for name, one in self.services.items())
+
+
+@contextlib.contextmanager
+def open_fleet(servers: Servers | None = None, **options: Any) -> Iterator[Fleet]:
+    """Context manager of a fleet in a temporary folder, by default on servers of its own."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        servers = servers or stack.enter_context(start_servers())
+        yield stack.enter_context(Fleet(folder, servers, **options))

@@ -1,18 +1,26 @@
-"""Runs one `placewise NAME` in a process that can be killed, paused and restarted."""
+"""Processes of Placewise: a service that can be killed and paused, and `placewise serve`.
+
+`ServiceProcess` is one service of a fleet, `start_embedded_server` the embedded form.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import resource
 import signal
+import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import httpx2
 import psutil
 
-from tests.support.processes import Process, start
+from shared.config.embedded_home import RunningServer, find_running_server
+from shared.errors import Unavailable
+from tests.support.processes import PLACEWISE, Process, start
 from tests.support.servers.daemon import cpu_seconds_of
 
 START_TIMEOUT_SECONDS = 120.0
@@ -23,8 +31,8 @@ class ServiceProcess:
     """A service process with a supervisor.
 
     It is ready when `ready_url` returns 200; a service without HTTP writes `ready_line` instead.
-    While it is `wanted`, `restart_if_exited` restarts it, as an orchestrator would. `executed`: see
-    tests/support/processes.py.
+    While `should_run` is set, `restart_if_exited` restarts it, as an orchestrator would.
+    `executed`: see tests/support/processes.py.
     """
 
     def __init__(
@@ -43,7 +51,7 @@ class ServiceProcess:
         self.log_path = log
         self.ready_url = ready_url
         self.ready_line = ready_line.encode()
-        self.wanted = False
+        self.should_run = False
         self.starts = 0
         self._command = command
         self._executed = executed
@@ -62,13 +70,13 @@ class ServiceProcess:
 
     def start(self) -> None:
         with self._lock:
-            self.wanted = True
+            self.should_run = True
             self._start()
 
     def restart_if_exited(self) -> bool:
         """Restart the process if it should run but has exited; return whether it was restarted."""
         with self._lock:
-            if not self.wanted or self.running:
+            if not self.should_run or self.running:
                 return False
             self._start()
             return True
@@ -89,7 +97,7 @@ class ServiceProcess:
     def kill(self) -> None:
         """Send SIGKILL, without restart."""
         with self._lock:
-            self.wanted = False
+            self.should_run = False
             if self._process is not None:
                 if self.running:
                     # One that is stopped would not be continued by anybody else.
@@ -100,7 +108,7 @@ class ServiceProcess:
     def stop(self) -> int:
         """Send SIGTERM and wait; return the exit code."""
         with self._lock:
-            self.wanted = False
+            self.should_run = False
             assert self._process is not None
             self._process.terminate()
             return self._process.wait(timeout=STOP_TIMEOUT_SECONDS)
@@ -140,3 +148,45 @@ class ServiceProcess:
 
     def log(self) -> str:
         return self.log_path.read_text(errors="replace")[-3000:]
+
+
+@contextlib.contextmanager
+def start_embedded_server(
+    folder: Path, *, max_open_files: int | None = None, **variables: str
+) -> Iterator[RunningServer]:
+    """Context manager that runs `placewise serve` in a process of its own; logs to server.log.
+
+    `variables` are added to this process's environment.
+
+    Raises:
+        Unavailable: `server_unreachable`, if the server does not start.
+    """
+    home = folder / "home"
+    environment = {**os.environ, "HOST": "127.0.0.1", "PORT": "0", **variables}
+
+    def limit_files() -> None:
+        if max_open_files is not None:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
+
+    with (
+        (folder / "server.log").open("wb") as log,
+        subprocess.Popen(  # noqa: S603
+            [PLACEWISE, "serve"],
+            env={**environment, "PLACEWISE_HOME": str(home)},
+            stderr=log,
+            cwd=folder,
+            preexec_fn=limit_files,
+        ) as server,
+    ):
+        try:
+            deadline = time.monotonic() + START_TIMEOUT_SECONDS
+            while (running := find_running_server(home)) is None:
+                if server.poll() is not None or time.monotonic() > deadline:
+                    output = (folder / "server.log").read_text(errors="replace")
+                    raise Unavailable(
+                        "server_unreachable", f"The server did not start: {output[-3000:]}"
+                    )
+                time.sleep(0.1)
+            yield running
+        finally:
+            server.terminate()

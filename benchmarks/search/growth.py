@@ -8,7 +8,6 @@ from statistics import median
 
 import numpy as np
 from rich.progress import Progress
-from rich.table import Table
 
 from benchmarks.report import Report
 from benchmarks.search.memory_traffic import MemoryBandwidth
@@ -18,7 +17,6 @@ from shared.codes.sign_codes import level_ends
 
 DIMENSION = 98_304
 MEASURED_SIZES = (100_000, 1_000_000)
-EXTRAPOLATED_SIZES = (3_000_000, 10_000_000)
 BLOCK_ROWS = 1000  # rows per chunk
 ROUNDS = 15
 TARGET_RATIO = 1.3
@@ -29,14 +27,11 @@ def measure_growth(
     report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
 ) -> None:
     """Time scans and plain reads of the same codes in turn."""
-    turn = get_rotation(DIMENSION)
-    words = int(level_ends(turn.padded)[0])
+    rotation = get_rotation(DIMENSION)
+    words = int(level_ends(rotation.padded)[0])
     draw = np.random.default_rng(SEED)
-    query = SignCodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), turn)
+    query = SignCodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), rotation)
     task = progress.add_task("growth", total=len(sizes) * ROUNDS)
-    table = Table("photos", "first bits", "scan", "of reading them", "", title="Growth")
-    per_row = 0.0
-    found = []
     for rows in sizes:
         codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
         blocks = _blocks(codes)
@@ -50,30 +45,9 @@ def measure_growth(
                 took.append(time.perf_counter() - started_at)
                 speed.sample()
                 progress.advance(task)
-        seconds = median(took)
-        ratio = seconds * speed.bytes_per_second / codes.nbytes
-        per_row = seconds / rows
-        report.add(f"growth: scan of {rows:,} codes, median", 1000 * seconds, "ms")
-        report.add(f"growth: {rows:,} codes, of reading them", ratio, "x", at_most=TARGET_RATIO)
-        table.add_row(
-            f"{rows:,}",
-            f"{codes.nbytes / 1e9:.2f} GB",
-            f"{1000 * seconds:.1f} ms",
-            f"{ratio:.2f}",
-            "measured",
-        )
-        found.append({"rows": rows, "seconds": took, "ratio": ratio, "measured": True})
-    for rows in EXTRAPOLATED_SIZES:
-        table.add_row(
-            f"{rows:,}",
-            f"{8 * rows * words / 1e9:.2f} GB",
-            f"{1000 * rows * per_row:.1f} ms",
-            "",
-            f"reckoned from {sizes[-1]:,}",
-        )
-        found.append({"rows": rows, "seconds": rows * per_row, "measured": False})
-    report.tables.append(table)
-    report.details["growth"] = found
+        report.add_latency(f"growth: scan of {rows:,} codes", took)
+        ratio = median(took) * speed.bytes_per_second / codes.nbytes
+        report.add(f"growth: {rows:,} codes, time / reading", ratio, "x", at_most=TARGET_RATIO)
 
 
 def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:

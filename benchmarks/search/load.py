@@ -9,27 +9,26 @@ from __future__ import annotations
 import bisect
 import contextlib
 import random
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http.client import HTTPException
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from rich.progress import Progress
 
+from benchmarks.fleet.load_generator import HttpCaller
 from benchmarks.fleet.service import ServiceProcess
-from benchmarks.load_generator import HttpCaller
-from benchmarks.report import LatencySummary, Report
+from benchmarks.report import Report
 from benchmarks.search.methods import BruteForce, Ranking, same_ranking
 from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
 from shared.search_api.protocol import SearchResponse
 from shared.storage.chunks import Rows
+from tests.support.processes import PLACEWISE
 from tests.support.server import environment
 from tests.support.servers.daemon import free_ports
 
@@ -50,7 +49,7 @@ class SearchObservation:
     query: int
     k: int
     least_version: int
-    """That the answer had to know."""
+    """Lowest version of the map that the response may refer to."""
     response: SearchResponse
     seconds: float
 
@@ -62,9 +61,9 @@ class LoadOutcome:
     answered: list[SearchObservation] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     versions: list[int] = field(default_factory=list)
-    """Rising."""
+    """Ascending."""
     live: list[NDArray[np.bool_]] = field(default_factory=list)
-    """Which photos the map has at each of the versions, and until the next one."""
+    """Mask of the photos that are in the map at each of the versions."""
     merges: int = 0
     seconds: float = 0.0
 
@@ -89,29 +88,19 @@ def measure_load(
         ]
     )
     pool = _similar_rows(queries, city.out_of_map_rows(OUT_OF_MAP_QUERIES + 1)[OUT_OF_MAP_QUERIES:])
-    with _start_search_service(world) as service:
-        outcome = _run_load(world, service, queries, pool, seconds, progress)
+    with _start_search_service(world) as url, HttpCaller(url) as caller:
+        outcome = _Load(world, caller, queries, pool).run(seconds, progress)
     pieces: Iterator[Rows] = (np.load(path, mmap_mode="r") for path in paths)
     added = len(world.photo_ids) - photos
     oracle = BruteForce.of((*pieces, pool[:added]), world.photo_ids, queries)
     wrong = count_wrong_answers(outcome, oracle)
-    spread = LatencySummary.of([answered.seconds for answered in outcome.answered])
-    report.add("load: answers", len(outcome.answered), at_least=1)
+    report.add("load: results", len(outcome.answered), at_least=1)
     report.add("load: versions of the map", len(outcome.versions) + outcome.merges, at_least=2)
-    report.add("load: wrong answers", wrong, at_most=0)
+    report.add("load: wrong results", wrong, at_most=0)
     report.add("load: errors", len(outcome.failed), at_most=0)
     report.add("load: throughput", len(outcome.answered) / outcome.seconds, "queries/s")
-    report.add("load: query, median", 1000 * spread.median, "ms")
-    report.add("load: query, p95", 1000 * spread.p95, "ms")
-    report.details["load"] = {
-        "clients": CLIENTS,
-        "photos": photos,
-        "dimension": world.dimension,
-        "added": added,
-        "deleted": len(world.photo_ids) - int(outcome.live[-1].sum()),
-        "merges": outcome.merges,
-        "errors": outcome.failed[:20],
-    }
+    report.add_latency("load: query", [answered.seconds for answered in outcome.answered])
+    report.details["load"] = {"added": added, "errors": outcome.failed[:20]}
 
 
 def count_wrong_answers(outcome: LoadOutcome, oracle: BruteForce) -> int:
@@ -133,107 +122,84 @@ def count_wrong_answers(outcome: LoadOutcome, oracle: BruteForce) -> int:
     return wrong
 
 
-def _run_load(
-    world: SyntheticMap,
-    service: ServiceProcess,
-    queries: Rows,
-    pool: Rows,
-    seconds: float,
-    progress: Progress,
-) -> LoadOutcome:
-    keys = [world.store_query(row) for row in queries]
-    outcome = LoadOutcome(versions=[world.version], live=[np.ones(len(world.photo_ids), bool)])
-    stop = threading.Event()
-    task = progress.add_task("load", total=seconds)
-    assert service.ready_url is not None
-    with HttpCaller(service.ready_url.removesuffix("/readyz")) as caller:
-        for number in range(len(TOP_KS)):  # what is compiled is compiled now
-            _send_query(world, caller, keys, number, TOP_KS[number], outcome)
-        outcome.answered.clear()
-        with ThreadPoolExecutor(CLIENTS + 1) as pool_of_threads:
+class _Load:
+    """Clients that search, and a thread that changes the map meanwhile."""
+
+    def __init__(self, world: SyntheticMap, caller: HttpCaller, queries: Rows, pool: Rows) -> None:
+        self._world, self._caller, self._pool = world, caller, pool
+        self._keys = [world.store_query(row) for row in queries]
+        self._stop = threading.Event()
+        self._outcome = LoadOutcome(
+            versions=[world.version], live=[np.ones(len(world.photo_ids), bool)]
+        )
+
+    def run(self, seconds: float, progress: Progress) -> LoadOutcome:
+        task = progress.add_task("load", total=seconds)
+        for query, k in enumerate(TOP_KS):  # compiles the kernels
+            self._send_query(query, k)
+        self._outcome.answered.clear()
+        with ThreadPoolExecutor(CLIENTS + 1) as threads:
             started_at = time.monotonic()
-            calls = [
-                pool_of_threads.submit(_client_loop, world, caller, keys, number, outcome, stop)
-                for number in range(CLIENTS)
-            ]
-            calls.append(pool_of_threads.submit(_change_loop, world, pool, outcome, stop))
+            loops = [threads.submit(self._search_loop, number) for number in range(CLIENTS)]
+            loops.append(threads.submit(self._change_loop))
             try:
                 while (spent := time.monotonic() - started_at) < seconds:
                     progress.update(task, completed=spent)
-                    if any(call.done() for call in calls):
-                        break  # one of them has died: its error is raised below
+                    if any(loop.done() for loop in loops):
+                        break  # its exception is raised below
                     time.sleep(0.1)
             finally:
-                stop.set()
-            for call in calls:
-                call.result()
-            outcome.seconds = time.monotonic() - started_at
-    return outcome
+                self._stop.set()
+            for loop in loops:
+                loop.result()
+            self._outcome.seconds = time.monotonic() - started_at
+        return self._outcome
 
+    def _search_loop(self, number: int) -> None:
+        draw = random.Random(SEED + number)
+        while not self._stop.is_set():
+            self._send_query(draw.randrange(len(self._keys)), draw.choice(TOP_KS))
 
-def _client_loop(
-    world: SyntheticMap,
-    caller: HttpCaller,
-    keys: list[str],
-    number: int,
-    outcome: LoadOutcome,
-    stop: threading.Event,
-) -> None:
-    draw = random.Random(SEED + number)
-    while not stop.is_set():
-        _send_query(world, caller, keys, draw.randrange(len(keys)), draw.choice(TOP_KS), outcome)
+    def _send_query(self, query: int, k: int) -> None:
+        outcome = self._outcome
+        least = outcome.versions[-1]
+        body = self._world.request(self._keys[query], k, least).model_dump_json().encode()
+        started_at = time.perf_counter()
+        try:
+            answer = self._caller.call("POST", "/search", body, **JSON_HEADERS)
+            took = time.perf_counter() - started_at
+            if answer.status == 200:
+                response = SearchResponse.model_validate_json(answer.body)
+                outcome.answered.append(SearchObservation(query, k, least, response, took))
+            else:
+                outcome.failed.append(f"{answer.status}: {answer.body[:200]!r}")
+        except (OSError, HTTPException, ValidationError) as error:
+            outcome.failed.append(f"{type(error).__name__}: {error}")
 
+    def _change_loop(self) -> None:
+        """Add a photo, delete another one, and merge the added chunks from time to time."""
+        world, draw = self._world, random.Random(SEED)
+        slot = len(world.photo_ids)  # beyond those in use
+        added = turn = 0
+        live = self._outcome.live[-1]
+        while not self._stop.wait(CHANGE_SECONDS):
+            turn += 1
+            if added < len(self._pool):
+                version = world.add(self._pool[added : added + 1], slot)
+                added += 1
+                live = np.append(live, True)
+                self._record_version(version, live)
+            deleted = int(draw.choice(np.flatnonzero(live).tolist()))
+            version = world.delete(world.photo_ids[deleted])
+            live = live.copy()
+            live[deleted] = False
+            self._record_version(version, live)
+            if turn % CHANGES_PER_MERGE == 0 and world.merge(slot):
+                self._outcome.merges += 1
 
-def _send_query(
-    world: SyntheticMap,
-    caller: HttpCaller,
-    keys: list[str],
-    query: int,
-    k: int,
-    outcome: LoadOutcome,
-) -> None:
-    least = outcome.versions[-1]
-    body = world.request(keys[query], k, least).model_dump_json().encode()
-    started_at = time.perf_counter()
-    try:
-        answer = caller.call("POST", "/search", body, **JSON_HEADERS)
-        took = time.perf_counter() - started_at
-        if answer.status == 200:
-            response = SearchResponse.model_validate_json(answer.body)
-            outcome.answered.append(SearchObservation(query, k, least, response, took))
-        else:
-            outcome.failed.append(f"{answer.status}: {answer.body[:200]!r}")
-    except (OSError, HTTPException, ValidationError) as error:
-        outcome.failed.append(f"{type(error).__name__}: {error}")
-
-
-def _change_loop(
-    world: SyntheticMap, pool: Rows, outcome: LoadOutcome, stop: threading.Event
-) -> None:
-    """Add a photo, delete another one, and merge the added chunks from time to time."""
-    draw = random.Random(SEED)
-    slot = len(world.photo_ids)  # far beyond those that are there
-    added = turn = 0
-    live = outcome.live[-1]
-    while not stop.wait(CHANGE_SECONDS):
-        turn += 1
-        if added < len(pool):
-            version = world.add(pool[added : added + 1], slot)
-            added += 1
-            live = np.append(live, True)
-            _record_version(outcome, version, live)
-        gone = int(draw.choice(np.flatnonzero(live).tolist()))
-        version = world.delete(world.photo_ids[gone])
-        live = live.copy()
-        live[gone] = False
-        _record_version(outcome, version, live)
-        if turn % CHANGES_PER_MERGE == 0 and world.merge(slot):
-            outcome.merges += 1
-
-
-def _record_version(outcome: LoadOutcome, version: int, live: NDArray[np.bool_]) -> None:
-    outcome.live.append(live)
-    outcome.versions.append(version)  # last: clients ask for it from now on
+    def _record_version(self, version: int, live: NDArray[np.bool_]) -> None:
+        self._outcome.live.append(live)
+        self._outcome.versions.append(version)  # last: clients require it from now on
 
 
 def _similar_rows(queries: Rows, others: Rows) -> Rows:
@@ -249,13 +215,13 @@ def _similar_rows(queries: Rows, others: Rows) -> Rows:
 
 
 @contextlib.contextmanager
-def _start_search_service(world: SyntheticMap) -> Iterator[ServiceProcess]:
-    """Start `placewise search` on the map."""
+def _start_search_service(world: SyntheticMap) -> Iterator[str]:
+    """Start `placewise search` on the map; yields its URL."""
     (port,) = free_ports(1)
     home = world.settings.placewise_home
     service = ServiceProcess(
         "search",
-        [str(Path(sys.executable).with_name("placewise")), "search"],
+        [PLACEWISE, "search"],
         environment(home, port=port, search_memory_budget=world.settings.search_memory_bytes),
         home / "search.log",
         f"http://127.0.0.1:{port}/readyz",
@@ -263,6 +229,6 @@ def _start_search_service(world: SyntheticMap) -> Iterator[ServiceProcess]:
     service.start()
     try:
         service.wait_until_ready()
-        yield service
+        yield f"http://127.0.0.1:{port}"
     finally:
         service.kill()

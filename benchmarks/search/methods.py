@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar
 from uuid import UUID
 
 import faiss
@@ -100,37 +100,48 @@ class BenchmarkQuery:
     min_score: float | None = None
 
 
-class SearchMethod(Protocol):
-    """Interface of a compared search method."""
+@dataclass(eq=False)
+class SearchMethod:
+    """A compared search method over the rows of `photo_ids`, with (q, dimension) `queries`."""
 
-    name: str
-    memory_bytes: int
-    """size of the index, without the page cache of files"""
+    name: ClassVar[str]
+    photo_ids: Sequence[UUID]
+    queries: Rows
 
-    def search(self, params: BenchmarkQuery) -> Ranking: ...
+    @property
+    def memory_bytes(self) -> int:
+        """Size of the index, without the page cache of files."""
+        return int(self.queries[0].nbytes) * len(self.photo_ids)
 
-    def bytes_touched(self, params: BenchmarkQuery) -> int:
+    def search(self, params: BenchmarkQuery) -> Ranking:
+        raise NotImplementedError
+
+    def bytes_touched(self, _params: BenchmarkQuery) -> int:
         """Return the number of bytes of codes and rows that the search reads."""
+        return int(self.queries[0].nbytes) * len(self.photo_ids)
 
 
-class PlacewiseSearch:
+class PlacewiseSearch(SearchMethod):
     """Placewise's search on a loaded snapshot, called directly."""
 
-    name = "Placewise, answer()"
+    name = "Placewise, execute_query()"
 
     def __init__(self, world: SyntheticMap, worker: SearchWorker, queries: Rows) -> None:
+        super().__init__(world.photo_ids, queries)
         self._snapshot = worker.snapshot(world.generation_id, world.version)
         self._query_batcher = worker.query_batcher
-        self._queries = queries
-        self._mask = self._snapshot.photos.findable
-        self.memory_bytes = worker.status().resident_bytes
+        self._resident_bytes = worker.status().resident_bytes
         self.certificates: set[str] = set()
+
+    @property
+    def memory_bytes(self) -> int:
+        return self._resident_bytes
 
     def search(self, params: BenchmarkQuery) -> Ranking:
         found = execute_query(
             self._snapshot,
-            self._queries[params.query],
-            self._mask,
+            self.queries[params.query],
+            self._snapshot.photos.findable,
             SearchOptions(params.k, params.min_score),
             self._query_batcher,
         )
@@ -141,96 +152,77 @@ class PlacewiseSearch:
         with count_bytes_read() as count:
             self.search(params)
         # Without codes every row is read.
-        return count.size_bytes or int(self._queries[0].nbytes) * len(self._mask)
+        return count.size_bytes or super().bytes_touched(params)
 
 
-class PlacewiseWorker:
+class PlacewiseWorker(SearchMethod):
     """The same through the search worker, which reads the query's descriptor from the store."""
 
     name = "Placewise, SearchWorker"
 
-    def __init__(
-        self, world: SyntheticMap, worker: SearchWorker, queries: Rows, ours: PlacewiseSearch
-    ) -> None:
-        self._world = world
-        self._worker = worker
+    def __init__(self, world: SyntheticMap, worker: SearchWorker, direct: PlacewiseSearch) -> None:
+        super().__init__(world.photo_ids, direct.queries)
+        self._world, self._worker, self._direct = world, worker, direct
         self._version = world.version
-        self._keys = [world.store_query(row) for row in queries]
-        self._ours = ours
-        self.memory_bytes = ours.memory_bytes
+        self._keys = [world.store_query(row) for row in direct.queries]
+
+    @property
+    def memory_bytes(self) -> int:
+        return self._direct.memory_bytes
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        request = self._world.request(
-            self._keys[params.query], params.k, self._version, params.min_score
-        )
+        key = self._keys[params.query]
+        request = self._world.request(key, params.k, self._version, params.min_score)
         return [(hit.photo_id, hit.score) for hit in self._worker.search(request).hits]
 
     def bytes_touched(self, params: BenchmarkQuery) -> int:
-        return self._ours.bytes_touched(params)
+        return self._direct.bytes_touched(params)
 
 
-class NumpySearch:
-    """All rows in one float32 array."""
+@dataclass(eq=False)
+class NumpySearch(SearchMethod):
+    """Product of the query with all rows in one float32 array."""
 
     name = "NumPy, resident float32"
-
-    def __init__(self, rows: Rows, photo_ids: Sequence[UUID], queries: Rows) -> None:
-        self._rows = rows
-        self._ids = photo_ids
-        self._queries = queries
-        self.memory_bytes = rows.nbytes
+    rows: Rows
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        return top_k(self._rows @ self._queries[params.query], self._ids, params)
-
-    def bytes_touched(self, params: BenchmarkQuery) -> int:
-        return self._rows.nbytes
+        return top_k(self.rows @ self.queries[params.query], self.photo_ids, params)
 
 
-class AnyLocSearch:
+@dataclass(eq=False)
+class AnyLocSearch(SearchMethod):
     """Loads every chunk for every query, as AnyLoc's similarity service does."""
 
-    name = "predecessor: np.load of every chunk"
-    memory_bytes = 0
+    name = "np.load of every chunk"
+    paths: Sequence[Path]
 
-    def __init__(self, paths: Sequence[Path], photo_ids: Sequence[UUID], queries: Rows) -> None:
-        self._paths = paths
-        self._ids = photo_ids
-        self._queries = queries
+    @property
+    def memory_bytes(self) -> int:
+        return 0
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        query = self._queries[params.query]
-        scores = np.concatenate([np.dot(np.load(path), query) for path in self._paths])
-        return top_k(scores, self._ids, params)
-
-    def bytes_touched(self, params: BenchmarkQuery) -> int:
-        return int(self._queries[0].nbytes) * len(self._ids)
+        query = self.queries[params.query]
+        scores = np.concatenate([np.dot(np.load(path), query) for path in self.paths])
+        return top_k(scores, self.photo_ids, params)
 
 
-class FaissFlat:
+@dataclass(eq=False)
+class FaissFlat(SearchMethod):
     """`faiss.IndexFlatIP`; shares its rows with NumPy, to hold a single copy."""
 
     name = "faiss.IndexFlatIP"
-
-    def __init__(self, index: faiss.IndexFlatIP, photo_ids: Sequence[UUID], queries: Rows) -> None:
-        self._index = index
-        self._ids = photo_ids
-        self._queries = queries
-        self.memory_bytes = int(queries[0].nbytes) * len(photo_ids)
+    index: faiss.IndexFlatIP
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        query = self._queries[params.query]
-        k = min(params.k, len(self._ids))
-        scores, numbers = self._index.search(query[np.newaxis], k)
-        found = zip(numbers[0].tolist(), scores[0].tolist(), strict=True)
+        k = min(params.k, len(self.photo_ids))
+        scores, rows = self.index.search(self.queries[params.query][np.newaxis], k)
+        found = zip(rows[0].tolist(), scores[0].tolist(), strict=True)
         min_score = -np.inf if params.min_score is None else params.min_score
-        return [(self._ids[number], score) for number, score in found if score >= min_score]
-
-    def bytes_touched(self, params: BenchmarkQuery) -> int:
-        return self.memory_bytes
+        return [(self.photo_ids[row], score) for row, score in found if score >= min_score]
 
 
-class FaissBinary:
+class FaissBinary(SearchMethod):
     """`faiss.IndexBinaryFlat` on the sign codes, with exact reranking of its candidates.
 
     The number of candidates that suffices for an exact result is unknown.
@@ -239,30 +231,32 @@ class FaissBinary:
     name = "faiss.IndexBinaryFlat + rerank"
 
     def __init__(
-        self, codes: SignCodes, rows: Rows, photo_ids: Sequence[UUID], queries: Rows
+        self, photo_ids: Sequence[UUID], queries: Rows, rows: Rows, codes: SignCodes
     ) -> None:
+        super().__init__(photo_ids, queries)
         words = np.concatenate(codes.levels, axis=1).view(np.uint8)
         self._index = faiss.IndexBinaryFlat(8 * words.shape[1])
         self._index.add(words)
+        self._index_bytes = words.nbytes
         self._rows = rows
-        self._ids = photo_ids
-        self._queries = queries
-        self._turn = get_rotation(rows.shape[1])
-        self.memory_bytes = words.nbytes
+
+    @property
+    def memory_bytes(self) -> int:
+        return self._index_bytes
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        query = self._queries[params.query]
-        code = pack_signs(self._turn.rotate(query[np.newaxis])).view(np.uint8)
-        _, numbers = self._index.search(code, self._candidates(params))
-        rows = numbers[0]
+        query = self.queries[params.query]
+        rotated = get_rotation(len(query)).rotate(query[np.newaxis])
+        _, found = self._index.search(pack_signs(rotated).view(np.uint8), self._candidates(params))
+        rows = found[0]
         scores = self._rows[rows].astype(np.float64) @ query.astype(np.float64)
-        return top_k(scores, [self._ids[row] for row in rows.tolist()], params)
+        return top_k(scores, [self.photo_ids[row] for row in rows.tolist()], params)
 
     def bytes_touched(self, params: BenchmarkQuery) -> int:
         return self.memory_bytes + self._candidates(params) * self._rows.strides[0]
 
     def _candidates(self, params: BenchmarkQuery) -> int:
-        return min(max(MIN_CANDIDATES, 3 * params.k), len(self._ids))
+        return min(max(MIN_CANDIDATES, 3 * params.k), len(self.photo_ids))
 
 
 def top_k(

@@ -151,9 +151,6 @@ def train(
     device: Annotated[
         str, typer.Option("--device", help="Device: auto, cpu, gpu or mps.")
     ] = "auto",
-    grid: Annotated[
-        bool, typer.Option("--grid", help="Also train three aggregators with two losses each.")
-    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the city and the network.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -168,7 +165,6 @@ def train(
         photos=photos,
         workers=workers,
         device=device,
-        grid=grid,
         seed=seed,
     )
 
@@ -259,9 +255,7 @@ def catalog(
 
     Creates a temporary database on the server of DATABASE_URL and drops it at the end.
     """
-    with report_errors(as_json):
-        program = _load_benchmark("catalog.command")
-    program.bench_catalog(photos, as_json)
+    _run_benchmark("catalog.command", as_json, photos=photos)
 
 
 @app.command("chaos")
@@ -323,20 +317,20 @@ def scale(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate machines, storage and cost for 10 thousand, 1 million and 100 million photos."""
+    if page is not None and (inputs or measured):
+        raise typer.BadParameter("edit the inputs in the page instead of --set or --measure")
     with report_errors(as_json):
         program = _load_benchmark("scale")
-        measurements = None
-        if measured:
-            with progress_bar() as progress:
-                measurements = program.measure(progress)
-        sizing = program.size_up(inputs or [], measurements)
+        values = program.measure_inputs() if measured else {}
+        values |= program.parse_assignments(inputs or [])
+        sizing = program.Sizing(values, page.read_text(encoding="utf-8") if page else None)
         if page is not None:
-            page.write_text(sizing.put_into(page.read_text(encoding="utf-8")), encoding="utf-8")
+            page.write_text(sizing.updated_page(), encoding="utf-8")
     if as_json:
         print_json(sizing.as_json())
     elif page is None:
-        for sheet in sizing.sheets():
-            console.print(sheet.table())
+        for table in sizing.terminal_tables():
+            console.print(table)
 
 
 def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:

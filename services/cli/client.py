@@ -9,10 +9,11 @@ from collections.abc import Iterator
 
 from rich.progress import Progress
 
+from placewise.answers import Generation, Job
+from placewise.client import Client, Work
 from services.cli.environment import read_settings
-from shared.client import Client, Json
 from shared.config.embedded_home import RunningServer, find_running_server
-from shared.errors import PlacewiseError, Unavailable, Unprocessable
+from shared.errors import Unavailable
 
 START_TIMEOUT_SECONDS = 30.0
 
@@ -38,13 +39,14 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
-    # Imported here: loading torch takes seconds, and clients of a running server don't need it.
-    from services.standalone import run_standalone
+    from services.standalone import run_standalone  # clients of a running server don't need it
 
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
-    with run_standalone(embedded_settings) as running:
+    with run_standalone(embedded_settings, lazy_extractor=True) as running:
         # In a thread: in the main thread, uvicorn would install its own signal handlers.
-        serving = threading.Thread(target=running.serve, name="http")
+        serving = threading.Thread(
+            target=running.server.run, kwargs={"sockets": [running.listener]}, name="http"
+        )
         serving.start()
         try:
             deadline = time.monotonic() + START_TIMEOUT_SECONDS
@@ -58,6 +60,10 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
                 time.sleep(0.01)
             with Client(running.url, map_name, running.local_key) as client:
                 yield client
+        except Exception as error:
+            if running.error is not None:  # why the server has stopped
+                raise running.error from error
+            raise
         finally:
             running.server.should_exit = True
             serving.join()
@@ -66,34 +72,25 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
 POLL_SECONDS = 1.0  # short, so that the progress bar moves
 
 
-def wait_for_job(client: Client, job_id: str, progress: Progress, label: str) -> Json:
-    """Wait until a job ends, showing its progress in a bar.
-
-    Returns:
-        The job, which has succeeded.
+def wait_for_job(client: Client, work: Work, progress: Progress, label: str) -> Job:
+    """Wait until a job succeeds, showing its progress in a bar.
 
     Raises:
         Unprocessable: The job failed or was cancelled; `code` and `detail` are the job's.
     """
     bar = progress.add_task(label, total=None)
 
-    def show(job: Json) -> None:
-        counts = job["progress"]
+    def show(job: Job) -> None:
         progress.update(
             bar,
-            description=f"{label}: {job['stage'] or job['state']}",
-            completed=counts["done"],
-            total=counts["total"],
+            description=f"{label}: {job.stage or job.state}",
+            completed=job.progress.done,
+            total=job.progress.total,
         )
 
-    job = client.wait_for(job_id, show, poll_seconds=POLL_SECONDS)
-    if job["state"] != "succeeded":
-        raise _job_error(job)
-    return job
+    return client.wait(work, on_progress=show, poll_seconds=POLL_SECONDS)
 
 
-def _job_error(job: Json) -> PlacewiseError:
-    error = job["error"] or {}
-    return Unprocessable(
-        error.get("code", "job_ended"), error.get("detail", f"The job ended as {job['state']}.")
-    )
+def active_generation(client: Client) -> Generation | None:
+    """The generation that answers searches; None if no photo of the map is described yet."""
+    return next((g for g in client.generations() if g.state == "active"), None)

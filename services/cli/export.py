@@ -21,21 +21,22 @@ import numpy as np
 import typer
 from rich.progress import Progress
 
-from services.cli.client import connect
+from placewise.answers import Estimate, Photo
+from placewise.client import Client
+from services.cli.client import active_generation, connect
 from services.cli.output import (
+    Json,
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
     atomic_write,
     check_output_path,
-    console,
-    print_json,
+    print_result,
     printable_path,
     progress_bar,
     report_errors,
 )
-from shared.client import Client, Json
 from shared.errors import Conflict, InvalidRequest, Misconfigured
 
 EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
@@ -61,16 +62,17 @@ def export_descriptors(
         NotFound: The map has no such generation.
         Misconfigured: `out_unwritable`.
     """
-    if generation_id is None:
-        generation_id = _active_generation_id(client)
-    else:
-        generation_id = _validate_generation_id(generation_id)
+    generation = (
+        _active_generation_id(client)
+        if generation_id is None
+        else _parse_generation_id(generation_id)
+    )
     receiving = progress.add_task("receiving (bytes)", total=None)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out) as received:
             client.export_descriptors(
-                generation_id, received, lambda size: progress.update(receiving, completed=size)
+                generation, received, lambda size: progress.update(receiving, completed=size)
             )
             received.seek(0)
             with tarfile.open(fileobj=received, mode="r:") as tar:
@@ -86,26 +88,25 @@ def export_descriptors(
     rows = np.load(out / "descriptors.npy", mmap_mode="r")
     return {
         "file": printable_path(out / "descriptors.npy"),
-        "generation_id": generation_id,
+        "generation_id": str(generation),
         "rows": rows.shape[0],
         "dimension": rows.shape[1],
     }
 
 
-def _active_generation_id(client: Client) -> str:
-    for generation in client.generations():
-        if generation["state"] == "active":
-            return str(generation["generation_id"])
-    raise Conflict(
-        "nothing_described",
-        "The map has no photos with descriptors yet. Upload photos: placewise index.",
-    )
+def _active_generation_id(client: Client) -> UUID:
+    generation = active_generation(client)
+    if generation is None:
+        raise Conflict(
+            "nothing_described",
+            "The map has no photos with descriptors yet. Upload photos: placewise index.",
+        )
+    return generation.generation_id
 
 
-def _validate_generation_id(generation_id: str) -> str:
-    """Reject anything but a UUID: the value becomes part of the URL's path."""
+def _parse_generation_id(generation_id: str) -> UUID:
     try:
-        return str(UUID(generation_id))
+        return UUID(generation_id)
     except ValueError:
         raise InvalidRequest(
             "bad_id", f"Invalid generation ID {generation_id!r}: a UUID is required."
@@ -130,17 +131,17 @@ def export_pairs(
         InvalidRequest: `ambiguous_names` if two photos share a name, or if a name contains white
             space, which hloc's format can't represent.
     """
-    photos = list(client.each("/search", "images"))
+    photos = list(client.photos())
     if names == PairNames.FILENAME:
         _check_unique_names(photos)
-    queries = [photo for photo in photos if photo["role"] == "query"] or photos
+    queries = [photo for photo in photos if photo.role == "query"] or photos
     if not queries:
         raise Conflict("no_photos", "The map has no photos yet. Upload photos: placewise index.")
     bar = progress.add_task("querying", total=len(queries))
     pairs = skipped = 0
     for photo in queries:
         try:
-            matches = client.similar_to(photo["image_id"], top_k=top_k)["similar_images"]
+            matches = client.similar(photo, top_k=top_k).similar_images
         except Conflict as error:
             if error.code != "not_searchable":
                 raise
@@ -153,12 +154,12 @@ def export_pairs(
     return {"asked": len(queries), "pairs": pairs, "passed_over": skipped}
 
 
-def _photo_name(photo: Json, names: PairNames) -> str:
-    return str(photo["original_filename" if names == PairNames.FILENAME else "image_id"])
+def _photo_name(photo: Photo, names: PairNames) -> str:
+    return photo.original_filename if names == PairNames.FILENAME else str(photo.image_id)
 
 
-def _check_unique_names(photos: list[Json]) -> None:
-    counts = Counter(photo["original_filename"] for photo in photos)
+def _check_unique_names(photos: list[Photo]) -> None:
+    counts = Counter(photo.original_filename for photo in photos)
     bad = [name for name, count in counts.items() if count > 1 or name.split() != [name]]
     if bad:
         raise InvalidRequest(
@@ -168,7 +169,7 @@ def _check_unique_names(photos: list[Json]) -> None:
         )
 
 
-PHOTO_PROPERTIES = (
+PHOTO_PROPERTIES = {
     "original_filename",
     "upload_time",
     "captured_at",
@@ -178,7 +179,7 @@ PHOTO_PROPERTIES = (
     "metadata",
     "role",
     "image_url",
-)
+}
 
 
 def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Progress) -> Json:
@@ -193,29 +194,30 @@ def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Pr
     Returns:
         Counts: `photos`, `estimates`, and `passed_over` (queries without a descriptor).
     """
-    writing = progress.add_task("photos", total=client.stats()["total_images"])
+    writing = progress.add_task("photos", total=client.stats().total_images)
     photos = 0
-    queries: list[Json] = []
+    queries: list[Photo] = []
     out = _FeatureWriter(file)
-    for photo in client.each("/search", "images"):
-        properties = {name: photo[name] for name in PHOTO_PROPERTIES}
-        out.add(photo["image_id"], photo, {"kind": "photo", **properties})
+    for photo in client.photos():
+        properties = photo.model_dump(mode="json", include=PHOTO_PROPERTIES)
+        out.add(str(photo.image_id), photo, {"kind": "photo", **properties})
         photos += 1
-        if estimates and photo["role"] == "query":
+        if estimates and photo.role == "query":
             queries.append(photo)
         progress.advance(writing)
     skipped = 0
     bar = progress.add_task("querying", total=len(queries), visible=estimates)
     for photo in queries:
         try:
-            estimate = client.similar_to(photo["image_id"])["estimate"]
+            estimate = client.similar(photo).estimate
         except Conflict as error:
             if error.code != "not_searchable":
                 raise
             skipped += 1
         else:
-            properties = {"kind": "estimate", "query": photo["image_id"], **estimate}
-            out.add(f"{photo['image_id']}#estimate", estimate, properties)
+            query = str(photo.image_id)
+            properties = {"kind": "estimate", "query": query, **estimate.as_json()}
+            out.add(f"{query}#estimate", estimate, properties)
         progress.advance(bar)
     out.end()
     return {
@@ -233,12 +235,12 @@ class _FeatureWriter:
         self._separator = b"\n"
         file.write(b'{"type": "FeatureCollection", "features": [')
 
-    def add(self, feature_id: str, position: Json, properties: Json) -> None:
+    def add(self, feature_id: str, position: Photo | Estimate, properties: Json) -> None:
         geometry: dict[str, Any] | None = None
-        if position["latitude"] is not None:
+        if position.latitude is not None:
             geometry = {
                 "type": "Point",
-                "coordinates": [position["longitude"], position["latitude"]],
+                "coordinates": [position.longitude, position.latitude],
             }
         feature = {
             "type": "Feature",
@@ -286,8 +288,10 @@ def descriptors(
     with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             written = export_descriptors(client, out, generation, progress)
-        _print_result(
-            written, as_json, f"{written['rows']} rows of {written['dimension']} dimensions"
+        print_result(
+            written,
+            as_json,
+            f"{written['file']}: {written['rows']} rows of {written['dimension']} dimensions.",
         )
 
 
@@ -317,11 +321,11 @@ def pairs(
             atomic_write(out) as file,
         ):
             written = export_pairs(client, file, top_k, names, progress)
-        _print_result(
+        print_result(
             {"file": str(out), **written},
             as_json,
-            f"{written['pairs']} pairs for {written['asked']} queries, "
-            f"{written['passed_over']} of them without a descriptor",
+            f"{out}: {written['pairs']} pairs for {written['asked']} queries, "
+            f"{written['passed_over']} of them without a descriptor.",
         )
 
 
@@ -346,15 +350,8 @@ def geojson(
             atomic_write(out) as file,
         ):
             written = export_geojson(client, file, estimates, progress)
-        _print_result(
+        print_result(
             {"file": str(out), **written},
             as_json,
-            f"{written['photos']} photos, {written['estimates']} estimates",
+            f"{out}: {written['photos']} photos, {written['estimates']} estimates.",
         )
-
-
-def _print_result(result: Json, as_json: bool, summary: str) -> None:
-    if as_json:
-        print_json(result)
-    else:
-        console.print(f"{result['file']}: {summary}.", soft_wrap=True, markup=False)

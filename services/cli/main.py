@@ -1,7 +1,7 @@
 """The Typer application of `placewise`, with lazily imported commands.
 
-A run imports only the module of the command it executes: some commands load torch or Lightning,
-which takes seconds and is not installed in every image.
+A run imports only the module of the command it executes: some commands load torch, which
+takes seconds and is not installed in every image.
 """
 
 from __future__ import annotations

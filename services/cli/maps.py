@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from placewise.answers import Map
 from services.cli.client import connect, wait_for_job
 from services.cli.extractor_options import PreprocessingOption, extractor_name
 from services.cli.output import (
@@ -16,10 +17,10 @@ from services.cli.output import (
     ServerOption,
     console,
     print_json,
+    print_result,
     progress_bar,
     report_errors,
 )
-from shared.client import Json
 from shared.errors import Conflict
 
 app = typer.Typer(
@@ -44,22 +45,22 @@ def list_maps(
         table = Table("map", *counts, "extractor", "vocabulary", "dimension")
         for map_ in maps:
             table.add_row(
-                map_["name"],
-                str(map_["photos"]),
-                str(map_["searchable"]),
-                str(map_["labelled_queries"]),
-                map_["extractor"],
-                map_["vocabulary"] or "",
+                map_.name,
+                str(map_.photos),
+                str(map_.searchable),
+                str(map_.labelled_queries),
+                map_.extractor,
+                map_.vocabulary or "",
                 _format_dimension(map_),
             )
         console.print(table)
 
 
-def _format_dimension(map_: Json) -> str:
-    if map_["dimension"] is None:
+def _format_dimension(map_: Map) -> str:
+    if map_.dimension is None:
         return ""
-    pca_note = "" if map_["pca_from"] is None else f" (PCA of {map_['pca_from']})"
-    return f"{map_['dimension']}{pca_note}"
+    pca_note = "" if map_.pca_from is None else f" (PCA of {map_.pca_from})"
+    return f"{map_.dimension}{pca_note}"
 
 
 @app.command("create")
@@ -79,10 +80,7 @@ def create(
             extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
             created = client.create_map(name, extractor)
-        if as_json:
-            print_json(created)
-            return
-        console.print(f"Created map {name} with extractor {created['extractor']}.")
+        print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 
 
 @app.command("switch")
@@ -112,16 +110,13 @@ def switch(
     with report_errors(as_json):
         with connect(server, name, key) as client, progress_bar() as progress:
             started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
-            job = wait_for_job(client, started["job_id"], progress, "switching")
-        if as_json:
-            print_json(job)
-            return
-        result = job["result"]
-        console.print(
+            job = wait_for_job(client, started, progress, "switching")
+        result = job.result or {}
+        print_result(
+            job,
+            as_json,
             f"Map {name} now uses {extractor}: {result['photos']} photos, "
             f"{result['dimension']} dimensions, {result['failed']} failed.",
-            soft_wrap=True,
-            markup=False,
         )
 
 
@@ -136,7 +131,7 @@ def delete(
     """Delete a map and all its photos."""
     with report_errors(as_json):
         with connect(server, None, key) as client:
-            photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
+            photos = next((m.photos for m in client.maps() if m.name == name), None)
             if photos and not yes and not sys.stdin.isatty():
                 raise Conflict(
                     "not_confirmed",
@@ -145,7 +140,4 @@ def delete(
             if photos and not yes:
                 typer.confirm(f"Delete map {name} and its {photos} photos?", abort=True)
             deleted = client.delete_map(name)
-        if as_json:
-            print_json(deleted)
-            return
-        console.print(deleted["message"])
+        print_result(deleted, as_json, deleted.message)

@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from operator import methodcaller
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
@@ -23,6 +24,8 @@ from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 # Progress and messages go to stderr, so that the answer on stdout can be piped.
 err_console = Console(stderr=True, highlight=False)
 console = Console(highlight=False)
+
+Json = dict[str, Any]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 MapOption = Annotated[
@@ -54,7 +57,16 @@ def printable_path(path: Path) -> str:
 
 
 def print_json(value: Any) -> None:
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    """Print a value as JSON; answers of the server as the server sent them."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json")))
+
+
+def print_result(result: Any, as_json: bool, message: str) -> None:
+    """Print the result of a command as JSON, or a message about it."""
+    if as_json:
+        print_json(result)
+    else:
+        console.print(message, soft_wrap=True, markup=False)
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Column, Table
 
+from placewise.answers import Estimate, Explanation
 from services.cli.client import connect
 from services.cli.output import (
     JsonOption,
@@ -18,7 +19,6 @@ from services.cli.output import (
     print_json,
     report_errors,
 )
-from shared.client import Json
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 
 MAX_CLUSTERS_SHOWN = 3  # per explanation
@@ -72,7 +72,7 @@ def query(
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
     with report_errors(as_json):
         with connect(server, map_name, key) as client:
-            answer = client.similar_to_file(
+            answer = client.similar(
                 photo,
                 top_k=top_k,
                 min_score=min_score,
@@ -89,7 +89,7 @@ def query(
         if as_json:
             print_json(answer)
             return
-        weighted = answer["word_weights"] == "applied"
+        weighted = answer.word_weights == "applied"
         table = Table(
             "rank",
             Column("score", no_wrap=True),
@@ -101,23 +101,23 @@ def query(
             "place",
             *([Column("explained by", overflow="fold")] if explain else []),
         )
-        for rank, match in enumerate(answer["similar_images"], start=1):
+        for rank, match in enumerate(answer.similar_images, start=1):
             table.add_row(
                 str(rank),
-                f"{match['similarity_score']:.4f}",
-                *([f"{match['weighted_score']:.4f}"] if weighted else []),
-                *([_format_score(match["rerank_score"])] if rerank else []),
-                match["original_filename"],
-                _format_degrees(match["latitude"]),
-                _format_degrees(match["longitude"]),
-                match["place"] or "",
-                *([_format_explanation(match["explanation"])] if explain else []),
+                f"{match.similarity_score:.4f}",
+                *([_format_score(match.weighted_score)] if weighted else []),
+                *([_format_score(match.rerank_score)] if rerank else []),
+                match.original_filename,
+                _format_degrees(match.latitude),
+                _format_degrees(match.longitude),
+                match.place or "",
+                *([_format_explanation(match.explanation)] if explain else []),
             )
         console.print(table)
-        console.print(_format_estimate(answer["estimate"]), soft_wrap=True)
+        console.print(_format_estimate(answer.estimate), soft_wrap=True)
         console.print(
-            f"{answer['rows_scanned']} photos compared (certificate: {answer['certificate']}), "
-            f"vocabulary: {answer['vocabulary']}, word weights: {answer['word_weights']}",
+            f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
+            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}",
             soft_wrap=True,
         )
 
@@ -126,34 +126,34 @@ def _format_score(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}"
 
 
-def _format_explanation(explanation: Json | None) -> str:
+def _format_explanation(explanation: Explanation | None) -> str:
     """The clusters that contribute most to the score; without a vocabulary, the patch grid."""
     if explanation is None:
         return ""
-    if explanation["clusters"] is None:
-        return f"{explanation['rows']} x {explanation['columns']} patches"
-    top = explanation["clusters"][:MAX_CLUSTERS_SHOWN]
-    return ", ".join(f"cluster {item['cluster']}: {item['share']:+.4f}" for item in top)
+    if explanation.clusters is None:
+        return f"{explanation.rows} x {explanation.columns} patches"
+    top = explanation.clusters[:MAX_CLUSTERS_SHOWN]
+    return ", ".join(f"cluster {item.cluster}: {item.share:+.4f}" for item in top)
 
 
-def _format_estimate(estimate: Json) -> str:
+def _format_estimate(estimate: Estimate) -> str:
     """The estimate in one line."""
-    if estimate["in_map"] is False:
-        return str(estimate["reason"])
-    parts = [estimate["place"]] if estimate["place"] else []
-    if estimate["latitude"] is not None:
+    if estimate.in_map is False:
+        return estimate.reason
+    parts = [estimate.place] if estimate.place else []
+    if estimate.latitude is not None:
         parts.append(
-            f"{estimate['latitude']:.6f}, {estimate['longitude']:.6f} "
-            f"(positive-match radius {estimate['radius_m']:g} m)"
+            f"{estimate.latitude:.6f}, {estimate.longitude:.6f} "
+            f"(positive-match radius {estimate.radius_m:g} m)"
         )
     if not parts:
-        return f"No place estimate: {estimate['reason']}"
+        return f"No place estimate: {estimate.reason}"
     confidence = (
-        f"confidence {estimate['confidence']:.0%}"
-        if estimate["confidence"] is not None
+        f"confidence {estimate.confidence:.0%}"
+        if estimate.confidence is not None
         else "confidence uncalibrated"
     )
-    in_map_note = "" if estimate["in_map"] else "; can't tell yet whether the place is in the map"
+    in_map_note = "" if estimate.in_map else "; can't tell yet whether the place is in the map"
     return f"Estimate: {'; '.join(parts)}, {confidence}{in_map_note}"
 
 

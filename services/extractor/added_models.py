@@ -14,16 +14,15 @@ import json
 import logging
 import math
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 
 from shared.catalog.models import ModelRegistration, get_model_for_loading, register_model
 from shared.catalog.session import Catalog
-from shared.config.private_files import create_private_file, make_private_folder
+from shared.config.private_files import make_private_folder
 from shared.config.settings import Settings
 from shared.descriptors.backbones.trained import TrainedBackbone
 from shared.descriptors.vpr_models.checkpoint import (
@@ -39,12 +38,16 @@ from shared.jobs import Job
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.transitions import succeed_job
 from shared.storage import ObjectStore
+from shared.storage.copying import (
+    PARTIAL_SUFFIX,
+    download_object,
+    hash_file,
+    hash_object,
+    remove_stale_partials,
+)
 from shared.storage.keys import new_model_key
 
 log = logging.getLogger(__name__)
-
-COPY_BYTES = 1 << 20
-STALE_PARTIAL_SECONDS = 3600.0  # age of partial downloads whose process must have been killed
 
 
 class ModelFileCache:
@@ -71,13 +74,12 @@ class ModelFileCache:
         """
         stored_file = self._store.file(key)
         if stored_file is not None:
-            with self._store.open(key) as opened:
-                _verify_hash(opened, key, sha256)
+            _check_hash(hash_object(self._store, key)[1], key, sha256)
             return stored_file
         path = self._folder / f"{sha256}.safetensors"
         with contextlib.suppress(FileNotFoundError, Unavailable):
-            with path.open("rb") as opened:
-                _verify_hash(opened, key, sha256)
+            with path.open("rb") as file:
+                _check_hash(hash_file(file)[1], key, sha256)
             os.utime(path)  # marks it as recently used
             return path
         self._download(key, sha256, path)
@@ -86,12 +88,9 @@ class ModelFileCache:
 
     def _download(self, key: str, sha256: str, path: Path) -> None:
         make_private_folder(self._folder)
-        partial = self._folder / f"{new_id()}.partial"
+        partial = self._folder / f"{new_id()}{PARTIAL_SUFFIX}"
         try:
-            with self._store.open(key) as source, create_private_file(partial) as file:
-                _verify_hash(source, key, sha256, file)
-                file.flush()
-                os.fsync(file.fileno())
+            _check_hash(download_object(self._store, key, partial), key, sha256)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -99,15 +98,12 @@ class ModelFileCache:
 
     def _evict(self, fetched: Path) -> None:
         """Delete the least recently used files until all but `fetched` fit into the limit."""
-        stale_before = time.time() - STALE_PARTIAL_SECONDS
+        remove_stale_partials(self._folder)
         files: list[tuple[float, int, Path]] = []
         for path in self._folder.iterdir():
             with contextlib.suppress(FileNotFoundError):  # another process may evict files, too
                 stat = path.stat()
-                if path.suffix == ".partial":
-                    if stat.st_mtime < stale_before:
-                        path.unlink()
-                elif path != fetched:
+                if path != fetched and path.suffix != PARTIAL_SUFFIX:
                     files.append((stat.st_mtime, stat.st_size, path))
         remaining = self._max_bytes
         for _, size_bytes, path in sorted(files, reverse=True):
@@ -116,14 +112,8 @@ class ModelFileCache:
                 path.unlink(missing_ok=True)
 
 
-def _verify_hash(source: BinaryIO, key: str, sha256: str, copy: BinaryIO | None = None) -> None:
-    """Read `source` to its end, into `copy` if given; Unavailable if its hash differs."""
-    digest = hashlib.sha256()
-    while block := source.read(COPY_BYTES):
-        digest.update(block)
-        if copy is not None:
-            copy.write(block)
-    if digest.hexdigest() != sha256:
+def _check_hash(actual: str, key: str, sha256: str) -> None:
+    if actual != sha256:
         raise Unavailable(
             "model_corrupt",
             f"The model {key} is corrupt: its hash differs. Restore it from a "
@@ -259,11 +249,9 @@ class ModelImporter:
             yield stored_file
             return
         make_private_folder(self._folder)
-        path = self._folder / f"{new_id()}.partial"
+        path = self._folder / f"{new_id()}{PARTIAL_SUFFIX}"
         try:
-            with self._store.open(key) as source, create_private_file(path) as file:
-                while block := source.read(COPY_BYTES):
-                    file.write(block)
+            download_object(self._store, key, path)
             yield path
         except NotFound as error:
             raise _checkpoint_lost_error() from error

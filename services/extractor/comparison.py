@@ -44,13 +44,13 @@ from shared.search_api.comparison import (
     ClusterContribution,
     CompareRequest,
     CompareResult,
-    RerankCandidate,
     RerankedCandidate,
     SimilarityExplanation,
     check_explainable,
     check_rerankable,
     query_expired_error,
 )
+from shared.search_api.protocol import SearchHit
 from shared.storage import ObjectStore
 from shared.storage.keys import comparison_key, local_features_key, query_key
 
@@ -259,7 +259,7 @@ class ComparisonRunner:
         self,
         target: ResolvedGeneration,
         query: LocalFeatures,
-        candidates: Sequence[RerankCandidate],
+        candidates: Sequence[SearchHit],
         photos: Sequence[Photo],
     ) -> dict[UUID, float]:
         """Return the rerank scores of the candidates that can be read, by photo."""

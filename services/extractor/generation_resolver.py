@@ -26,7 +26,7 @@ from services.extractor.model_registry import (
 )
 from shared.catalog.base import db_now
 from shared.catalog.generations import Generation, GenerationState, active_generation
-from shared.catalog.jobs import QUERY_JOBS
+from shared.catalog.jobs import QUERY_JOBS, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import (
@@ -40,7 +40,9 @@ from shared.descriptors.vocabulary import encode_centres
 from shared.errors import Conflict, PlacewiseError
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
+from shared.jobs.transitions import fail_job, release_job
 from shared.storage import ObjectStore
 from shared.storage.keys import new_vocabulary_key
 
@@ -143,6 +145,23 @@ def _create_first_generation(
         increment_map_version(session, map_id)
     log.info("generation %s created with extractor %s", generation.id, extractor.recipe.name)
     return generation, vocabulary
+
+
+def defer_until_vocabulary(catalog: Catalog, jobs: list[Job]) -> None:
+    """Requeue claimed photos until the map has a vocabulary; fail queries."""
+    error = Conflict(
+        "no_vocabulary",
+        "The map's extractor needs a vocabulary, but the map has none yet. Fit one on its photos "
+        "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
+    )
+    with catalog.write() as session:
+        lock_map(session, jobs[0].map_id)
+        has_generation = active_generation(session, jobs[0].map_id) is not None
+        for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
+            if job.kind == JobKind.DESCRIBE and not has_generation:
+                fail_job(job, error.as_problem())
+            else:
+                release_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
 
 
 def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:

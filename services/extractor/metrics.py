@@ -20,6 +20,7 @@ from prometheus_client.registry import Collector
 from services.extractor.publish import PublishResult
 from shared.descriptors.inference import gpu_memory
 from shared.jobs import JobKind
+from shared.jobs.runner import StepOutcome
 
 METRIC_PREFIX = "placewise_extractor"
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -41,6 +42,7 @@ STAGE_BUCKETS_SECONDS = (
     120.0,
 )
 LOAD_BUCKETS_SECONDS = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+STEP_OUTCOME_LABELS = {StepOutcome.INTERRUPTED: "given_back", StepOutcome.FAILED: "refused"}
 
 
 class ExtractorMetrics:
@@ -93,6 +95,11 @@ class ExtractorMetrics:
     def count_outcome(self, kind: JobKind, outcome: str, jobs: int = 1) -> None:
         """Count jobs with an outcome."""
         self._jobs.labels(kind, outcome).inc(jobs)
+
+    def count_step_outcome(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
+        """Count the jobs of a step that was not done; `observe_batch` counts the others."""
+        if outcome != StepOutcome.DONE:
+            self.count_outcome(kind, STEP_OUTCOME_LABELS.get(outcome, outcome), jobs)
 
     def observe_batch(
         self, kind: JobKind, outcome: PublishResult, seconds: dict[str, float]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Hashable, ValuesView
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 from uuid import UUID
+from weakref import WeakValueDictionary
 
 import torch
+from cachetools import LRUCache
 from sqlalchemy.orm import Session
 
 from shared.catalog.generations import Generation
@@ -25,34 +27,6 @@ from shared.descriptors.vocabulary import ClusterCentres, decode_centres
 from shared.errors import Unavailable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.storage import ObjectStore
-
-Key = TypeVar("Key", bound=Hashable)
-Value = TypeVar("Value")
-
-
-class LruCache(Generic[Key, Value]):
-    """Least-recently-used cache of at most `max_size` values, at least one; not thread-safe.
-
-    Unlike `cachetools.LRUCache`, iterating over `values` does not count as a use.
-    """
-
-    def __init__(self, max_size: int) -> None:
-        self._max_size = max_size
-        self._values: OrderedDict[Key, Value] = OrderedDict()
-
-    def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """Return the key's value, computed by `make` if absent; errors of `make` propagate."""
-        if key not in self._values:
-            self._values[key] = make()
-        self._values.move_to_end(key)
-        while len(self._values) > self._max_size:
-            self._values.popitem(last=False)
-        return self._values[key]
-
-    def values(self) -> ValuesView[Value]:
-        """The cached values; reading them does not count as a use."""
-        return self._values.values()
-
 
 LoadAddedModel = Callable[[str, torch.device], Backbone]
 
@@ -99,13 +73,15 @@ class ModelRegistry:
         self._settings = settings
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
-        self._extractors: LruCache[str, Extractor] = LruCache(MAX_EXTRACTORS)
+        self._extractors: LRUCache[str, Extractor] = LRUCache(MAX_EXTRACTORS)
+        # Extractors with the same local features share a backbone.
+        self._backbones: WeakValueDictionary[object, Backbone] = WeakValueDictionary()
         # Kept beyond eviction, so that a reloaded model does not run out of memory again.
         self._pass_limits: defaultdict[tuple[object, ...], BatchSizeLimit] = defaultdict(
             BatchSizeLimit
         )
-        self._centres: LruCache[UUID, ClusterCentres] = LruCache(MAX_VOCABULARIES)
-        self._projections: LruCache[UUID, PcaProjection] = LruCache(MAX_WHITENINGS)
+        self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)
+        self._projections: LRUCache[UUID, PcaProjection] = LRUCache(MAX_WHITENINGS)
 
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """Return the extractor called `name` with its weights loaded.
@@ -115,12 +91,13 @@ class ModelRegistry:
             precision: Precision of an existing generation (see `extractor_of_generation`); by
                 default that of new generations, PRECISION.
         """
-        recipe = self._settings.recipe(name)
+        recipe = self._settings.extractor_config(name)
         if precision is None:
             precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
-            extractor = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
-            return extractor.at(precision)
+            if recipe.name not in self._extractors:
+                self._extractors[recipe.name] = self._load(recipe, precision)
+            return self._extractors[recipe.name].with_precision(precision)
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
         """Return the generation's extractor in the precision that the generation was created with.
@@ -143,15 +120,11 @@ class ModelRegistry:
 
     def _load(self, recipe: ExtractorConfig, precision: Precision) -> Extractor:
         limit = self._pass_limits[recipe.local_features]
-        for loaded in self._extractors.values():
-            if loaded.recipe.local_features == recipe.local_features:
-                return Extractor(
-                    recipe,
-                    self._device,
-                    precision=precision,
-                    backbone=loaded.backbone,
-                    limit=limit,
-                )
+        shared_backbone = self._backbones.get(recipe.local_features)
+        if shared_backbone is not None:
+            return Extractor(
+                recipe, self._device, precision=precision, backbone=shared_backbone, limit=limit
+            )
         added = recipe.trained.registered if recipe.trained else None
         started = time.perf_counter()
         extractor = Extractor(
@@ -162,6 +135,7 @@ class ModelRegistry:
             backbone=self._load_added(added, self._device) if added else None,
             limit=limit,
         )
+        self._backbones[recipe.local_features] = extractor.backbone
         if self._device.type == "cuda":
             extractor.warm_up(self._settings.batch_photos)
         self._on_load(time.perf_counter() - started)
@@ -170,7 +144,9 @@ class ModelRegistry:
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """Return the vocabulary's centres, verified against the catalog's hash."""
         with self._lock:
-            return self._centres.get(vocabulary.id, lambda: self._read_centres(vocabulary))
+            if vocabulary.id not in self._centres:
+                self._centres[vocabulary.id] = self._read_centres(vocabulary)
+            return self._centres[vocabulary.id]
 
     def _read_centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         centres = decode_centres(self._store.get(vocabulary.object_key))
@@ -185,7 +161,9 @@ class ModelRegistry:
     def projection(self, whitening: StoredWhitening) -> PcaProjection:
         """Return the PCA projection on the device, verified against the catalog's hash."""
         with self._lock:
-            return self._projections.get(whitening.id, lambda: self._read_projection(whitening))
+            if whitening.id not in self._projections:
+                self._projections[whitening.id] = self._read_projection(whitening)
+            return self._projections[whitening.id]
 
     def _read_projection(self, whitening: StoredWhitening) -> PcaProjection:
         stored = decode_whitening(self._store.get(whitening.object_key))

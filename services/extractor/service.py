@@ -16,12 +16,9 @@ from typing import Any
 
 from celery import signals
 from prometheus_client import CollectorRegistry
-from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.failures import UNAVAILABLE_RETRY_SECONDS
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.database_errors import OutageLog
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
@@ -55,19 +52,12 @@ def serve_extractor(
     heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
 
-    outage = OutageLog("extractor")
-
     def drain() -> dict[str, Any]:
-        try:
-            result = worker.drain(stop, settings.drain_seconds)
-        except SQLAlchemyError as error:
-            outage.record_error(error)
-            stop.wait(UNAVAILABLE_RETRY_SECONDS)
-            wakeups.send(WakeupQueue.BULK)  # the queued jobs are still to be processed
-            return DrainStats().as_dict()
-        outage.record_success()
+        result = worker.drain_once(stop, settings.drain_seconds)
+        if result is None:
+            result = DrainStats(interrupted=True)
         if result.interrupted and not stop.is_set():
-            wakeups.send(WakeupQueue.BULK)
+            wakeups.send(WakeupQueue.BULK)  # for the jobs that are still queued
         elif result.claimed:
             log.info("drained: %s", result.as_dict())
         return result.as_dict()

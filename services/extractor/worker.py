@@ -25,29 +25,28 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from uuid import UUID
 
 from prometheus_client import CollectorRegistry
-from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.comparison import ComparisonRunner, PreparedComparison
 from services.extractor.decoder_pool import DecoderPool
-from services.extractor.failures import UNAVAILABLE_RETRY_SECONDS, JobFailureHandler
-from services.extractor.generation_resolver import reindex_outdated_generations, resolve_generation
+from services.extractor.generation_resolver import (
+    defer_until_vocabulary,
+    reindex_outdated_generations,
+    resolve_generation,
+)
 from services.extractor.metrics import DrainStats, ExtractorMetrics
 from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
-from shared.catalog.database_errors import OutageLog
 from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.jobs import InProcessWakeups, Job, Priority, claim_jobs, maintain_lease, mark_started
-from shared.jobs.claim import has_claimable_jobs
-from shared.jobs.leases import get_lease_token
+from shared.jobs import InProcessWakeups, Job, Priority, mark_started
+from shared.jobs.runner import ClaimedJobs, JobRunner
 from shared.jobs.trace_context import job_trace_context
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows
@@ -56,22 +55,15 @@ from shared.telemetry.heartbeat import Heartbeat
 log = logging.getLogger(__name__)
 
 QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is described
-IDLE_POLL_SECONDS = 1.0  # polling interval when idle: the delay that a lost wakeup costs
 
 
 @dataclass(slots=True)
-class ClaimedJobs:
-    """Claimed jobs, the lease on them, and the pending decoding of their photos."""
+class ExtractorBatch(ClaimedJobs):
+    """Claimed jobs, and the pending decoding of their photos."""
 
-    jobs: list[Job]
-    lease: contextlib.ExitStack
-    preparation: Future[DescribeBatch | PreparedComparison | None] | None
+    preparation: Future[DescribeBatch | PreparedComparison | None] | None = None
     """A result of None means that the map has no vocabulary yet. The future itself is None for a
     step of a model change and for the import of a checkpoint."""
-
-    @property
-    def token(self) -> UUID:
-        return get_lease_token(self.jobs[0])
 
 
 class ExtractorWorker:
@@ -106,7 +98,6 @@ class ExtractorWorker:
         self._store = store
         self._settings = settings
         self._heartbeat = Heartbeat(settings.heartbeat_file)
-        self._name = name
         self._only_worker = only_worker
         added = AddedModelLoader(catalog, store, settings)
         self._models = ModelRegistry(store, settings, added.load, self._metrics.observe_model_load)
@@ -115,7 +106,9 @@ class ExtractorWorker:
             catalog, store, self._models, self._decoders, settings
         )
         self._comparisons = ComparisonRunner(catalog, store, self._models, self._decoders, settings)
-        self._failures = JobFailureHandler(catalog, settings.max_attempts, self._metrics)
+        self._runner = JobRunner(
+            catalog, settings, name, EXTRACTOR_JOBS, self._metrics.count_step_outcome
+        )
         # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -135,19 +128,18 @@ class ExtractorWorker:
     def run(self, stop: threading.Event, hints: InProcessWakeups) -> None:
         """Drain whenever there is work, until `stop` is set; used by the embedded worker."""
         self.warm_up()
-        outage = OutageLog("extractor")
-        while not stop.is_set():
-            try:
-                result = self.drain(stop)
-            except SQLAlchemyError as error:
-                outage.record_error(error)
-                stop.wait(UNAVAILABLE_RETRY_SECONDS)
-                continue
-            outage.record_success()
+
+        def drain() -> bool:
+            result = self.drain(stop)
             if result.claimed:
                 log.info("drained: %s", result.as_dict())
-            else:
-                hints.wait(IDLE_POLL_SECONDS)
+            return result.claimed > 0
+
+        self._runner.run(drain, stop, hints.wait)
+
+    def drain_once(self, stop: threading.Event, seconds: float) -> DrainStats | None:
+        """Drain as `drain` does; pause and return None if the catalog was unavailable."""
+        return self._runner.run_once(lambda: self.drain(stop, seconds), stop)
 
     def close(self) -> None:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
@@ -166,10 +158,10 @@ class ExtractorWorker:
         return result
 
     def _drain(
-        self, first: ClaimedJobs, stop: threading.Event, until: float, result: DrainStats
+        self, first: ExtractorBatch, stop: threading.Event, until: float, result: DrainStats
     ) -> None:
-        current: ClaimedJobs | None = None
-        upcoming: ClaimedJobs | None = first
+        current: ExtractorBatch | None = None
+        upcoming: ExtractorBatch | None = first
 
         def out_of_time() -> bool:
             return stop.is_set() or time.monotonic() > until
@@ -178,7 +170,7 @@ class ExtractorWorker:
             while upcoming is not None:
                 if out_of_time():
                     with upcoming.lease:
-                        self._failures.release_unstarted(upcoming.jobs)
+                        self._runner.release(upcoming)
                     result.interrupted = True
                     break
                 current = upcoming
@@ -201,7 +193,7 @@ class ExtractorWorker:
             self._wait_for_publish(result)
 
     def _process_in_order(
-        self, work: ClaimedJobs, result: DrainStats, stop: threading.Event
+        self, work: ExtractorBatch, result: DrainStats, stop: threading.Event
     ) -> None:
         if _runs_exclusively(work):
             self._wait_for_publish(result)
@@ -229,13 +221,9 @@ class ExtractorWorker:
         self, done: threading.Event, stop: threading.Event, result: DrainStats
     ) -> None:
         while not (done.is_set() or stop.is_set()):
-            with self._catalog.read() as session:
-                has_queries = has_claimable_jobs(
-                    session, EXTRACTOR_JOBS, Priority.QUERY, alone=False
-                )
             query = (
                 self._claim_next(result, min_priority=Priority.QUERY, alone=False)
-                if has_queries
+                if self._runner.has_jobs(Priority.QUERY, alone=False)
                 else None
             )
             if query is None:
@@ -245,29 +233,21 @@ class ExtractorWorker:
 
     def _claim_next(
         self, result: DrainStats, min_priority: int | None = None, *, alone: bool = True
-    ) -> ClaimedJobs | None:
-        settings = self._settings
+    ) -> ExtractorBatch | None:
         self._heartbeat.beat()  # for each batch: a drain may last for several
-        with self._catalog.write() as session:
-            jobs = claim_jobs(
-                session,
-                worker=self._name,
-                limit=settings.batch_photos,
-                lease_seconds=settings.lease_seconds,
-                min_priority=min_priority,
-                alone=alone,
-                started=False,
-            )
-        if not jobs:
+        claimed = self._runner.claim(
+            self._settings.batch_photos, min_priority, alone=alone, started=False
+        )
+        if claimed is None:
             return None
-        self._metrics.observe_claim(JobKind(jobs[0].kind), len(jobs))
+        jobs = claimed.jobs
+        self._metrics.observe_claim(claimed.kind, len(jobs))
         result.claimed += len(jobs)
         result.maps.add(str(jobs[0].map_id))
-        work = ClaimedJobs(jobs, contextlib.ExitStack(), None)
-        work.lease.enter_context(maintain_lease(self._catalog, work.token, settings.lease_seconds))
-        if jobs[0].kind == JobKind.COMPARE:
+        work = ExtractorBatch(jobs, claimed.lease)
+        if claimed.kind == JobKind.COMPARE:
             work.preparation = self._prepare_executor.submit(self._comparisons.prepare, jobs[0])
-        elif jobs[0].kind not in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS):
+        elif claimed.kind not in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS):
             work.preparation = self._prepare_executor.submit(self._prepare, jobs)
         return work
 
@@ -280,7 +260,7 @@ class ExtractorWorker:
 
     def _process(
         self,
-        work: ClaimedJobs,
+        work: ExtractorBatch,
         result: DrainStats,
         concurrent_jobs: int = 0,
         *,
@@ -309,13 +289,10 @@ class ExtractorWorker:
             )
 
     def _describe_claimed(
-        self, work: ClaimedJobs, result: DrainStats, concurrent_jobs: int
+        self, work: ExtractorBatch, result: DrainStats, concurrent_jobs: int
     ) -> Rows | None:
         """Return a row for each job of the batch's `ready`; None if there is nothing to publish."""
-        with (
-            job_trace_context(work.jobs, "describe"),
-            self._failures.handling_failures(work.jobs, result),
-        ):
+        with self._step(work, "describe", result):
             if work.preparation is None:
                 started = time.perf_counter()
                 self._mark_begun(work)
@@ -326,7 +303,8 @@ class ExtractorWorker:
                 return None
             batch = work.preparation.result()
             if batch is None:
-                self._failures.defer_until_vocabulary(work.jobs)
+                defer_until_vocabulary(self._catalog, work.jobs)
+                self._metrics.count_outcome(work.kind, "waiting", len(work.jobs))
                 return None
             self._mark_begun(work, concurrent_jobs)
             if isinstance(batch, PreparedComparison):
@@ -335,11 +313,14 @@ class ExtractorWorker:
             return describe_batch(batch)
         return None  # the failure has been handled
 
-    def _publish(self, work: ClaimedJobs, rows: Rows, result: DrainStats) -> None:
-        with (
-            job_trace_context(work.jobs, "publish"),
-            self._failures.handling_failures(work.jobs, result),
-        ):
+    @contextlib.contextmanager
+    def _step(self, work: ExtractorBatch, name: str, result: DrainStats) -> Iterator[None]:
+        with self._runner.step(work, name):
+            yield
+        result.failed += work.failed
+
+    def _publish(self, work: ExtractorBatch, rows: Rows, result: DrainStats) -> None:
+        with self._step(work, "publish", result):
             batch = work.preparation.result() if work.preparation else None
             assert isinstance(batch, DescribeBatch), "only described batches are published"
             outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
@@ -347,15 +328,15 @@ class ExtractorWorker:
 
     def _record_outcome(
         self,
-        work: ClaimedJobs,
+        work: ExtractorBatch,
         result: DrainStats,
         outcome: PublishResult,
         seconds: dict[str, float],
     ) -> None:
         result.add_batch(outcome, seconds)
-        self._metrics.observe_batch(JobKind(work.jobs[0].kind), outcome, seconds)
+        self._metrics.observe_batch(work.kind, outcome, seconds)
 
-    def _publish_in_background(self, work: ClaimedJobs, rows: Rows) -> DrainStats:
+    def _publish_in_background(self, work: ExtractorBatch, rows: Rows) -> DrainStats:
         result = DrainStats()
         with work.lease:
             self._publish(work, rows, result)
@@ -367,7 +348,7 @@ class ExtractorWorker:
         if pending is not None:
             result.merge(pending.result())
 
-    def _mark_begun(self, work: ClaimedJobs, concurrent_jobs: int = 0) -> None:
+    def _mark_begun(self, work: ExtractorBatch, concurrent_jobs: int = 0) -> None:
         """Record that jobs have started: from here on a crash may be caused by a photo.
 
         Decoding runs in other processes and is finished.
@@ -376,11 +357,11 @@ class ExtractorWorker:
             mark_started(session, work.token, len(work.jobs) + concurrent_jobs)
 
 
-def _is_query(work: ClaimedJobs) -> bool:
+def _is_query(work: ExtractorBatch) -> bool:
     return work.jobs[0].priority >= Priority.QUERY
 
 
-def _runs_exclusively(work: ClaimedJobs) -> bool:
+def _runs_exclusively(work: ExtractorBatch) -> bool:
     """Whether nothing may run concurrently, so that a crash can be attributed to the job.
 
     Steps of model changes come as a batch of one job and run exclusively, too.

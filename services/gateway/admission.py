@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
-import time
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Annotated
@@ -26,21 +25,85 @@ from uuid import UUID
 from fastapi import Depends, Request
 
 from services.gateway.authentication import Caller, get_caller
-from services.gateway.concurrency import ConcurrencyLimit
-from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName
+from services.gateway.dependencies import GatewayDep, get_map_name
+from services.http_connections import address_group
 from shared.catalog.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ingest.store_photo import PhotoQuota
-from shared.jobs.queue_depth import QueueDepth, measure_queue_depth
+from shared.jobs.queue_depth import PolledValue, QueueDepth, measure_queue_depth
 
 ADMISSION_POLL_SECONDS = 1.0
-POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
 RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share of its limit
 MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
+
+
+class ConcurrencyLimit:
+    """Limits concurrent requests of one kind. Must be used on the event loop only."""
+
+    def __init__(
+        self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
+    ) -> None:
+        """Creates the limit.
+
+        Args:
+            what: Names the requests, and the settings of both limits, in error messages.
+            code: Error code of the refusal.
+            total: Limit for all callers together.
+            per_caller: Limit for one API key, and for one client address.
+            retry_after_seconds: Sent as `Retry-After`.
+        """
+        self._what = what
+        self._code = code
+        self._total = total
+        self._per_caller = per_caller
+        self._retry_after_seconds = retry_after_seconds
+        self._count_by_caller: Counter[str] = Counter()
+        self.count = 0
+
+    @contextlib.contextmanager
+    def hold(self, request: Request) -> Iterator[None]:
+        """Counts the request while the block runs.
+
+        Raises:
+            TooManyRequests: The total limit or the limit of the caller is reached.
+        """
+        callers = _callers(request)
+        if self.count >= self._total:
+            raise self._refusal(f"The server is already handling {self._total} {self._what}.")
+        for caller in callers:
+            if self._count_by_caller[caller] >= self._per_caller:
+                raise self._refusal(
+                    f"The server is already handling {self._per_caller} {self._what} of this "
+                    f"{caller.partition(' ')[0]}."
+                )
+        self.count += 1
+        self._count_by_caller.update(callers)
+        try:
+            yield
+        finally:
+            self.count -= 1
+            self._count_by_caller.subtract(callers)
+            self._count_by_caller += Counter()  # removes callers whose count is 0
+
+    def _refusal(self, detail: str) -> TooManyRequests:
+        return TooManyRequests(
+            self._code,
+            f"{detail} Try again in a moment.",
+            retry_after_seconds=self._retry_after_seconds,
+        )
+
+
+def _callers(request: Request) -> list[str]:
+    """The request's key and address. ADMIN_KEY has no key id, so it is counted by address only."""
+    key_id = get_caller(request).key_id
+    callers = [] if key_id is None else [f"key {key_id}"]
+    if request.client is not None:
+        callers.append(f"address {address_group(request.client.host)}")
+    return callers
 
 
 class UploadKind(StrEnum):
@@ -59,9 +122,7 @@ class AdmissionControl:
         self._catalog = catalog
         self._settings = settings
         self.disk = DiskSpace(settings)
-        self._refresh_lock = threading.Lock()
-        self._queue_depth: QueueDepth | None = None
-        self._next_refresh = 0.0
+        self._queue_depth = PolledValue(self._measure_queue_depth, ADMISSION_POLL_SECONDS)
         self._admitted: Counter[str | None] = Counter()  # since the last poll; None: queries
         self._active_uploads = {
             kind: ConcurrencyLimit(
@@ -137,26 +198,13 @@ class AdmissionControl:
 
     def queue_depth(self) -> QueueDepth:
         """Returns the depth of the queue, at most about a second old."""
-        # While another thread polls, the previous result is used.
-        due = self._queue_depth is None or time.monotonic() >= self._next_refresh
-        if due and self._refresh_lock.acquire(blocking=self._queue_depth is None):
-            try:
-                self._refresh()
-            finally:
-                self._refresh_lock.release()
-        assert self._queue_depth is not None
-        return self._queue_depth
+        return self._queue_depth.get()
 
-    def _refresh(self) -> None:
-        started = time.monotonic()
-        if self._queue_depth is not None and started < self._next_refresh:
-            return  # another thread has polled while this one waited for the lock
+    def _measure_queue_depth(self) -> QueueDepth:
         limit = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
         self._admitted.clear()  # before the poll: a job may be counted twice, but is never missed
         with self._catalog.read() as session:
-            self._queue_depth = measure_queue_depth(session, limit)
-        elapsed = time.monotonic() - started
-        self._next_refresh = started + max(ADMISSION_POLL_SECONDS, POLL_COST_DIVISOR * elapsed)
+            return measure_queue_depth(session, limit)
 
 
 def get_admission_control(request: Request) -> AdmissionControl:
@@ -168,8 +216,8 @@ def get_admission_control(request: Request) -> AdmissionControl:
 AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
 
 
-def _admit_job(admission: AdmissionDep, map_name: MapName = DEFAULT_MAP) -> None:
-    admission.admit_job(map_name)
+def _admit_job(request: Request, admission: AdmissionDep) -> None:
+    admission.admit_job(get_map_name(request))
 
 
 def _admit_query(admission: AdmissionDep) -> None:

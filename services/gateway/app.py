@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from fastapi import Depends, FastAPI
+from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
 from services.gateway import metrics
 from services.gateway.admission import AdmissionControl
 from services.gateway.authentication import READ, AuthenticationMiddleware, check_declared_scopes
-from services.gateway.dependencies import (
-    API_PREFIX,
-    GatewayContext,
-    reject_unknown_query_parameters,
-)
+from services.gateway.dependencies import API_PREFIX, GatewayContext
 from services.gateway.idempotency import IdempotentReplay, replay_response
 from services.gateway.metrics import GatewayMetrics
 from services.gateway.middleware import (
@@ -118,12 +114,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         health,
     ):
         check_declared_scopes(module.router)
-        app.include_router(
-            module.router,
-            prefix=API_PREFIX,
-            responses=AUTHENTICATION_RESPONSES,
-            dependencies=[Depends(reject_unknown_query_parameters)],
-        )
+        app.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)
     app.include_router(health.probe_router)
     app.include_router(metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ])
     app.include_router(create_web_page_router(gateway.settings))

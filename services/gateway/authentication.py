@@ -13,13 +13,13 @@ from __future__ import annotations
 import hmac
 import logging
 import re
-import time
 from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 from uuid import UUID
 
+from cachetools import TTLCache
 from fastapi import APIRouter, Request, Security
 from fastapi.params import Security as SecurityParameter
 from fastapi.routing import APIRoute
@@ -51,7 +51,7 @@ HOW_TO_AUTHENTICATE = (
 )
 # Headers that proxies add (RFC 9110, RFC 7239, and the de facto ones before them).
 FORWARDED = ("Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP")
-MAX_REMEMBERED_USES = 10_000  # keys whose last use is cached; the cache is cleared when full
+MAX_REMEMBERED_USES = 10_000  # keys whose last use was recorded lately
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,9 @@ class ApiKeyAuthenticator:
         """`admin_sha256` are hexadecimal hashes of admin keys (`hash_api_key`)."""
         self._catalog = catalog
         self._admins = admin_sha256
-        self._use_recorded_at: dict[UUID, float] = {}
+        self._recently_recorded: TTLCache[UUID, bool] = TTLCache(
+            MAX_REMEMBERED_USES, LAST_USED_RESOLUTION_SECONDS
+        )
 
     async def authenticate(self, headers: Headers) -> Caller:
         key_sha256 = hash_api_key(parse_bearer(headers.get("authorization")))
@@ -177,16 +179,10 @@ class ApiKeyAuthenticator:
 
     async def record_use(self, caller: Caller) -> None:
         """Updates `last_used_at` at most once a minute per key; errors are only logged."""
-        key_id, now = caller.key_id, time.monotonic()
-        if (
-            key_id is None
-            or now - self._use_recorded_at.get(key_id, -LAST_USED_RESOLUTION_SECONDS)
-            < LAST_USED_RESOLUTION_SECONDS
-        ):
+        key_id = caller.key_id
+        if key_id is None or key_id in self._recently_recorded:
             return
-        if len(self._use_recorded_at) >= MAX_REMEMBERED_USES:
-            self._use_recorded_at.clear()
-        self._use_recorded_at[key_id] = now
+        self._recently_recorded[key_id] = True
         try:
             await run_in_threadpool(self._write_use, key_id)
         except SQLAlchemyError as error:
@@ -212,16 +208,7 @@ def parse_bearer(authorization: str | None) -> str:
 
 
 # Health probes, the web page and the API documentation: none of them exposes stored data.
-PUBLIC_PATHS = frozenset(
-    {
-        "/",
-        "/livez",
-        "/readyz",
-        "/docs",
-        "/redoc",
-        "/openapi.json",
-    }
-)
+PUBLIC_PATHS = frozenset({"/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"})
 PUBLIC_PATH_PREFIX = "/console/"  # assets of the web page, where the user enters the key
 
 # For the OpenAPI schema only: `AuthenticationMiddleware` checks the key, before routing.

@@ -2,9 +2,6 @@
 
 `JobNotifier` implements long polling (`Prefer: wait=N`, `?wait=N`) and the event streams. It polls
 the job table once for all waiting requests, so it can poll often without loading the database.
-
-`reject_unknown_query_parameters` refuses misspelt query parameters: FastAPI ignores them, and a
-misspelt filter would match every photo.
 """
 
 from __future__ import annotations
@@ -13,16 +10,14 @@ import asyncio
 import math
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, TypeVar
 from uuid import UUID
 
 from fastapi import Depends, Query, Request
-from fastapi.openapi.utils import get_openapi
-from fastapi.routing import APIRoute
 from prometheus_client import CollectorRegistry
-from pydantic import BeforeValidator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
@@ -32,7 +27,7 @@ from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
-from shared.errors import NotFound, invalid_field_error
+from shared.errors import NotFound, PlacewiseError, invalid_field_error
 from shared.jobs import Job, Wakeups
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
@@ -209,6 +204,14 @@ API_PREFIX = "/api/v1"
 NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL's text type can't store NUL
 
 
+class _HasId(Protocol):
+    @property
+    def id(self) -> Any: ...
+
+
+Row = TypeVar("Row", bound=_HasId)
+
+
 @dataclass(frozen=True, slots=True)
 class GatewayContext:
     """The stores, clients and settings that the routes use."""
@@ -246,29 +249,63 @@ def _uuid_or_not_found(noun: str):  # type: ignore[no-untyped-def]
     return BeforeValidator(parse)
 
 
-def parse_cursor(cursor: str | None) -> UUID | None:
-    """Parses the cursor of a page: the id of the last row of the previous page.
+class MapParams(BaseModel):
+    """Query parameters of an endpoint; subclasses add theirs.
 
-    Raises:
-        Unprocessable: `invalid_field`, if `cursor` is not a UUID.
+    Unknown parameters are refused: a misspelt filter would match every photo. Clients send `map`
+    with every request, so it is accepted everywhere.
     """
-    try:
-        return UUID(cursor) if cursor else None
-    except ValueError:
-        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned") from None
 
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
-GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
-MapName = Annotated[
-    str,
-    Query(
-        alias="map",
+    map: str = Field(
+        DEFAULT_MAP,
         description="The map to use.",
         min_length=1,
         max_length=100,
         pattern=NO_NUL_PATTERN,
-    ),
-]
+    )
+
+
+class PageParams(MapParams):
+    """Query parameters of a list that is returned in pages, newest first."""
+
+    limit: int = Field(50, ge=1, le=1000)
+    cursor: str | None = Field(None, description="`next_cursor` of the previous page")
+
+    @property
+    def before(self) -> UUID | None:
+        """The id of the last row of the previous page; 422 (`invalid_field`) if it is malformed."""
+        try:
+            return UUID(self.cursor) if self.cursor else None
+        except ValueError:
+            raise invalid_cursor_error() from None
+
+    def split(self, rows: list[Row]) -> tuple[list[Row], str | None]:
+        """Splits up to `limit + 1` rows into the page and the cursor of the next one, if any."""
+        page = rows[: self.limit]
+        return page, str(page[-1].id) if len(rows) > self.limit else None
+
+
+def invalid_cursor_error() -> PlacewiseError:
+    """Builds the 422 error for a malformed cursor."""
+    return invalid_field_error("cursor", "is not a cursor that this endpoint returned")
+
+
+def get_map_name(request: Request) -> str:
+    """Returns the name of the request's map, for dependencies; routes declare `MapParams`."""
+    return request.query_params.get("map", DEFAULT_MAP)
+
+
+def _accept_no_parameters(_params: Annotated[MapParams, Query(include_in_schema=False)]) -> None:
+    pass
+
+
+MapQuery = Annotated[MapParams, Query()]
+PageQuery = Annotated[PageParams, Query()]
+NO_PARAMETERS = Depends(_accept_no_parameters)
+"""Dependency of endpoints that use no query parameters."""
+GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
 FileId = Annotated[UUID, _uuid_or_not_found("photo")]
 UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
 JobId = Annotated[UUID, _uuid_or_not_found("job")]
@@ -293,62 +330,3 @@ async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) ->
     """Waits at most `seconds` for the end of the job; returns None if the job was deleted."""
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
     return await run_in_threadpool(load_job, gateway, job_id)
-
-
-# Clients send `map` with every request, also to the few endpoints that do not use it.
-ALWAYS_ALLOWED = frozenset({"map"})
-
-# Cached by endpoint function and method: generating the OpenAPI operation takes about 10 ms.
-_documented_by_route: dict[tuple[Callable[..., Any], str], frozenset[str] | None] = {}
-
-
-async def reject_unknown_query_parameters(request: Request) -> None:
-    """Dependency that rejects query parameters that the OpenAPI operation does not declare.
-
-    Raises:
-        Unprocessable: `invalid_field`, with the name of the unknown parameter.
-    """
-    if not request.query_params:
-        return
-    route: APIRoute = request.scope["route"]
-    operation = route.endpoint, request.method.lower()
-    if operation not in _documented_by_route:
-        _documented_by_route[operation] = _documented_parameters(route, request.method.lower())
-    known = _documented_by_route[operation]
-    if known is None:  # such as HEAD, which the OpenAPI schema leaves out
-        return
-    for name in request.query_params:
-        if name not in known:
-            raise invalid_field_error(
-                name, f"is unknown; this endpoint takes {', '.join(sorted(known))}"
-            )
-
-
-def _documented_parameters(route: APIRoute, method: str) -> frozenset[str] | None:
-    """The query parameters of the operation; None if the OpenAPI schema does not contain it."""
-    paths = get_openapi(title="", version="", routes=[route])["paths"]
-    operation = paths.get(route.path_format, {}).get(method)
-    if operation is None:
-        return None
-    return ALWAYS_ALLOWED | {
-        parameter["name"]
-        for parameter in operation.get("parameters", ())
-        if parameter["in"] == "query"
-    }
-
-
-__all__ = [
-    "API_PREFIX",
-    "DEFAULT_MAP",
-    "NO_NUL_PATTERN",
-    "FileId",
-    "GatewayContext",
-    "GatewayDep",
-    "GenerationId",
-    "JobId",
-    "KeyId",
-    "MapName",
-    "UploadId",
-    "WebhookId",
-    "parse_cursor",
-]

@@ -8,6 +8,8 @@ dependency, and by storing its response in the transaction that executes the req
             ...
             idempotent.store_response(session, 201, response)
 
+and `idempotent.accept_job(session, job)` stores and returns the 202 of a job.
+
 The content of a multipart form is known only after it has been received: its routes use
 `IdempotentFormDep`, and `await idempotent.claim_form(gateway.store, received)` after
 `store_form_file`.
@@ -23,7 +25,7 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any
 from uuid import UUID
 
@@ -33,8 +35,8 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import get_caller
-from services.gateway.dependencies import DEFAULT_MAP, GatewayContext, GatewayDep
-from services.gateway.schemas import to_job_accepted
+from services.gateway.dependencies import GatewayContext, GatewayDep, get_map_name
+from services.gateway.schemas import JobAcceptedResponse, accepted_headers, to_job_accepted
 from shared.catalog.idempotency import (
     RequestIdentity,
     StoredResponse,
@@ -86,15 +88,18 @@ async def replay_response(request: Request, replay: Exception) -> Response:
 
 
 class IdempotentRequest:
-    """A request with an `Idempotency-Key`; without the header, all methods do nothing."""
+    """A request with an `Idempotency-Key`; without the header, nothing is claimed or stored."""
 
-    def __init__(self, gateway: GatewayContext, request: Request, key: str | None) -> None:
+    def __init__(
+        self, gateway: GatewayContext, request: Request, response: Response, key: str | None
+    ) -> None:
         if key is not None and not re.fullmatch(IDEMPOTENCY_KEY_PATTERN, key):
             raise invalid_field_error(
                 IDEMPOTENCY_HEADER, "must have 1 to 255 printable ASCII characters without spaces"
             )
         self._gateway = gateway
         self._request = request
+        self._response = response
         self._key = key
         self._token: UUID | None = None
         self._response_stored = False
@@ -106,12 +111,13 @@ class IdempotentRequest:
 
         Deletes the received file from `store` if the request is refused or was already executed.
         """
-        content = [received.filename, received.sha256, received.fields]
-        try:
-            await run_in_threadpool(self.claim_key, content, life_seconds)
-        except (PlacewiseError, IdempotentReplay):
-            await run_in_threadpool(store.delete, received.key)
-            raise
+
+        def claim() -> None:
+            content = [received.filename, received.sha256, received.fields]
+            with delete_if_refused(store, received.key):
+                self.claim_key(content, life_seconds)
+
+        await run_in_threadpool(claim)
 
     def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
         """Claims the key: from here on only this request is executed under it.
@@ -150,11 +156,7 @@ class IdempotentRequest:
         self._token = claimed
 
     def store_response(
-        self,
-        session: Session,
-        status: int,
-        body: BaseModel,
-        headers: dict[str, str] | None = None,
+        self, session: Session, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """Stores the response, in the transaction that executes the request.
 
@@ -165,12 +167,19 @@ class IdempotentRequest:
             store_response(session, self._token, stored)
             self._response_stored = True
 
-    def store_job_response(self, session: Session, job: Job) -> None:
-        """Stores the 202 response for a job that this transaction queues."""
-        accepted = to_job_accepted(job, _map_name(self._request))
-        self.store_response(
-            session, 202, accepted, {"Location": accepted.status_url, "Retry-After": "1"}
-        )
+    def store_job_response(self, session: Session, job: Job) -> JobAcceptedResponse:
+        """Adds a job to the transaction, and stores and returns its 202 response."""
+        session.add(job)
+        session.flush()
+        accepted = to_job_accepted(job, get_map_name(self._request))
+        self.store_response(session, 202, accepted, accepted_headers(accepted.status_url))
+        return accepted
+
+    def accept_job(self, session: Session, job: Job) -> JobAcceptedResponse:
+        """As `store_job_response`, and sets the headers of this request's response."""
+        accepted = self.store_job_response(session, job)
+        self._response.headers.update(accepted_headers(accepted.status_url))
+        return accepted
 
     def replace_response(
         self, status: int, body: BaseModel, headers: dict[str, str] | None = None
@@ -203,11 +212,24 @@ class IdempotentRequest:
                 release_idempotency_key(session, self._token)
 
 
+@contextlib.contextmanager
+def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
+    """Deletes a received object if the block refuses the request, or replays a response.
+
+    Not for other exceptions: after a lost connection the row may have been committed.
+    """
+    try:
+        yield
+    except (PlacewiseError, IdempotentReplay):
+        store.delete(key)
+        raise
+
+
 async def idempotent_form_request(
-    request: Request, gateway: GatewayDep, key: IdempotencyKeyHeader = None
+    request: Request, response: Response, gateway: GatewayDep, key: IdempotencyKeyHeader = None
 ) -> AsyncIterator[IdempotentRequest]:
     """Dependency for streamed bodies: the route calls `claim_form` or `claim_key` itself."""
-    idempotent = IdempotentRequest(gateway, request, key)
+    idempotent = IdempotentRequest(gateway, request, response, key)
     try:
         yield idempotent
     except PlacewiseError as error:
@@ -228,12 +250,8 @@ async def idempotent_request(
 
 def _key_scope(request: Request) -> str:
     """Namespace of the idempotency key: the caller and the map, hashed."""
-    scope = [get_caller(request).identity, _map_name(request)]
+    scope = [get_caller(request).identity, get_map_name(request)]
     return hashlib.sha256(json.dumps(scope).encode()).hexdigest()
-
-
-def _map_name(request: Request) -> str:
-    return request.query_params.get("map", DEFAULT_MAP)
 
 
 IdempotentDep = Annotated[IdempotentRequest, Depends(idempotent_request)]

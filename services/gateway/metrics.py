@@ -6,8 +6,6 @@ read from the catalog and are therefore the same on every gateway.
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -27,11 +25,10 @@ from services.request_log import RequestRecord
 from shared.catalog.base import db_now
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.maps import Map
-from shared.catalog.session import Catalog
+from shared.jobs.queue_depth import PolledValue
 from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE
 
 QUEUE_POLL_SECONDS = 5.0
-POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
 COUNTED_STATES = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
 
 
@@ -46,31 +43,6 @@ class JobCount:
     state: str
     count: int
     oldest_seconds: float
-
-
-class QueueMetrics:
-    """Job counts, cached for QUEUE_POLL_SECONDS. Thread-safe."""
-
-    def __init__(self, catalog: Catalog) -> None:
-        self._catalog = catalog
-        self._lock = threading.Lock()
-        self._cached: Sequence[JobCount] | None = None
-        self._next_poll = 0.0
-
-    def job_counts(self) -> Sequence[JobCount] | None:
-        """Returns the job counts; None while the catalog is unreachable."""
-        with self._lock:
-            started = time.monotonic()
-            if started < self._next_poll:
-                return self._cached
-            try:
-                with self._catalog.read() as session:
-                    self._cached = count_jobs(session)
-            except SQLAlchemyError:
-                self._cached = None
-            elapsed = time.monotonic() - started
-            self._next_poll = started + max(QUEUE_POLL_SECONDS, POLL_COST_DIVISOR * elapsed)
-            return self._cached
 
 
 def count_jobs(session: Session) -> list[JobCount]:
@@ -94,7 +66,7 @@ def count_jobs(session: Session) -> list[JobCount]:
 router = APIRouter(tags=["operations"])
 
 # From a health probe to the longest `Prefer: wait`.
-LATENCY_BUCKETS_SECONDS = (
+LATENCY_BUCKETS = (
     0.005,
     0.01,
     0.025,
@@ -108,7 +80,7 @@ LATENCY_BUCKETS_SECONDS = (
     10.0,
     30.0,
     60.0,
-)
+)  # seconds
 METRIC_PREFIX = "placewise_gateway"
 
 
@@ -127,7 +99,7 @@ class GatewayMetrics:
             f"{METRIC_PREFIX}_request_seconds",
             "Seconds from the request to the first byte of the response.",
             ["method", "route"],
-            buckets=LATENCY_BUCKETS_SECONDS,
+            buckets=LATENCY_BUCKETS,
             registry=registry,
         )
         self._received = Counter(
@@ -162,8 +134,17 @@ class _LoadCollector(Collector):
     """Collects the job queue, the uploads of this gateway and the free disk space per scrape."""
 
     def __init__(self, gateway: GatewayContext, admission: AdmissionControl) -> None:
-        self._queue_metrics = QueueMetrics(gateway.catalog)
+        self._catalog = gateway.catalog
+        self._job_counts = PolledValue(self._count_jobs, QUEUE_POLL_SECONDS)
         self._admission = admission
+
+    def _count_jobs(self) -> Sequence[JobCount] | None:
+        """Counts the jobs; None while the catalog is unreachable."""
+        try:
+            with self._catalog.read() as session:
+                return count_jobs(session)
+        except SQLAlchemyError:
+            return None
 
     def describe(self) -> Iterable[Metric]:
         return []  # otherwise registering would call `collect` and query the catalog
@@ -182,7 +163,7 @@ class _LoadCollector(Collector):
                 "Free bytes of the local disks that Placewise writes to.",
                 free,
             )
-        queue = self._queue_metrics.job_counts()
+        queue = self._job_counts.get()
         yield GaugeMetricFamily(
             f"{METRIC_PREFIX}_catalog_up",
             "1 if the catalog is reachable.",

@@ -11,19 +11,25 @@ from typing import Any
 from urllib.parse import urlencode
 from uuid import UUID
 
-from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.dependencies import API_PREFIX, DEFAULT_MAP
+from services.gateway.dependencies import API_PREFIX
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import QUERY_JOBS
+from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
+from shared.catalog.vocabularies import VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
 
 
+class RequestModel(BaseModel):
+    """A JSON body; unknown fields are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
 class ResponseModel(BaseModel):
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
 
 class PhotoResponse(ResponseModel):
@@ -286,9 +292,7 @@ class JobResponse(ResponseModel):
             waiting_for=job.waiting_for,
             awaited=job.awaited,
             progress=JobProgress(
-                done=job.progress_done,
-                total=job.progress_total,
-                failed=job.progress_failed,
+                done=job.progress_done, total=job.progress_total, failed=job.progress_failed
             ),
             attempts=job.attempts,
             file_id=job.photo_id,
@@ -336,7 +340,7 @@ class DeletedPhotoResponse(ResponseModel):
 
 
 class VocabularyResponse(ResponseModel):
-    vocabulary_id: UUID
+    vocabulary_id: UUID = Field(validation_alias="id")
     origin: VocabularyOrigin
     clusters: int
     dimension: int
@@ -347,18 +351,6 @@ class VocabularyResponse(ResponseModel):
         "if the imported file does not contain them"
     )
     created_at: datetime
-
-    @classmethod
-    def of(cls, vocabulary: Vocabulary) -> VocabularyResponse:
-        return cls(
-            vocabulary_id=vocabulary.id,
-            origin=VocabularyOrigin(vocabulary.origin),
-            clusters=vocabulary.clusters,
-            dimension=vocabulary.dimension,
-            sha256=vocabulary.sha256,
-            provenance=vocabulary.provenance,
-            created_at=vocabulary.created_at,
-        )
 
 
 class GenerationResponse(ResponseModel):
@@ -413,9 +405,6 @@ def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
     )
 
 
-def accept_job(response: Response, job: Job, map_name: str) -> JobAcceptedResponse:
-    """Builds the body of the 202 response for a job, and sets its headers on `response`."""
-    accepted = to_job_accepted(job, map_name)
-    response.headers["Location"] = accepted.status_url
-    response.headers["Retry-After"] = "1"
-    return accepted
+def accepted_headers(status_url: str) -> dict[str, str]:
+    """Builds the headers of a 202 response."""
+    return {"Location": status_url, "Retry-After": "1"}

@@ -11,10 +11,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy import select
@@ -40,10 +39,6 @@ from shared.search_api.protocol import IndexPart, ReplicationLag
 from shared.storage import ObjectStore
 from shared.storage.chunks import CODED_DIMENSION
 from shared.storage.read_retries import ReadRetries
-
-if TYPE_CHECKING:
-    from shared.codes.int8_codes import Int8Codes
-
 
 log = logging.getLogger(__name__)
 
@@ -136,13 +131,9 @@ def sync_snapshot(
         photos = PhotoColumns.of(len(stored.rows), filter_values[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     large = sum(chunk.rows.nbytes for chunk in loaded) >= MIN_CODED_BYTES
-    if large:
+    if large or (old is not None and (old.has_sign_codes or old.has_int8_codes)):
         loaded = _with_codes(loader, loaded)
-        _compile_kernels(loaded)
     loader.evict_except(loaded)
-    mid_dimension = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
-    if (mid_dimension and large) or (old is not None and old.has_int8_codes):
-        loaded = _attach_int8_to_all(loader, loaded)
     return _apply_memory_budget(
         memory_budget,
         Snapshot(
@@ -152,24 +143,6 @@ def sync_snapshot(
             chunks=tuple(loaded),
             missing=tuple(missing),
         ),
-    )
-
-
-def with_int8_codes(
-    store: ObjectStore,
-    folder: Path,
-    memory_budget: MemoryBudget,
-    old: Snapshot,
-    built: Mapping[UUID, Int8Codes],
-) -> Snapshot:
-    """Return the snapshot with int8 codes of every chunk.
-
-    Codes in `built`, by chunk id, are used; the others are loaded or computed.
-    """
-    loader = generation_loader(store, folder, old.generation_id)
-    return _apply_memory_budget(
-        memory_budget,
-        replace(old, chunks=tuple(_attach_int8(loader, c, built) for c in old.chunks)),
     )
 
 
@@ -190,56 +163,40 @@ def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Sna
 
 
 def _with_codes(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
-    """Return the chunks with their sign codes, or unchanged if those can't be loaded.
+    """Return the chunks with their codes, or all without if those can't be loaded or stored.
 
     Without codes every row is compared, with the same results.
     """
     try:
-        return [_attach_sign_codes(loader, chunk) for chunk in chunks]
+        coded = [_attach_codes(loader, chunk) for chunk in chunks]
     except (Unavailable, OSError) as error:
-        log.error("sign codes can't be loaded, searching without them: %s", error)
-        return chunks
-
-
-def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
-    """Return the chunks with their int8 codes, or all without if there is no space for them.
-
-    Without codes every row is compared, with the same results.
-    """
-    try:
-        return [_attach_int8(loader, chunk, {}) for chunk in chunks]
-    except OSError as error:
-        log.error("int8 codes can't be stored, searching without them: %s", error)
+        log.error("codes can't be loaded or stored, searching without them: %s", error)
         return [
-            replace(chunk, int8=None, stored=chunk.stored and replace(chunk.stored, int8=None))
+            replace(
+                chunk,
+                codes=None,
+                int8=None,
+                stored=chunk.stored and replace(chunk.stored, codes=None, int8=None),
+            )
             for chunk in chunks
         ]
-
-
-def _attach_int8(
-    loader: ChunkLoader, chunk: LoadedChunk, built: Mapping[UUID, Int8Codes]
-) -> LoadedChunk:
-    stored = chunk.stored
-    if stored is None or stored.int8 is not None:
-        return chunk
-    codes = built.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
-    return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
-
-
-def _attach_sign_codes(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
-    """Return the chunk with its sign codes, if rows of this dimension have any."""
-    stored = chunk.stored
-    if stored is None or stored.codes is not None or stored.rows.shape[1] < CODED_DIMENSION:
-        return chunk
-    codes = loader.load_sign_codes(chunk.object_key, stored)
-    return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
-
-
-def _compile_kernels(chunks: Sequence[LoadedChunk]) -> None:
-    if any(chunk.codes is not None for chunk in chunks):
+    if any(chunk.codes is not None for chunk in coded):
         from services.search.sign_code_search import compile_kernels
 
         compile_kernels()
+    return coded
+
+
+def _attach_codes(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
+    """Return the chunk with the codes for rows of its dimension: sign codes, or int8 codes."""
+    stored = chunk.stored
+    if stored is None or stored.codes is not None or stored.int8 is not None:
+        return chunk
+    if stored.rows.shape[1] >= CODED_DIMENSION:
+        codes = loader.load_sign_codes(chunk.object_key, stored)
+        return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
+    int8 = loader.load_int8_codes(chunk.object_key, stored)
+    return replace(chunk, int8=int8, stored=replace(stored, int8=int8))
 
 
 def _apply_photo_changes(chunk: LoadedChunk, changes: dict[UUID, PhotoFilterValues]) -> LoadedChunk:

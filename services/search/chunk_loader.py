@@ -15,7 +15,6 @@ import mmap
 import os
 import shutil
 import sys
-import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from shared.errors import NotFound
 from shared.ids import new_id
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, chunk_corrupt_error, codes_key, decode_rows
+from shared.storage.copying import PARTIAL_SUFFIX, download_object, remove_stale_partials
 
 if TYPE_CHECKING:
     from shared.codes.int8_codes import Int8Codes
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
-
-COPY_BYTES = 1 << 20
-STALE_PARTIAL_SECONDS = 3600.0  # age of partial files whose writer must have been killed
 
 # A mapping holds a file descriptor, and many chunks would use them up; Python 3.13 can do without.
 MMAP_OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
@@ -137,7 +134,7 @@ class MappedFileCache:
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             return _map_file(file.fileno(), path)
         make_private_folder(self._folder)
-        partial = self._folder / f"{new_id()}.partial"
+        partial = self._folder / f"{new_id()}{PARTIAL_SUFFIX}"
         try:
             make(partial)
             with partial.open("rb") as file:
@@ -155,26 +152,14 @@ class MappedFileCache:
         """Delete the files of all other names from the folder; existing mappings stay readable."""
         if not self._folder.is_dir():
             return
-        stale_before = time.time() - STALE_PARTIAL_SECONDS
+        remove_stale_partials(self._folder)
         for path in self._folder.iterdir():
-            with contextlib.suppress(FileNotFoundError):
-                if path.suffix == ".partial":
-                    stale = path.stat().st_mtime < stale_before
-                else:
-                    stale = path.name not in names
-                if stale:
-                    path.unlink()
+            if path.suffix != PARTIAL_SUFFIX and path.name not in names:
+                path.unlink(missing_ok=True)
 
     def _download(self, key: str, sha256: str, target: Path) -> None:
-        digest = hashlib.sha256()
-        with self._store.open(key) as source, create_private_file(target) as file:
-            while block := source.read(COPY_BYTES):
-                digest.update(block)
-                file.write(block)
-            if digest.hexdigest() != sha256:
-                raise chunk_corrupt_error(key)
-            file.flush()
-            os.fsync(file.fileno())
+        if download_object(self._store, key, target) != sha256:
+            raise chunk_corrupt_error(key)
 
 
 def _map_file(descriptor: int, path: Path) -> MappedFile:

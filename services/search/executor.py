@@ -16,11 +16,18 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import catalog_sync
 from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
-from shared.search_api.protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Mode, SearchHit
+from shared.search_api.protocol import (
+    BOUND,
+    EXHAUSTIVE,
+    NONE,
+    STATISTICAL,
+    Mode,
+    SearchHit,
+    SearchResponse,
+)
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load
     from services.search.exact_rerank import SearchBudget
@@ -63,18 +70,6 @@ class SearchOptions:
     most_seconds: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class SearchResult:
-    """Hits in order, with the statistics of `SearchResponse`."""
-
-    hits: tuple[SearchHit, ...]
-    certificate: str
-    certified_k: int
-    rows_scanned: int
-    rows_reranked: int
-    max_z: float | None = None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _ScoredRows:
     """Rows with their exact scores, among them all that the result needs."""
@@ -94,7 +89,8 @@ def execute_query(
     row_mask: NDArray[np.bool_],
     options: SearchOptions,
     batcher: QueryBatcher,
-) -> SearchResult:
+    weighted_query: QueryRow | None = None,
+) -> SearchResponse:
     """Search the rows of a snapshot that are most similar to a query.
 
     Args:
@@ -103,37 +99,27 @@ def execute_query(
         row_mask: (n,) bool, the rows that may be returned.
         options: Number of results, minimum score, strategy and limits.
         batcher: Batches the first-level scans of concurrent queries.
+        weighted_query: If given, rows are ranked by their similarity to it. Hits also carry the
+            plain cosine, and `options.min_score` applies to that.
     """
-    if not row_mask.any() or not query.any():
-        return SearchResult((), EXHAUSTIVE, 0, 0, 0)
-    scored = _score_rows(snapshot, query, row_mask, options, batcher)
-    hits = _rank_photos(snapshot, scored.rows, scored.scores, options)
-    return _to_search_result(
-        [SearchHit(photo_id=photo_id, score=score) for photo_id, _, score in hits], scored
-    )
-
-
-def execute_weighted_query(
-    snapshot: Snapshot,
-    query: QueryRow,
-    weighted_query: QueryRow,
-    row_mask: NDArray[np.bool_],
-    options: SearchOptions,
-    batcher: QueryBatcher,
-) -> SearchResult:
-    """Rank rows by their similarity to `weighted_query`; hits also carry the plain cosine.
-
-    `options.min_score` applies to the plain cosine, with `query`. See `execute_query`.
-    """
-    scanned = int(np.count_nonzero(row_mask))
-    if options.min_score is not None and scanned:
-        row_mask = _mask_min_score(snapshot, query, row_mask, options, batcher)
+    selected = int(np.count_nonzero(row_mask))
+    plain = _Query(snapshot, query, row_mask, options, batcher)
+    if not selected or not query.any():
+        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
+    if weighted_query is None:
+        scored = plain.score_rows()
+        hits = [
+            SearchHit(photo_id=photo_id, score=score)
+            for photo_id, _, score in plain.rank_photos(scored)
+        ]
+        return plain.to_response(hits, scored)
+    if options.min_score is not None:
+        row_mask = plain.mask_min_score()
     if not row_mask.any():
-        return SearchResult((), EXHAUSTIVE, 0, scanned, 0)
-    scored = _score_rows(
-        snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher
-    )
-    ranked = _rank_photos(snapshot, scored.rows, scored.scores, replace(options, min_score=None))
+        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, selected))
+    weighted = _Query(snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher)
+    scored = weighted.score_rows()
+    ranked = weighted.rank_photos(scored)
     plain_scores = _round_scores(
         exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked]))
     )
@@ -141,7 +127,7 @@ def execute_weighted_query(
         SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
         for (photo_id, _, weighted_score), score in zip(ranked, plain_scores.tolist(), strict=True)
     ]
-    return _to_search_result(hits, replace(scored, scanned=scanned))
+    return plain.to_response(hits, replace(scored, scanned=selected))
 
 
 def sign_codes_pay_off(selected: int, k: int) -> bool:
@@ -150,63 +136,6 @@ def sign_codes_pay_off(selected: int, k: int) -> bool:
     They leave about 2 k rows to compare exactly, and have a fixed cost of some dozens of rows.
     """
     return selected > 64 + 4 * k
-
-
-def _score_rows(
-    snapshot: Snapshot,
-    query: QueryRow,
-    row_mask: NDArray[np.bool_],
-    options: SearchOptions,
-    batcher: QueryBatcher,
-) -> _ScoredRows:
-    selected = int(np.count_nonzero(row_mask))
-    scored = None
-    if options.mode != Mode.DENSE and sign_codes_pay_off(selected, options.k):
-        scored = _search_on_gpu(snapshot, query, row_mask, options)
-        if scored is None and options.mode == Mode.AUTO and snapshot.has_sign_codes:
-            scored = _search_by_sign_codes(snapshot, query, row_mask, options, batcher)
-    if scored is None and _uses_int8_codes(snapshot, options.mode, selected, options.k):
-        scored = _search_by_int8(snapshot, query, row_mask, options)
-    if scored is None:
-        rows, scores = scan_top_k(snapshot.chunks, query, options.k, row_mask)
-        scored = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
-    return scored
-
-
-def _uses_int8_codes(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
-    """Whether int8 codes exist, suit the mode, and are faster than a dense scan."""
-    suits_mode = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.has_sign_codes)
-    return (
-        suits_mode
-        and snapshot.has_int8_codes
-        and int8_codes_pay_off(selected, k, snapshot.dimension)
-    )
-
-
-def _mask_min_score(
-    snapshot: Snapshot,
-    query: QueryRow,
-    row_mask: NDArray[np.bool_],
-    options: SearchOptions,
-    batcher: QueryBatcher,
-) -> NDArray[np.bool_]:
-    """Return the rows of the mask that score at least `options.min_score`."""
-    assert options.min_score is not None
-    scored = None
-    if (
-        options.mode == Mode.AUTO
-        and snapshot.has_sign_codes
-        and sign_codes_pay_off(len(row_mask), 1)
-    ):
-        all_rows = SearchOptions(len(row_mask), options.min_score)
-        scored = _search_by_sign_codes(snapshot, query, row_mask, all_rows, batcher)
-    if scored is not None:
-        rows, scores = scored.rows, scored.scores
-    else:
-        rows, scores = scan_min_score(snapshot.chunks, query, options.min_score, row_mask)
-    passing = np.zeros(len(row_mask), bool)
-    passing[rows[_round_scores(scores) >= options.min_score]] = True
-    return passing
 
 
 def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
@@ -221,148 +150,182 @@ def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
 
 
-def needs_int8_codes(snapshot: Snapshot, row_mask: NDArray[np.bool_], k: int) -> bool:
-    """Whether a deterministic search would have to scan all rows because int8 codes are missing."""
-    if (
-        snapshot.has_int8_codes
-        or snapshot.gpu_snapshot
-        or snapshot.row_bytes < catalog_sync.MIN_CODED_BYTES
-    ):
-        return False
-    if not snapshot.chunks:
-        return False
-    return int8_codes_pay_off(int(np.count_nonzero(row_mask)), k, snapshot.dimension)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Query:
+    """A query of a snapshot, and the strategies that score its rows."""
 
+    snapshot: Snapshot
+    vector: QueryRow
+    row_mask: NDArray[np.bool_]
+    options: SearchOptions
+    batcher: QueryBatcher
 
-def _search_on_gpu(
-    snapshot: Snapshot, query: QueryRow, row_mask: NDArray[np.bool_], options: SearchOptions
-) -> _ScoredRows | None:
-    """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
-    resident = snapshot.gpu_snapshot
-    if resident is None or resident.failure is not None:
-        return None
-    from services.search.gpu import GpuError, GpuQuery
+    def score_rows(self) -> _ScoredRows:
+        """Score the rows with the cheapest suitable strategy."""
+        snapshot, options, selected = self.snapshot, self.options, self._selected()
+        scored = None
+        if options.mode != Mode.DENSE and sign_codes_pay_off(selected, options.k):
+            scored = self._search_on_gpu()
+            if scored is None and options.mode == Mode.AUTO and snapshot.has_sign_codes:
+                scored = self._search_by_sign_codes()
+        if (
+            scored is None
+            and options.mode != Mode.DENSE
+            and snapshot.has_int8_codes
+            and int8_codes_pay_off(selected, options.k, snapshot.dimension)
+        ):
+            scored = self._search_by_int8()
+        if scored is None:
+            rows, scores = scan_top_k(snapshot.chunks, self.vector, options.k, self.row_mask)
+            scored = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
+        return scored
 
-    budget = _search_budget(options)
-    try:
-        (candidates,) = resident.candidates(
-            [GpuQuery(query, row_mask, options.k, _score_floor(options))]
+    def mask_min_score(self) -> NDArray[np.bool_]:
+        """Return the rows of the mask that score at least `options.min_score`."""
+        min_score, number = self.options.min_score, len(self.row_mask)
+        assert min_score is not None
+        scored = None
+        if (
+            self.options.mode == Mode.AUTO
+            and self.snapshot.has_sign_codes
+            and sign_codes_pay_off(number, 1)
+        ):
+            all_rows = replace(self, options=SearchOptions(number, min_score))
+            scored = all_rows._search_by_sign_codes()
+        if scored is not None:
+            rows, scores = scored.rows, scored.scores
+        else:
+            rows, scores = scan_min_score(
+                self.snapshot.chunks, self.vector, min_score, self.row_mask
+            )
+        passing = np.zeros(number, bool)
+        passing[rows[_round_scores(scores) >= min_score]] = True
+        return passing
+
+    def rank_photos(self, scored: _ScoredRows) -> list[tuple[UUID, int, float]]:
+        """Return (photo, row, score), sorted by descending score, ties by photo id."""
+        options, rows, scores = self.options, scored.rows, _round_scores(scored.scores)
+        if options.min_score is not None:
+            passing = scores >= options.min_score
+            rows, scores = rows[passing], scores[passing]
+        if len(rows) > options.k:
+            kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
+            best = scores >= kth
+            rows, scores = rows[best], scores[best]
+        ranked: list[tuple[float, UUID, int]] = sorted(
+            (-score, photo_id, row)
+            for score, photo_id, row in zip(
+                scores.tolist(), self.snapshot.photos.ids(rows), rows.tolist(), strict=True
+            )
+            if photo_id is not None
         )
-    except GpuError as error:
-        log.error("generation %s is searched by the CPU: %s", snapshot.generation_id, error)
-        return None
-    return _rerank_candidates(snapshot, query, candidates, row_mask, options, budget)
+        return [(photo_id, row, -score) for score, photo_id, row in ranked[: options.k]]
 
+    def to_response(self, hits: list[SearchHit], scored: _ScoredRows) -> SearchResponse:
+        """Build the response; missing chunks may contain better rows."""
+        missing = self.snapshot.missing
+        certain = sum(hit.ranked_by > scored.unseen_bound for hit in hits)
+        return SearchResponse(
+            hits=tuple(hits),
+            certificate=NONE if missing else scored.certificate,
+            certified_k=0 if missing else certain,
+            rows_scanned=scored.scanned,
+            rows_reranked=len(scored.rows),
+            max_z=scored.max_z,
+            snapshot_version=self.snapshot.version,
+            missing=missing,
+        )
 
-def _search_by_int8(
-    snapshot: Snapshot, query: QueryRow, row_mask: NDArray[np.bool_], options: SearchOptions
-) -> _ScoredRows:
-    from services.search.int8_search import find_candidates
-    from shared.codes.int8_codes import Int8Query
+    def _search_on_gpu(self) -> _ScoredRows | None:
+        """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
+        resident = self.snapshot.gpu_snapshot
+        if resident is None or resident.failure is not None:
+            return None
+        from services.search.gpu import GpuError, GpuQuery
 
-    budget = _search_budget(options)
-    coded = Int8Query.from_row(query)
-    candidates = find_candidates(
-        snapshot.int8_blocks, coded, row_mask, options.k, _score_floor(options), budget
-    )
-    if candidates is None:
+        budget = self._budget()
+        query = GpuQuery(self.vector, self.row_mask, self.options.k, self._score_floor())
+        try:
+            (candidates,) = resident.candidates([query])
+        except GpuError as error:
+            log.error(
+                "generation %s is searched by the CPU: %s", self.snapshot.generation_id, error
+            )
+            return None
+        return self._rerank(candidates, budget)
+
+    def _search_by_int8(self) -> _ScoredRows:
+        from services.search.int8_search import find_candidates
+        from shared.codes.int8_codes import Int8Query
+
+        budget = self._budget()
+        candidates = find_candidates(
+            self.snapshot.int8_blocks,
+            Int8Query.from_row(self.vector),
+            self.row_mask,
+            self.options.k,
+            self._score_floor(),
+            budget,
+        )
+        if candidates is None:
+            return _ScoredRows(NO_ROWS, NO_SCORES, NONE, self._selected(), unseen_bound=math.inf)
+        return self._rerank(candidates, budget)
+
+    def _rerank(self, candidates: Candidates, budget: SearchBudget) -> _ScoredRows:
+        """Compare the candidates exactly."""
+        from services.search.exact_rerank import ExactReranker
+
+        norm = float(np.linalg.norm(self.vector.astype(np.float64)))
+        snapshot = self.snapshot
+        reranker = ExactReranker(
+            snapshot.row_blocks, self.vector, norm, self.options.k, snapshot.prefetch_rows
+        )
+        reranked = reranker.find_best(
+            candidates.rows, candidates.upper_bounds, candidates.floor, budget
+        )
         return _ScoredRows(
-            NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(row_mask)), unseen_bound=math.inf
+            reranked.rows,
+            reranked.scores,
+            BOUND if reranked.is_complete else NONE,
+            self._selected(),
+            unseen_bound=reranked.unseen_bound,
         )
-    return _rerank_candidates(snapshot, query, candidates, row_mask, options, budget)
 
+    def _search_by_sign_codes(self) -> _ScoredRows | None:
+        """Search by sign codes; None if an error of an estimate is larger than chance explains."""
+        from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
+        from shared.codes.rotation import get_rotation
 
-def _rerank_candidates(
-    snapshot: Snapshot,
-    query: QueryRow,
-    candidates: Candidates,
-    row_mask: NDArray[np.bool_],
-    options: SearchOptions,
-    budget: SearchBudget,
-) -> _ScoredRows:
-    """Compare the candidates exactly."""
-    from services.search.exact_rerank import ExactReranker
-
-    norm = float(np.linalg.norm(query.astype(np.float64)))
-    reranker = ExactReranker(snapshot.row_blocks, query, norm, options.k, snapshot.prefetch_rows)
-    reranked = reranker.find_best(
-        candidates.rows, candidates.upper_bounds, candidates.floor, budget
-    )
-    certificate = BOUND if reranked.is_complete else NONE
-    scanned = int(np.count_nonzero(row_mask))
-    return _ScoredRows(
-        reranked.rows, reranked.scores, certificate, scanned, unseen_bound=reranked.unseen_bound
-    )
-
-
-def _score_floor(options: SearchOptions) -> float:
-    return -math.inf if options.min_score is None else options.min_score
-
-
-def _search_budget(options: SearchOptions) -> SearchBudget:
-    from services.search.exact_rerank import SearchBudget
-
-    deadline = options.most_seconds and time.monotonic() + options.most_seconds
-    return SearchBudget(options.most_rows, deadline)
-
-
-def _search_by_sign_codes(
-    snapshot: Snapshot,
-    query: QueryRow,
-    row_mask: NDArray[np.bool_],
-    options: SearchOptions,
-    batcher: QueryBatcher,
-) -> _ScoredRows | None:
-    """Search by sign codes; None if an error of an estimate is larger than chance explains."""
-    from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
-    from shared.codes.rotation import get_rotation
-
-    budget = _search_budget(options)
-    coded = SignCodedQuery.of(query, get_rotation(len(query)))
-    first = batcher.scan(snapshot.sign_code_blocks, coded, row_mask)
-    search = SignCodeSearch(
-        snapshot.sign_code_blocks, coded, options.k, options.min_score, snapshot.prefetch_rows
-    )
-    result = search.search(first, budget)
-    if result.max_z > MAX_Z:
-        return None
-    certificate = STATISTICAL if result.is_complete else NONE
-    return _ScoredRows(
-        result.rows, result.scores, certificate, result.scanned, result.max_z, result.unseen_bound
-    )
-
-
-def _rank_photos(
-    snapshot: Snapshot, rows: RowNumbers, scores: Scores, options: SearchOptions
-) -> list[tuple[UUID, int, float]]:
-    """Return (photo, row, score), sorted by descending score, ties by photo id."""
-    scores = _round_scores(scores)
-    if options.min_score is not None:
-        passing = scores >= options.min_score
-        rows, scores = rows[passing], scores[passing]
-    if len(rows) > options.k:
-        kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
-        best = scores >= kth
-        rows, scores = rows[best], scores[best]
-    ranked: list[tuple[float, UUID, int]] = sorted(
-        (-score, photo_id, row)
-        for score, photo_id, row in zip(
-            scores.tolist(), snapshot.photos.ids(rows), rows.tolist(), strict=True
+        budget, options = self._budget(), self.options
+        blocks = self.snapshot.sign_code_blocks
+        coded = SignCodedQuery.of(self.vector, get_rotation(len(self.vector)))
+        first = self.batcher.scan(blocks, coded, self.row_mask)
+        search = SignCodeSearch(
+            blocks, coded, options.k, options.min_score, self.snapshot.prefetch_rows
         )
-        if photo_id is not None
-    )
-    return [(photo_id, row, -score) for score, photo_id, row in ranked[: options.k]]
+        result = search.search(first, budget)
+        if result.max_z > MAX_Z:
+            return None
+        return _ScoredRows(
+            result.rows,
+            result.scores,
+            STATISTICAL if result.is_complete else NONE,
+            result.scanned,
+            result.max_z,
+            result.unseen_bound,
+        )
 
+    def _selected(self) -> int:
+        return int(np.count_nonzero(self.row_mask))
 
-def _to_search_result(hits: list[SearchHit], scored: _ScoredRows) -> SearchResult:
-    return SearchResult(
-        hits=tuple(hits),
-        certificate=scored.certificate,
-        certified_k=sum(hit.ranked_by > scored.unseen_bound for hit in hits),
-        rows_scanned=scored.scanned,
-        rows_reranked=len(scored.rows),
-        max_z=scored.max_z,
-    )
+    def _score_floor(self) -> float:
+        return -math.inf if self.options.min_score is None else self.options.min_score
+
+    def _budget(self) -> SearchBudget:
+        from services.search.exact_rerank import SearchBudget
+
+        seconds = self.options.most_seconds
+        return SearchBudget(self.options.most_rows, seconds and time.monotonic() + seconds)
 
 
 def _round_scores(scores: Scores) -> Scores:

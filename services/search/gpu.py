@@ -1,9 +1,8 @@
 """GPU search: scores of all rows by matrix products, each with a bound of its error.
 
-A generation's rows are held in the GPU's memory, as float16 where they fit and as int8 codes
-(`shared.codes.int8_codes`) where only those do. One product gives every row's score to within a
-bound; rows that may be among the best are compared exactly on the CPU, by their float32 rows. So
-the results are the same as those of the CPU.
+A generation's rows are held in the GPU's memory as float16 if they fit. One product gives every
+row's score to within a bound; rows that may be among the best are compared exactly on the CPU, by
+their float32 rows. So the results are the same as those of the CPU.
 
 Error bound of a float16 row: a row x is stored as the float16 numbers h nearest to it, scaled by
 256 so that none underflows; a query u of length 1 is stored as two float16 vectors whose sum v
@@ -18,9 +17,7 @@ times the sum of their magnitudes, which is at most |v| |h|; u' is 2^-24 if each
 Tensor cores truncate instead of rounding, and align the terms of one step before they add them:
 ACCUMULATION_ERROR, 2^-22, is twice the most that this loses. A device whose trial product is off by
 more is not used (`GpuDevice.self_test`). TF32 and sums in float16 are never used: the inputs are
-float16 or int8, the outputs float32 or int32.
-
-The products of int8 codes are integers, and exact.
+float16, the outputs float32.
 """
 
 from __future__ import annotations
@@ -36,17 +33,11 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.int8_search import Candidates
-from shared.codes.int8_codes import INT8_MAX, Int8Query
-from shared.codes.rotation import get_rotation
-
-FLOAT16, INT8 = "float16", "int8"
-ROW_FORMATS = (FLOAT16, INT8)  # in order of preference: float16 leaves fewer rows to compare
 
 PARTIAL_SUM_TERMS = 2048  # products of a row that are summed in float32
 ACCUMULATION_ERROR = 2.0**-22  # error of each addition, relative to the sum of all magnitudes
 FLOAT16_SCALE = 256.0  # factor by which stored float16 numbers are larger than the row's
 RESIDUAL_SCALE = 2.0**11  # further factor of the second float16 vector of a query
-MAX_INT8_TERMS = 2**31 // (INT8_MAX * INT8_MAX) - 1  # products whose int32 sum can't overflow
 ROUNDING = 1e-9  # bound of rounding errors of scores and bounds in float64
 ROWS_ALIGNED, COLUMNS_ALIGNED, TERMS_ALIGNED = 32, 8, 8  # alignment for the fast GPU kernels
 COPY_ROWS = 64  # rows copied to the device at once
@@ -79,9 +70,7 @@ class GpuChunk:
     """A chunk's rows in GPU memory."""
 
     numbers: torch.Tensor
-    """(rows, terms) float16 or int8, padded with zeros to the alignment."""
-    scales: torch.Tensor
-    """(n,) float64: factor of each row's numbers."""
+    """(rows, terms) float16, FLOAT16_SCALE times the row, padded with zeros to the alignment."""
     errors: torch.Tensor
     """(n,) float64: upper bound of the distance of the scaled numbers from the row."""
     lengths: torch.Tensor
@@ -89,7 +78,7 @@ class GpuChunk:
 
     @property
     def nbytes(self) -> int:
-        return self.numbers.nbytes + 3 * self.scales.nbytes
+        return self.numbers.nbytes + self.errors.nbytes + self.lengths.nbytes
 
 
 class GpuDevice:
@@ -151,8 +140,7 @@ class GpuDevice:
         chunk = self._copy_as_float16(rows)
         try:
             results = [
-                _score_all_rows([chunk], FLOAT16, row[np.newaxis], self.torch_device)
-                for row in rows[::9]
+                _score_all_rows([chunk], row[np.newaxis], self.torch_device) for row in rows[::9]
             ]
         except (RuntimeError, TypeError) as error:  # TypeError: before PyTorch 2.8
             raise GpuUnsupported(f"{self.name} can't multiply float16 matrices: {error}") from error
@@ -178,53 +166,18 @@ class GpuDevice:
         Raises:
             GpuError: The copy failed.
         """
-        row_format = next(
-            (candidate for candidate in ROW_FORMATS if self.has_room(chunks, candidate, old)), None
-        )
-        if row_format is None or (
-            row_format == INT8 and any(chunk.int8 is None for chunk in chunks)
-        ):
+        reusable = {} if old is None else old.chunks
+        copied_bytes = sum(_gpu_bytes(c) for c in chunks if c.chunk_id not in reusable)
+        if copied_bytes > min(max_bytes, self._free_bytes() - self._headroom_bytes):
             return None
-        if _copied_bytes(chunks, row_format, old) > max_bytes:
-            return None
-        reusable = _reusable_chunks(row_format, old)
         try:
             gpu_chunks = {
-                chunk.chunk_id: reusable.get(chunk.chunk_id) or self._copy_chunk(chunk, row_format)
+                chunk.chunk_id: reusable.get(chunk.chunk_id) or self._copy_as_float16(chunk.rows)
                 for chunk in chunks
             }
         except RuntimeError as error:  # includes out-of-memory errors
             raise GpuError(str(error)) from error
-        return GpuSnapshot(self.torch_device, row_format, gpu_chunks)
-
-    def has_room(
-        self, chunks: Sequence[LoadedChunk], row_format: str, old: GpuSnapshot | None = None
-    ) -> bool:
-        """Whether the chunks' rows fit into free memory in this format, reusing those of `old`."""
-        dimension = chunks[0].rows.shape[1]
-        if row_format == INT8 and get_rotation(dimension).padded > MAX_INT8_TERMS:
-            return False
-        needed = _copied_bytes(chunks, row_format, old) + self._headroom_bytes
-        return needed <= self._free_bytes()
-
-    def _copy_chunk(self, chunk: LoadedChunk, row_format: str) -> GpuChunk:
-        if row_format == FLOAT16:
-            return self._copy_as_float16(chunk.rows)
-        codes = chunk.int8
-        assert codes is not None
-        numbers = torch.zeros(
-            (_round_up(len(codes), ROWS_ALIGNED), codes.numbers.shape[1]),
-            dtype=torch.int8,
-            device=self.torch_device,
-        )
-        for begin in range(0, len(codes), COPY_ROWS):
-            block = np.array(codes.numbers[begin : begin + COPY_ROWS])
-            numbers[begin : begin + len(block)] = torch.from_numpy(block).to(self.torch_device)
-        params = (codes.scales, codes.errors, codes.lengths)
-        return GpuChunk(
-            numbers,
-            *(torch.from_numpy(array.astype(np.float64)).to(self.torch_device) for array in params),
-        )
+        return GpuSnapshot(self.torch_device, gpu_chunks)
 
     def _copy_as_float16(self, rows: NDArray[np.float32]) -> GpuChunk:
         parts, part_terms = _partial_sum_layout(rows.shape[1])
@@ -245,16 +198,13 @@ class GpuDevice:
             stored = scaled.double() / FLOAT16_SCALE
             errors[begin:end] = (block.double() - stored).norm(dim=1)
             lengths[begin:end] = stored.norm(dim=1)
-        return GpuChunk(numbers, torch.full_like(errors, 1 / FLOAT16_SCALE), errors, lengths)
+        return GpuChunk(numbers, errors, lengths)
 
 
 class GpuSnapshot:
     """A snapshot's rows in GPU memory; immutable. The memory is freed with its last reference."""
 
-    def __init__(
-        self, torch_device: torch.device, row_format: str, chunks: Mapping[UUID, GpuChunk]
-    ) -> None:
-        self.row_format = row_format
+    def __init__(self, torch_device: torch.device, chunks: Mapping[UUID, GpuChunk]) -> None:
         self.chunks = chunks
         """Chunks by id, in the snapshot's order."""
         self.failure: str | None = None
@@ -274,7 +224,7 @@ class GpuSnapshot:
         try:
             queries = np.stack([query.query for query in batch])
             scores, bounds = _score_all_rows(
-                list(self.chunks.values()), self.row_format, queries, self._torch_device
+                list(self.chunks.values()), queries, self._torch_device
             )
             return [
                 _select_candidates(query, scores[index], bounds[index])
@@ -298,36 +248,20 @@ def _select_candidates(query: GpuQuery, scores: torch.Tensor, bounds: torch.Tens
 
 def _score_all_rows(
     chunks: Sequence[GpuChunk],
-    row_format: str,
     queries: NDArray[np.float32],
     torch_device: torch.device,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return scores of all rows for b queries, (b, n) float64, and bounds of their errors."""
     count = len(queries)
-    if row_format == FLOAT16:
-        columns, errors, accumulation_error = _float16_query_columns(queries)
-        scales = np.full(count, 1 / FLOAT16_SCALE)
-        weights = (1.0, 1 / RESIDUAL_SCALE)
-    else:
-        coded = [Int8Query.from_row(query) for query in queries]
-        columns = np.concatenate(
-            [np.stack([code.parts[part] for code in coded]) for part in (0, 1)]
-        )
-        errors, accumulation_error = np.array([code.error for code in coded]), 0.0
-        scales = np.array([code.scale for code in coded])
-        weights = (128.0, 1.0)
+    columns, errors, accumulation_error = _float16_query_columns(queries)
     padded = np.zeros((_round_up(2 * count, COLUMNS_ALIGNED), columns.shape[1]), columns.dtype)
     padded[: 2 * count] = columns
     on_device = torch.from_numpy(padded).to(torch_device)
     chunk_scores = []
     for chunk in chunks:
-        rows = len(chunk.scales)
-        products = (_float16_products if row_format == FLOAT16 else _int8_products)(
-            chunk, on_device
-        )[:rows]
-        sums = weights[0] * products[:, :count] + weights[1] * products[:, count : 2 * count]
-        chunk_scores.append(sums * chunk.scales[:, None])
-    scores = torch.cat(chunk_scores) * torch.from_numpy(scales).to(torch_device)
+        products = _float16_products(chunk, on_device)[: len(chunk.errors)]
+        chunk_scores.append(products[:, :count] + products[:, count : 2 * count] / RESIDUAL_SCALE)
+    scores = torch.cat(chunk_scores) / FLOAT16_SCALE**2
     row_errors = torch.cat([chunk.errors for chunk in chunks])[:, None]
     lengths = torch.cat([chunk.lengths for chunk in chunks])[:, None]
     bounds = (
@@ -373,31 +307,16 @@ def _float16_products(chunk: GpuChunk, columns: torch.Tensor) -> torch.Tensor:
     return products.double().sum(0)
 
 
-def _int8_products(chunk: GpuChunk, columns: torch.Tensor) -> torch.Tensor:
-    """Exact products (rows, columns) in float64."""
-    return torch._int_mm(chunk.numbers, columns.t()).double()
-
-
 def _partial_sum_layout(dimension: int) -> tuple[int, int]:
     """Number of partial sums of a row, and the terms of each."""
     parts = -(-dimension // PARTIAL_SUM_TERMS)
     return parts, _round_up(-(-dimension // parts), TERMS_ALIGNED)
 
 
-def _gpu_bytes(chunk: LoadedChunk, row_format: str) -> int:
+def _gpu_bytes(chunk: LoadedChunk) -> int:
     count, dimension = chunk.rows.shape
     parts, part_terms = _partial_sum_layout(dimension)
-    terms = 2 * parts * part_terms if row_format == FLOAT16 else get_rotation(dimension).padded
-    return _round_up(count, ROWS_ALIGNED) * (terms + 24)
-
-
-def _copied_bytes(chunks: Sequence[LoadedChunk], row_format: str, old: GpuSnapshot | None) -> int:
-    reusable = _reusable_chunks(row_format, old)
-    return sum(_gpu_bytes(chunk, row_format) for chunk in chunks if chunk.chunk_id not in reusable)
-
-
-def _reusable_chunks(row_format: str, old: GpuSnapshot | None) -> Mapping[UUID, GpuChunk]:
-    return old.chunks if old is not None and old.row_format == row_format else {}
+    return _round_up(count, ROWS_ALIGNED) * (2 * parts * part_terms + 16)
 
 
 def _round_up(number: int, multiple: int) -> int:

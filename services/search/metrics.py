@@ -16,7 +16,7 @@ from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStat
 from shared.telemetry.tracing import span
 
 # From a small map in memory to a dense scan of a full shard, and the longest wait for a version.
-LATENCY_BUCKETS_SECONDS = (
+LATENCY_BUCKETS = (
     0.001,
     0.0025,
     0.005,
@@ -30,7 +30,7 @@ LATENCY_BUCKETS_SECONDS = (
     2.5,
     5.0,
     10.0,
-)
+)  # seconds
 
 # The maximum over some dozens of rows. From 5.5 on sign codes are not trusted (`executor.py`).
 MAX_Z_BUCKETS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
@@ -55,7 +55,7 @@ class MeteredSearch:
         self._seconds = Histogram(
             "placewise_search_seconds",
             "Duration of successful searches in seconds.",
-            buckets=LATENCY_BUCKETS_SECONDS,
+            buckets=LATENCY_BUCKETS,
             registry=self._registry,
         )
         self._rows = Counter(

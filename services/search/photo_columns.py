@@ -220,7 +220,7 @@ def build_row_mask(
 ) -> RowMask:
     """Return the (n,) bool mask of findable photos that pass the filter and are not excluded.
 
-    It selects the same photos as `catalog.metadata_search.filter_conditions` does in SQL.
+    It selects the same photos as `shared.catalog.photo_search.filter_conditions` does in SQL.
     Conditions that use an index are applied first; distances are computed for the remaining rows
     only.
     """

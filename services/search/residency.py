@@ -103,16 +103,6 @@ class GpuResidency:
             self._retry_at[snapshot.generation_id] = time.monotonic() + GPU_RETRY_SECONDS
         return replace(snapshot, gpu_snapshot=resident)
 
-    def needs_int8_codes(self, snapshot: Snapshot) -> bool:
-        """Whether the snapshot would fit onto the GPU as int8 codes, which do not exist yet."""
-        from services.search.gpu import FLOAT16, INT8
-
-        if self._device is None or snapshot.has_int8_codes:
-            return False
-        return not self._device.has_room(snapshot.chunks, FLOAT16) and self._device.has_room(
-            snapshot.chunks, INT8
-        )
-
     def status(self, snapshots: Iterable[Snapshot]) -> tuple[DeviceStatus, ...]:
         """Return the state of the GPU, if there is one."""
         if self._device is None:
@@ -128,7 +118,7 @@ class GpuResidency:
                 name=self._device.name,
                 resident_bytes=sum(gpu_snapshot.nbytes for gpu_snapshot in loaded.values()),
                 generations={
-                    key: gpu_snapshot.row_format
+                    key: "float16"
                     for key, gpu_snapshot in loaded.items()
                     if not gpu_snapshot.failure
                 },

@@ -59,11 +59,6 @@ class Snapshot:
         """Dimension of the rows; 0 without any rows."""
         return self.chunks[0].rows.shape[1] if self.chunks else 0
 
-    @property
-    def row_bytes(self) -> int:
-        """Size of all rows in bytes."""
-        return sum(chunk.rows.nbytes for chunk in self.chunks)
-
     @cached_property
     def held(self) -> LoadedGeneration:
         """The loaded generation as `SearchStatus` reports it."""

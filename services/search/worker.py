@@ -11,12 +11,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
+from cachetools import LRUCache
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.search.catalog_sync import (
@@ -24,16 +24,9 @@ from services.search.catalog_sync import (
     ReplicationLagTracker,
     read_generation_versions,
     sync_snapshot,
-    with_int8_codes,
 )
 from services.search.chunk_loader import remove_stale_folders
-from services.search.executor import (
-    SearchOptions,
-    execute_query,
-    execute_weighted_query,
-    needs_int8_codes,
-)
-from services.search.int8_builder import Int8CodeBuilder
+from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.query_batcher import QueryBatcher
 from services.search.residency import GpuResidency, MemoryBudget, open_search_device
@@ -44,7 +37,7 @@ from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
-from shared.search_api.protocol import NONE, Mode, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
@@ -53,7 +46,6 @@ from shared.word_weights.weights import apply_word_weights
 
 if TYPE_CHECKING:
     from services.search.gpu import GpuDevice
-    from shared.codes.int8_codes import Int8Codes
 
 
 log = logging.getLogger(__name__)
@@ -67,7 +59,7 @@ class QueryRowReader:
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._cache: OrderedDict[tuple[str, int], Row] = OrderedDict()
+        self._cache: LRUCache[tuple[str, int], Row] = LRUCache(CACHED_ROWS)
 
     def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
         """Return the (dimension,) row that a request refers to.
@@ -91,7 +83,6 @@ class QueryRowReader:
         with self._lock:
             cached = self._cache.get(cache_key)
             if cached is not None:
-                self._cache.move_to_end(cache_key)
                 return cached
         try:
             loaded = read_row(self._store, object_key, row)
@@ -107,8 +98,6 @@ class QueryRowReader:
             raise _unreadable_error(object_key)
         with self._lock:
             self._cache[cache_key] = loaded
-            while len(self._cache) > CACHED_ROWS:
-                self._cache.popitem(last=False)
         return loaded
 
 
@@ -168,7 +157,6 @@ class SearchWorker:
         self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
         self._residency = GpuResidency(device or open_search_device(settings.search_device))
-        self._int8 = Int8CodeBuilder(store, self._folder, self._attach_int8)
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
@@ -230,10 +218,6 @@ class SearchWorker:
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._query_rows.read_query(snapshot, request)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        if request.mode == Mode.DETERMINISTIC and needs_int8_codes(snapshot, row_mask, request.k):
-            self._int8.wait_for_codes(snapshot, self._settings.search_wait_seconds)
-            snapshot = self.snapshot(request.generation_id, snapshot.version)
-            row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
         options = SearchOptions(
             k=request.k,
             min_score=request.min_score,
@@ -242,23 +226,7 @@ class SearchWorker:
             most_seconds=request.most_seconds,
         )
         weighted = _weight_query(query, request.word_weights)
-        if weighted is None:
-            result = execute_query(snapshot, query, row_mask, options, self._batcher)
-        else:
-            result = execute_weighted_query(
-                snapshot, query, weighted, row_mask, options, self._batcher
-            )
-        return SearchResponse(
-            hits=result.hits,
-            # Missing chunks may contain better rows.
-            certificate=NONE if snapshot.missing else result.certificate,
-            certified_k=0 if snapshot.missing else result.certified_k,
-            rows_scanned=result.rows_scanned,
-            rows_reranked=result.rows_reranked,
-            max_z=result.max_z,
-            snapshot_version=snapshot.version,
-            missing=snapshot.missing,
-        )
+        return execute_query(snapshot, query, row_mask, options, self._batcher, weighted)
 
     @property
     def query_batcher(self) -> QueryBatcher:
@@ -351,8 +319,6 @@ class SearchWorker:
             return
         filled = self._residency.update(snapshot)
         if filled.gpu_snapshot is None and snapshot.gpu_snapshot is None:
-            if self._residency.needs_int8_codes(snapshot):
-                self._int8.start_build(snapshot)
             return
         with self._snapshots_lock:
             load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
@@ -362,18 +328,6 @@ class SearchWorker:
                 new = self._residency.carry_over(current, filled)
                 with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
-
-    def _attach_int8(self, generation_id: UUID, built: dict[UUID, Int8Codes]) -> None:
-        """Replace the current snapshot by one with its int8 codes."""
-        with self._snapshots_lock:
-            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
-        with load_lock:
-            old = self._snapshots.get(generation_id)
-            if old is None:
-                return  # the generation was dropped meanwhile
-            new = with_int8_codes(self._store, self._folder, self._memory_budget, old, built)
-            with self._snapshots_lock:
-                self._snapshots = {**self._snapshots, generation_id: new}
 
 
 def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:

@@ -15,7 +15,6 @@ from uuid import UUID
 from prometheus_client import CollectorRegistry
 from sqlalchemy.orm import Session
 
-from services.steward.job_runner import JobInterrupted, JobRunner
 from services.steward.map_evaluation import MapEvaluation
 from services.steward.metrics import StewardMetrics
 from services.steward.word_weights import WordWeightsFit
@@ -29,6 +28,7 @@ from shared.evaluation.calibration import Calibration
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.runner import JobInterrupted, JobRunner
 from shared.jobs.transitions import succeed_job
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
@@ -92,11 +92,11 @@ class EvaluationWorker:
         self._settings = settings
         kinds = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS)
         metrics = metrics or StewardMetrics(CollectorRegistry())
-        self._runner = JobRunner(catalog, settings, name, kinds, metrics)
+        self._runner = JobRunner(catalog, settings, name, kinds, metrics.count_jobs)
 
     def run(self, stop: threading.Event) -> None:
         """Run jobs until `stop` is set."""
-        self._runner.run(stop, lambda job: self._run_job(job, stop))
+        self._runner.run(lambda: self.run_next(stop), stop, stop.wait)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run the next job; False when there is none."""

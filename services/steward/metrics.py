@@ -13,6 +13,9 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from shared.jobs import JobKind
+from shared.jobs.runner import StepOutcome
+
 METRIC_PREFIX = "placewise_steward"
 # From one query that finds nothing to a walk over a whole bucket.
 TASK_BUCKETS_SECONDS = (0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 900.0)
@@ -99,9 +102,9 @@ class StewardMetrics:
         if outcome == "done":
             self._last_success[duty] = time.monotonic()
 
-    def count_job(self, kind: str, outcome: str) -> None:
-        """Record a slice of one of the steward's own jobs."""
-        self._jobs.labels(kind, outcome).inc()
+    def count_jobs(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
+        """Record a slice of the steward's own jobs."""
+        self._jobs.labels(kind, outcome).inc(jobs)
 
 
 class _TaskLagCollector(Collector):

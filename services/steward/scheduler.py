@@ -37,7 +37,7 @@ from services.steward.tasks.model_changes import (
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database_errors import OutageLog
-from shared.catalog.file_checks import sqlite_file
+from shared.catalog.schema import sqlite_file
 from shared.catalog.session import Catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
@@ -134,7 +134,7 @@ class Scheduler:
         reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
         self._journal = PeriodicTask("write journal", 2.0, JournalTask(catalog, store, metrics))
         self.tasks = [
-            *([PeriodicTask("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
+            *([PeriodicTask("keep disk reserve", 5.0, reserve.maintain)] if reserve else []),
             PeriodicTask(
                 "free leases",
                 1.0,

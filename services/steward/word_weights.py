@@ -175,8 +175,8 @@ class WordWeightsFit:
         halves = self._fit_halves(split)
         record = WordWeights(
             outcome=Outcome.NOT_ENOUGH_PAIRS,
-            reason=_not_enough_pairs_reason(split.by, halves),
-            taught_by=split.by,
+            reason=_not_enough_pairs_reason(split.source, halves),
+            taught_by=split.source,
             near_pairs=sum(half.near.pairs for half in halves),
             far_pairs=sum(half.far.pairs for half in halves),
             seed=seed,
@@ -188,7 +188,7 @@ class WordWeightsFit:
         weights_of_other_half = (_rounded_weights(halves[1]), _rounded_weights(halves[0]))
         half_of = {photo.photo_id: half for photo, half in zip(photos, split.halves, strict=True)}
         queries = [(query, weights_of_other_half[half_of[query.photo_id]]) for query in sample]
-        held_out = self._cross_validate(queries, split.by)
+        held_out = self._cross_validate(queries, split.source)
         is_better = is_significant_improvement(held_out.better, held_out.worse)
         record = record.model_copy(
             update={

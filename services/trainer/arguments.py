@@ -1,9 +1,9 @@
-"""Arguments of `placewise train`: definition, parsing, validation, and YAML input and output.
+"""Arguments of `placewise train`: definition, validation, and YAML input and output.
 
-`TrainingArguments` is the single definition. Command-line flags, YAML keys and the help text are
-generated from it. The arguments of the original GSV-Cities code (aliyassine26/gsv-cities,
-`src/configs/args.py`) keep their names, meanings and defaults, including the misspelt
-`warmpup_steps`.
+`TrainingArguments` is the single definition. pydantic parses and validates what flags and YAML
+files say; the flags and their help are generated from the model. The arguments of the original
+GSV-Cities code (aliyassine26/gsv-cities, `src/configs/args.py`) keep their names, meanings and
+defaults, including the misspelt `warmpup_steps`.
 
 Lists and dicts are JSON. The published GSV-Cities commands write some of them in Python notation,
 `(320, 320)` and `['sfxs_val']`, so both notations are accepted. An unknown key is an error that
@@ -24,36 +24,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from shared.errors import InvalidRequest, NotFound
 
-TRUE_WORDS = frozenset(("true", "yes", "on", "1"))
-FALSE_WORDS = frozenset(("false", "no", "off", "0"))
-
-
-def parse_bool(value: Any) -> Any:
-    """Parse `True`, `false`, `yes`, `0` ... as a bool.
-
-    Values that are not strings are returned unchanged, for pydantic to validate.
-
-    Raises:
-        ValueError: for any other text. A non-empty string is not silently true.
-    """
-    if not isinstance(value, str):
-        return value
-    word = value.strip().lower()
-    if word in TRUE_WORDS:
-        return True
-    if word in FALSE_WORDS:
-        return False
-    raise ValueError(f"{value!r} is neither true nor false")
-
 
 def parse_literal(value: Any) -> Any:
-    """Parse JSON or Python literal notation as a list, tuple, dict or number.
-
-    Values that are not strings are returned unchanged.
-
-    Raises:
-        ValueError: if the text is in neither notation.
-    """
+    """Parse text in JSON or Python notation; other text and other values are returned unchanged."""
     if not isinstance(value, str):
         return value
     text = value.strip()
@@ -62,36 +35,22 @@ def parse_literal(value: Any) -> Any:
             return parse(text)
         except (ValueError, SyntaxError):
             continue
-    raise ValueError(f"{value!r} is neither JSON nor Python notation")
+    return text
 
 
 def parse_names(value: Any) -> Any:
-    """Parse a list of names: a literal, a bare word, or words separated by commas."""
-    if isinstance(value, str) and re.fullmatch(r"[\w.\- ]+(,[\w.\- ]+)*", value.strip()):
+    """Parse a list of names: a literal, a word, or words separated by commas."""
+    if isinstance(value, str) and not value.lstrip().startswith(("[", "(")):
         return [name.strip() for name in value.split(",")]
     return parse_literal(value)
 
 
 def parse_image_size(value: Any) -> Any:
     """Parse `(320, 320)`, `[320, 320]`, `320 320`, `320x320` or `320` as (height, width)."""
-    if isinstance(value, str):
-        numbers = re.fullmatch(r"\s*(\d+)(?:\s*[x, ]\s*(\d+))?\s*", value)
-        if numbers:
-            return (int(numbers[1]), int(numbers[2] or numbers[1]))
-        value = parse_literal(value) if value.strip()[:1] in ("(", "[") else value.strip()
-    if isinstance(value, int):
-        return (value, value)
-    return value
-
-
-def parse_number_or_text(value: Any) -> Any:
-    """Parse a literal if the text is one, else return the text: `32` -> 32, `16-mixed` as it is."""
-    if not isinstance(value, str):
-        return value
-    try:
-        return parse_literal(value)
-    except ValueError:
-        return value.strip()
+    parsed = parse_literal(value)
+    if isinstance(parsed, str) and re.fullmatch(r"\d+\s*[x ]\s*\d+", parsed):
+        parsed = re.findall(r"\d+", parsed)
+    return (parsed, parsed) if isinstance(parsed, int) else parsed
 
 
 # fmt: off
@@ -104,7 +63,6 @@ CITIES = (
 MIN_IMAGE_PIXELS = 32
 """Minimum side in pixels; below it a ResNet's last feature map is smaller than one position."""
 
-Bool = Annotated[bool, BeforeValidator(parse_bool)]
 NameList = Annotated[tuple[str, ...], BeforeValidator(parse_names)]
 IntList = Annotated[tuple[int, ...], BeforeValidator(parse_literal)]
 HeightWidth = Annotated[tuple[int, int], BeforeValidator(parse_image_size)]
@@ -135,10 +93,10 @@ class TrainingArguments(BaseModel):
     batch_size: int = _argument(DATA, 64, "Number of places per batch.", ge=1)
     img_per_place: int = _argument(DATA, 2, "Number of photos per place in a batch.", ge=1)
     min_img_per_place: int = _argument(DATA, 2, "Skip places with fewer photos than this.", ge=1)
-    shuffle_all: Bool = _argument(
+    shuffle_all: bool = _argument(
         DATA, False, "Shuffle places across cities. False: shuffle within each city, in turn."
     )
-    random_sample_from_each_place: Bool = _argument(
+    random_sample_from_each_place: bool = _argument(
         DATA, True, "Sample a place's photos at random. False: take its first photos."
     )
     image_size: HeightWidth = _argument(
@@ -147,7 +105,7 @@ class TrainingArguments(BaseModel):
     num_workers: int = _argument(
         DATA, 8, "Number of data loader processes. 0: load in the main process.", ge=0
     )
-    show_data_stats: Bool = _argument(DATA, True, "Print data set statistics before training.")
+    show_data_stats: bool = _argument(DATA, True, "Print data set statistics before training.")
     augmentation: Literal["randaugment", "none"] = _argument(
         DATA, "randaugment", "Data augmentation of training photos: randaugment or none."
     )
@@ -156,7 +114,7 @@ class TrainingArguments(BaseModel):
     )
 
     backbone_arch: str = _argument(MODEL, "resnet18", "Name of the backbone.")
-    pretrained: Bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
+    pretrained: bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
     weights: Path | None = _argument(
         MODEL, None, "File with the backbone's weights. If omitted: the torch.hub cache."
     )
@@ -211,12 +169,12 @@ class TrainingArguments(BaseModel):
     )
     test_image_size: Annotated[
         Literal["same", "native"] | HeightWidth, BeforeValidator(parse_image_size)
-    ] = Field(
+    ] = _argument(
+        EVALUATION,
         "same",
-        description="Test photo size: same as image_size, native (batches of one), or H W pixels.",
-        json_schema_extra={"group": EVALUATION},
+        "Test photo size: same as image_size, native (batches of one), or H W pixels.",
     )
-    faiss_gpu: Bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
+    faiss_gpu: bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
     check_val_every_n_epoch: int = _argument(
         EVALUATION, 1, "Validate every n epochs, and after the last.", ge=1
     )
@@ -234,11 +192,14 @@ class TrainingArguments(BaseModel):
     run_name: str | None = _argument(
         RUN, None, "Folder name of this run. If omitted: a timestamp and the model's name."
     )
-    logger: NameList = _argument(
+    logger: Annotated[
+        tuple[Literal["csv", "tensorboard", "wandb", "mlflow", "none"], ...],
+        BeforeValidator(parse_names),
+    ] = _argument(
         RUN, ("tensorboard", "csv"), "List of csv, tensorboard, wandb and mlflow, or none."
     )
     log_every_n_steps: int = _argument(RUN, 20, "Number of steps between log entries.", ge=1)
-    fast_dev_run: Bool = _argument(
+    fast_dev_run: bool = _argument(
         RUN, False, "Run one batch of training and validation as a check; write no files."
     )
 
@@ -251,7 +212,7 @@ class TrainingArguments(BaseModel):
     save_top_k: int = _argument(
         CHECKPOINTS, 3, "Number of best checkpoints to keep. -1: all, 0: none.", ge=-1
     )
-    save_weights_only: Bool = _argument(
+    save_weights_only: bool = _argument(
         CHECKPOINTS, True, "Save best checkpoints without optimizer state; last.ckpt has it always."
     )
     filename: str = _argument(
@@ -259,22 +220,18 @@ class TrainingArguments(BaseModel):
         "{backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{R1:.4f}]_R5[{R5:.4f}]",
         "Name template of the best checkpoints. R1 is the monitored set's; SET/R1 names others.",
     )
-    auto_insert_metric_name: Bool = _argument(
+    auto_insert_metric_name: bool = _argument(
         CHECKPOINTS, False, "Insert each metric's name before its value in the file name."
     )
 
     accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _argument(
         MACHINE, "gpu", "Training accelerator: gpu, cuda, mps, cpu or auto."
     )
-    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(parse_number_or_text)] = Field(
-        (0,),
-        description="Device to train on: its index as [0], or 1 for any.",
-        json_schema_extra={"group": MACHINE},
+    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(parse_literal)] = _argument(
+        MACHINE, (0,), "Device to train on: its index as [0], or 1 for any."
     )
-    precision: Annotated[int | str, BeforeValidator(parse_number_or_text)] = Field(
-        32,
-        description="Floating-point precision: 32, 16-mixed or bf16-mixed.",
-        json_schema_extra={"group": MACHINE},
+    precision: Annotated[int | str, BeforeValidator(parse_literal)] = _argument(
+        MACHINE, 32, "Floating-point precision: 32, 16-mixed or bf16-mixed."
     )
     reload_dataloaders_every_n_epochs: int = _argument(
         DATA, 1, "Reshuffle the places every n epochs. 0: shuffle once.", ge=0
@@ -301,10 +258,6 @@ class TrainingArguments(BaseModel):
     @field_validator("logger")
     @classmethod
     def _check_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        known = ("csv", "tensorboard", "wandb", "mlflow", "none")
-        for name in names:
-            if name not in known:
-                raise ValueError(f"{name!r} is unknown; known: {', '.join(known)}")
         if "none" in names and len(names) > 1:
             raise ValueError("none cannot be combined with other loggers")
         return tuple(name for name in names if name != "none")
@@ -317,29 +270,30 @@ def argument_group(name: str) -> str:
     return str(extra["group"])
 
 
-def is_boolean(name: str) -> bool:
-    """Return whether the argument is a boolean."""
-    return TrainingArguments.model_fields[name].annotation is bool
-
-
 ALIASES = {"warmup_steps": "warmpup_steps"}
 """Correct spelling -> the name in the GSV-Cities code"""
 ARGUMENT_NAMES = tuple(TrainingArguments.model_fields)
 
 
+def normalise_name(name: str) -> str:
+    """Replace hyphens by underscores, and an alias by the argument's name."""
+    name = name.replace("-", "_")
+    return ALIASES.get(name, name)
+
+
 def resolve_name(name: str) -> str:
-    """Return an argument's canonical name: hyphens become underscores, aliases are resolved.
+    """Return an argument's canonical name.
 
     Raises:
         InvalidRequest: `unknown_argument`.
     """
-    canonical = name.replace("-", "_")
-    canonical = ALIASES.get(canonical, canonical)
-    if canonical in ARGUMENT_NAMES:
-        return canonical
-    raise InvalidRequest(
-        "unknown_argument", f"Unknown argument {name!r}.{suggest_name(canonical, ARGUMENT_NAMES)}"
-    )
+    canonical = normalise_name(name)
+    if canonical not in ARGUMENT_NAMES:
+        raise InvalidRequest(
+            "unknown_argument",
+            f"Unknown argument {name!r}.{suggest_name(canonical, ARGUMENT_NAMES)}",
+        )
+    return canonical
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:

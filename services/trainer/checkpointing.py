@@ -10,8 +10,7 @@ Names of checkpoints and run folders are templates with fields in braces:
 A field is the name of an argument, `epoch`, `step` or a metric. A prefix `self.` or `model.`, as in
 the GSV-Cities commands, is ignored. `R1` without a set is the monitored set's.
 
-Lightning's `ModelCheckpoint` is not used. It also saves in hooks other than `on_train_batch_end`,
-in which the state of the loops differs, so that a resumed run would not be identical.
+Lightning's `ModelCheckpoint` belongs to its `Trainer`; the training loop is a plain one.
 """
 
 from __future__ import annotations
@@ -140,8 +139,6 @@ def _format_value(value: Any, spec: str | None) -> str:
 
 
 LAST_CHECKPOINT = "last.ckpt"
-TRAINING_STATE_KEYS = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "MixedPrecision")
-"""Keys that a weights-only checkpoint does not have"""
 
 SaveCheckpoint = Callable[[Path, bool], None]
 """Called with a path and `weights_only`; writes the current state"""
@@ -218,14 +215,6 @@ class TopKCheckpoints:
             os.fsync(file.fileno())
         partial.replace(path)
         return path
-
-
-def copy_checkpoint(source: Path, path: Path, weights_only: bool) -> None:
-    """Copy a checkpoint; with `weights_only`, without the training state."""
-    stored = torch.load(source, map_location="cpu", weights_only=True)
-    if weights_only:
-        stored = {key: value for key, value in stored.items() if key not in TRAINING_STATE_KEYS}
-    torch.save(stored, path)
 
 
 def seed_everything(seed: int) -> None:

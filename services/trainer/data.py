@@ -1,4 +1,4 @@
-"""Training data: batch sampler, dataset, augmentation, and a data loader that resumes mid-epoch.
+"""Training data: batch sampler, dataset, augmentation and data loader.
 
 A batch holds P places x K photos. The batches of an epoch are a function of (seed, epoch) only, not
 of earlier random draws. A run that resumes in the middle of an epoch, with any number of workers,
@@ -8,10 +8,8 @@ gets the same batches as an uninterrupted run.
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +21,7 @@ from torchvision import transforms as tv
 
 from shared.datasets.open_dataset import TrainingPlace
 from shared.errors import Unprocessable
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.decode import decode_resized
 
 ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # keep the random streams independent
@@ -108,8 +107,6 @@ class PlaceBatchSampler:
 
 RANDAUGMENT_OPERATIONS = 3
 RANDAUGMENT_MAGNITUDE = 9
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 
 _randaugment = tv.RandAugment(
     num_ops=RANDAUGMENT_OPERATIONS,
@@ -221,83 +218,27 @@ def collate_batches(places: list[Batch]) -> Batch:
     )
 
 
-class ResumableDataLoader:
-    """Data loader whose position inside an epoch is part of the checkpoint.
-
-    Lightning saves `state_dict`, the epoch and the number of batches already yielded; a resumed run
-    begins with the next batch. torch's DataLoader has no such state.
-
-    Attributes:
-        seconds_waited: total time for which the consumer has waited for batches, in seconds.
-    """
-
-    def __init__(
-        self,
-        batch_sampler: PlaceBatchSampler,
-        dataset: PlaceDataset,
-        *,
-        num_workers: int,
-        pin_memory: bool,
-    ) -> None:
-        self._batch_sampler = batch_sampler
-        self.sampler = self  # Lightning calls `loader.sampler.set_epoch`
-        self.seconds_waited = 0.0
-        self._dataset = dataset
-        self._num_workers = num_workers
-        self._pin_memory = pin_memory
-        self._epoch = 0
-        self._batches_yielded = 0
-
-    def __len__(self) -> int:
-        return len(self._batch_sampler)
-
-    def set_epoch(self, epoch: int) -> None:
-        if epoch != self._epoch:
-            self._epoch, self._batches_yielded = epoch, 0
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"epoch": self._epoch, "given": self._batches_yielded}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._epoch, self._batches_yielded = state["epoch"], state["given"]
-
-    def __iter__(self) -> Iterator[Batch]:
-        # A generator: workers start with the first `next`, after Lightning has called set_epoch.
-        if self._batches_yielded >= len(self._batch_sampler):
-            self._batches_yielded = 0
-        loader: DataLoader[Batch] = DataLoader(
-            self._dataset,
-            batch_sampler=_RemainingBatches(
-                self._batch_sampler, self._epoch, self._batches_yielded
-            ),
-            num_workers=self._num_workers,
+def load_batches(
+    sampler: PlaceBatchSampler,
+    dataset: PlaceDataset,
+    epoch: int = 0,
+    start: int = 0,
+    *,
+    num_workers: int,
+    pin_memory: bool,
+) -> Iterator[Batch]:
+    """Load the epoch's batches, beginning with batch number `start`; workers read ahead."""
+    return iter(
+        DataLoader(
+            dataset,
+            batch_sampler=sampler.batches(epoch, start),
+            num_workers=num_workers,
             collate_fn=collate_batches,
-            pin_memory=self._pin_memory,
-            worker_init_fn=_init_worker if self._num_workers else None,
+            pin_memory=pin_memory,
+            worker_init_fn=_init_worker if num_workers else None,
             generator=torch.Generator(),  # else it would draw from the training's global generator
         )
-        batches = iter(loader)
-        while True:
-            started_at = time.perf_counter()
-            batch = next(batches, None)
-            self.seconds_waited += time.perf_counter() - started_at
-            if batch is None:
-                return
-            self._batches_yielded += 1
-            yield batch
-
-
-class _RemainingBatches:
-    """Batch sampler over the remaining batches of one epoch, for torch's DataLoader."""
-
-    def __init__(self, sampler: PlaceBatchSampler, epoch: int, start: int) -> None:
-        self._sampler, self._epoch, self._start = sampler, epoch, start
-
-    def __len__(self) -> int:
-        return len(self._sampler) - self._start
-
-    def __iter__(self) -> Iterator[list[PlaceSample]]:
-        return self._sampler.batches(self._epoch, self._start)
+    )
 
 
 def _init_worker(worker_id: int) -> None:

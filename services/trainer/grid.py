@@ -19,12 +19,15 @@ import itertools
 import json
 import shutil
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from services.trainer import run
 from services.trainer.arguments import (
     build_arguments,
     load_mapping,
@@ -37,12 +40,11 @@ from services.trainer.arguments import (
 from services.trainer.checkpointing import LAST_CHECKPOINT, safe_filename
 from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
-from services.trainer.module import build_model_config
+from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
 from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE
 from shared.errors import Conflict, InvalidRequest, PlacewiseError
 
-GRID_KEYS = ("base", "grid", "runs", "fingerprints")
 RESERVED_ARGUMENTS = ("default_root_dir", "run_name")
 """Arguments that the grid sets for each run"""
 
@@ -66,6 +68,26 @@ class GridPlan:
     """set name -> fingerprint of the set that published results were measured on; may be empty"""
 
 
+class ListedRun(BaseModel):
+    """A run of `runs`; its other keys are arguments."""
+
+    model_config = ConfigDict(extra="allow", coerce_numbers_to_str=True)
+
+    name: str | None = None
+    published: dict[str, float] | None = None
+
+
+class GridFile(BaseModel):
+    """The keys of a grid's YAML file."""
+
+    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
+
+    base: dict[str, Any] | None = None
+    grid: dict[str, Annotated[list[Any], Field(min_length=1)]] | None = None
+    runs: list[ListedRun] | None = None
+    fingerprints: dict[str, str] | None = None
+
+
 def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
     """Load a grid from a YAML file and validate the arguments of all runs.
 
@@ -78,16 +100,16 @@ def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
         InvalidRequest: `bad_grid`, `unknown_argument`, `bad_argument`. Also raises the errors of
             an unknown backbone, aggregator, loss or miner.
     """
-    stored = load_mapping(path)
-    for key in stored:
-        if key not in GRID_KEYS:
-            raise _grid_error(path, f"there is no key {key!r}.{suggest_name(key, GRID_KEYS)}")
-    base = resolve_keys(_require_mapping(path, "base", stored.get("base")), f"{path}, base")
+    try:
+        stored = GridFile.model_validate(load_mapping(path))
+    except ValidationError as error:
+        raise _grid_error(path, _describe_first(error)) from error
+    base = resolve_keys(stored.base or {}, f"{path}, base")
     runs = [
         _plan_run(path, name, {**base, **arguments, **overrides}, published)
         for name, arguments, published in (
-            *_expand_grid(path, _require_mapping(path, "grid", stored.get("grid"))),
-            *_listed_runs(path, stored.get("runs") or []),
+            *_expand_grid(path, stored.grid or {}),
+            *_listed_runs(path, stored.runs or []),
         )
     ]
     if not runs:
@@ -98,23 +120,20 @@ def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
         raise _grid_error(
             path, f"several runs are called {', '.join(duplicates)}; run names must be unique"
         )
-    fingerprints = _require_mapping(path, "fingerprints", stored.get("fingerprints"))
-    return GridPlan(tuple(runs), {name: str(value) for name, value in fingerprints.items()})
+    return GridPlan(tuple(runs), stored.fingerprints or {})
 
 
-def _expand_grid(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, Any], Any]]:
-    options: list[list[tuple[str, dict[str, Any]]]] = []
-    for axis, values in axes.items():
-        if not isinstance(values, list) or not values:
-            raise _grid_error(path, f"grid, {axis}: must be a list of values")
-        options.append([_axis_option(path, axis, value) for value in values])
-    runs: list[tuple[str, dict[str, Any], Any]] = []
+RunSettings = tuple[str, dict[str, Any], dict[str, float]]
+"""Name, arguments and published results"""
+
+
+def _expand_grid(path: Path, axes: Mapping[str, list[Any]]) -> Iterator[RunSettings]:
+    options = [[_axis_option(path, axis, value) for value in axes[axis]] for axis in axes]
     for combination in itertools.product(*options) if options else ():
         arguments: dict[str, Any] = {}
         for _, values in combination:
             arguments |= values
-        runs.append(("-".join(label for label, _ in combination), arguments, {}))
-    return runs
+        yield "-".join(label for label, _ in combination), arguments, {}
 
 
 def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]]:
@@ -127,17 +146,16 @@ def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]
     return str(value), {resolve_name(axis): value}
 
 
-def _listed_runs(path: Path, runs: Any) -> list[tuple[str, dict[str, Any], Any]]:
-    listed = []
-    for number, entry in enumerate(runs if isinstance(runs, list) else [runs], start=1):
-        values = dict(_require_mapping(path, f"runs, {number}", entry))
-        name = str(values.pop("name", f"{number:02d}"))
-        published = _require_mapping(path, f"{name}, published", values.pop("published", None))
-        listed.append((name, resolve_keys(values, f"{path}, runs, {name}"), published))
-    return listed
+def _listed_runs(path: Path, runs: Sequence[ListedRun]) -> Iterator[RunSettings]:
+    for number, listed in enumerate(runs, start=1):
+        name = listed.name or f"{number:02d}"
+        arguments = resolve_keys(listed.model_extra or {}, f"{path}, runs, {name}")
+        yield name, arguments, listed.published or {}
 
 
-def _plan_run(path: Path, name: str, values: dict[str, Any], published: Any) -> PlannedRun:
+def _plan_run(
+    path: Path, name: str, values: dict[str, Any], published: dict[str, float]
+) -> PlannedRun:
     reserved = [key for key in RESERVED_ARGUMENTS if key in values]
     if reserved:
         raise _grid_error(
@@ -148,20 +166,17 @@ def _plan_run(path: Path, name: str, values: dict[str, Any], published: Any) -> 
         build_model_config(arguments)
         make_loss(arguments.loss_name)
         make_miner(arguments.miner_name, arguments.miner_margin)
-        published_metrics = {str(key): float(value) for key, value in published.items()}
     except PlacewiseError as error:
         raise type(error)(error.code, f"{path}, {name}: {error.detail}") from error
-    except (TypeError, ValueError) as error:
-        raise _grid_error(path, f"{name}, published: values must be numbers") from error
-    return PlannedRun(safe_filename(name), values, published_metrics)
+    return PlannedRun(safe_filename(name), values, published)
 
 
-def _require_mapping(path: Path, location: str, value: Any) -> dict[str, Any]:
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise _grid_error(path, f"{location}: must be a mapping of names to values")
-    return value
+def _describe_first(error: ValidationError) -> str:
+    first = error.errors()[0]
+    location = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"there is no key {location!r}.{suggest_name(location, GridFile.model_fields)}"
+    return f"{location}: {first['msg']} (got {first['input']!r})"
 
 
 def _grid_error(path: Path, detail: str) -> InvalidRequest:
@@ -198,14 +213,6 @@ class RunOutcome:
     """`code` and `detail` of a failed run"""
 
 
-@dataclass(frozen=True, slots=True)
-class RunFunctions:
-    """Functions that start and resume a run: `run` and `resume` of `services.trainer.run`."""
-
-    begin: Callable[..., Json]
-    resume: Callable[..., Json]
-
-
 def load_outcome(planned: PlannedRun, out: Path) -> RunOutcome:
     """Determine the state of a planned run from its folder below `out`.
 
@@ -230,7 +237,6 @@ def load_outcome(planned: PlannedRun, out: Path) -> RunOutcome:
 def run_grid(
     plan: GridPlan,
     out: Path,
-    trainer: RunFunctions,
     display: Display,
     stop: StopRequest,
     after_each: Callable[[list[RunOutcome]], None],
@@ -240,7 +246,6 @@ def run_grid(
     Args:
         plan: the runs.
         out: root folder of the runs.
-        trainer: functions that start and resume a run.
         display: receives messages and progress.
         stop: requests a graceful stop.
         after_each: called with all outcomes after each run.
@@ -260,22 +265,22 @@ def run_grid(
             continue
         is_interrupted = outcome.state is RunState.INTERRUPTED
         display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
-        outcomes[index] = _execute_run(planned, out / planned.name, trainer, display, stop)
+        outcomes[index] = _execute_run(planned, out / planned.name, display, stop)
         after_each(outcomes)
     return outcomes
 
 
 def _execute_run(
-    planned: PlannedRun, folder: Path, trainer: RunFunctions, display: Display, stop: StopRequest
+    planned: PlannedRun, folder: Path, display: Display, stop: StopRequest
 ) -> RunOutcome:
     (folder / FAILED_FILE).unlink(missing_ok=True)
     try:
         if (folder / CHECKPOINTS_FOLDER / LAST_CHECKPOINT).is_file():
-            report = trainer.resume(folder, {}, display, stop)
+            report = run.resume(folder, {}, display, stop)
         else:
             _remove_unstarted(folder)
             reserved = {"default_root_dir": str(folder.parent), "run_name": folder.name}
-            report = trainer.begin(build_arguments(planned.arguments, reserved), display, stop)
+            report = run.run(build_arguments(planned.arguments, reserved), display, stop)
     except RunStopped:
         raise
     # Any error, such as running out of memory, must not stop the remaining runs.

@@ -49,7 +49,7 @@ def _row(outcome: RunOutcome, comparable: set[str]) -> Row:
     report = outcome.report
     row |= {name: str(report["arguments"][name]) for name in SETTING_COLUMNS}
     row["state"] = str(outcome.state)
-    metrics = {**_best_epoch(report)["figures"], **_test_metrics(report)}
+    metrics = {**best_epoch(report)["figures"], **_test_metrics(report)}
     for metric, value in metrics.items():
         set_name, _, recall_name = metric.rpartition("/")
         if int(recall_name.removeprefix("R")) not in SHOWN_KS:
@@ -73,7 +73,8 @@ def _comparable_sets(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> set[str]
     return comparable
 
 
-def _best_epoch(report: dict[str, Any]) -> dict[str, Any]:
+def best_epoch(report: dict[str, Any]) -> dict[str, Any]:
+    """Return the epoch of `metrics.json` with the best monitored metric."""
     monitor, sign = report["monitor"], 1 if report["arguments"]["mode"] == "max" else -1
     empty: dict[str, Any] = {"figures": {}}
     return max(
@@ -94,7 +95,7 @@ def _test_metrics(report: dict[str, Any]) -> dict[str, float]:
 def _score(outcome: RunOutcome) -> float:
     if outcome.state is not RunState.FINISHED or outcome.report is None:
         return float("-inf")
-    value = _best_epoch(outcome.report)["figures"].get(outcome.report["monitor"])
+    value = best_epoch(outcome.report)["figures"].get(outcome.report["monitor"])
     if value is None:
         return float("-inf")
     return float(value) if outcome.report["arguments"]["mode"] == "max" else -float(value)

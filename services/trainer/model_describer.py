@@ -15,12 +15,9 @@ from PIL import Image
 from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.evaluation.ranking import Rows, refused_photos_error
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
-
-# Mean and std of ImageNet's channels, the normalisation with which the backbones were trained.
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class ModelDescriber:

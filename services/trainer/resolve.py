@@ -115,18 +115,11 @@ def _device_index(devices: int | str | tuple[int, ...]) -> int:
     )
 
 
-LOGGER_PACKAGES = {"tensorboard": ("tensorboard",), "wandb": ("wandb",), "mlflow": ("mlflow",)}
-
-
 def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
     """Create Lightning loggers by name.
 
     Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`).
-
-    Raises:
-        Misconfigured: `logger_missing`, if a logger's package is not installed.
     """
-    check_loggers(names)
     loggers: list[Logger] = []
     for name in names:
         if name == "csv":
@@ -149,13 +142,12 @@ def check_loggers(names: tuple[str, ...]) -> None:
         Misconfigured: `logger_missing`.
     """
     for name in names:
-        for package in LOGGER_PACKAGES.get(name, ()):
-            if importlib.util.find_spec(package) is None:
-                raise Misconfigured(
-                    "logger_missing",
-                    f"--logger {name} requires the package {package}. Install it, or choose other "
-                    "loggers (csv, tensorboard, none).",
-                )
+        if name != "csv" and importlib.util.find_spec(name) is None:
+            raise Misconfigured(
+                "logger_missing",
+                f"--logger {name} requires the package {name}. Install it, or choose other "
+                "loggers (csv, tensorboard, none).",
+            )
 
 
 Json = dict[str, Any]

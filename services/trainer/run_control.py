@@ -54,30 +54,16 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.is_requested = False
-        self._is_listening = False
 
     @contextmanager
     def handle_signals(self) -> Iterator[StopRequest]:
         """Handle SIGINT and SIGTERM inside the block. Only for the main thread."""
-        before = {number: signal.getsignal(number) for number in SIGNALS}
-        self._is_listening = True
-        self.install_handlers()
+        before = {number: signal.signal(number, self._handle_signal) for number in SIGNALS}
         try:
             yield self
         finally:
-            self._is_listening = False
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-    def install_handlers(self) -> None:
-        """Install the handlers again, inside `handle_signals`; elsewhere do nothing.
-
-        Lightning replaces the handler of SIGTERM when training starts, and would end the run
-        without saving it.
-        """
-        if self._is_listening:
-            for number in SIGNALS:
-                signal.signal(number, self._handle_signal)
 
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:
         if self.is_requested:

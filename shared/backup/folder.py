@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import gzip
-import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -34,8 +33,18 @@ from shared.catalog.tables import SchemaCompatibility
 from shared.config.private_files import FILE_MODE, FOLDER_MODE, make_private_folder, write_private
 from shared.errors import Conflict, Misconfigured
 from shared.storage import ObjectStore
-from shared.storage.folder import OWNER_MARK, FolderStore
-from shared.storage.keys import FEATURES, INCOMING, ORIGINALS, QUERIES, TRASH, WORK, is_original_key
+from shared.storage.copying import copy_object
+from shared.storage.folder import FolderStore
+from shared.storage.keys import (
+    FEATURES,
+    INCOMING,
+    ORIGINALS,
+    OWNER_MARK,
+    QUERIES,
+    TRASH,
+    WORK,
+    is_original_key,
+)
 from shared.storage.protocol import ObjectInfo
 
 BACKUP_FORMAT = 1
@@ -191,7 +200,6 @@ def _unreadable(path: Path, name: str) -> Misconfigured:
     return Misconfigured("backup_unreadable", f"{path / name} can't be read. Use another backup.")
 
 
-COPY_BLOCK_BYTES = 1024 * 1024
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
 EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, TRASH, WORK)
@@ -225,32 +233,6 @@ def back_up_object(store: ObjectStore, folder: BackupFolder, info: ObjectInfo) -
     size, sha256 = copy_object(store, folder.objects, info.key)
     folder.add_to_index(BackedUpObject(info.key, size, sha256, info.modified_at.isoformat()))
     return size
-
-
-def copy_object(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int, str]:
-    """Copy an object; return its size in bytes and SHA-256. NotFound when it is missing."""
-    digest, size = hashlib.sha256(), 0
-    with source.open(key) as file:
-        writer = target.writer(key)
-        try:
-            while block := file.read(COPY_BLOCK_BYTES):
-                digest.update(block)
-                writer.write(block)
-                size += len(block)
-            writer.commit()
-        finally:
-            writer.abort()
-    return size, digest.hexdigest()
-
-
-def hash_object(store: ObjectStore, key: str) -> tuple[int, str]:
-    """Return an object's size in bytes and SHA-256. NotFound when it is missing."""
-    digest, size = hashlib.sha256(), 0
-    with store.open(key) as file:
-        while block := file.read(COPY_BLOCK_BYTES):
-            digest.update(block)
-            size += len(block)
-    return size, digest.hexdigest()
 
 
 ROWS_PER_STATEMENT = 1000

@@ -19,8 +19,6 @@ from shared.backup.folder import (
     BackupManifest,
     BackupProgress,
     backup_tables,
-    copy_object,
-    hash_object,
     list_backup_objects,
     load_rows,
 )
@@ -33,6 +31,7 @@ from shared.errors import Conflict, Misconfigured, NotFound
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_job, release_job
 from shared.storage import ObjectStore
+from shared.storage.copying import copy_object, hash_object
 
 MAX_NAMES_IN_ERROR = 5
 

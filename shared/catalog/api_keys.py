@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import BigInteger, Integer, String, Text, Uuid, func, or_, select, update
+from sqlalchemy import BigInteger, Integer, String, Text, Uuid, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus
+from shared.catalog.base import Base, JsonValue, UtcDateTime, count_rows, db_now, db_now_plus
 from shared.catalog.photos import Photo
 from shared.errors import NotFound, Unauthorized
 from shared.ids import new_id
@@ -121,8 +121,7 @@ def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:
 def has_admin_key(session: Session) -> bool:
     """Return whether a valid key with the admin scope exists."""
     usable = select(ApiKey.scopes).where(
-        ApiKey.revoked_at.is_(None),
-        or_(ApiKey.expires_at.is_(None), ApiKey.expires_at > db_now()),
+        ApiKey.revoked_at.is_(None), or_(ApiKey.expires_at.is_(None), ApiKey.expires_at > db_now())
     )
     return any(Scope.ADMIN in scopes for scopes in session.scalars(usable))
 
@@ -145,5 +144,5 @@ def record_key_use(session: Session, key_id: UUID) -> None:
 
 def count_photos_of_key(session: Session, key_id: UUID, limit: int) -> int:
     """Count the live photos uploaded with the key, up to `limit`."""
-    photos = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)).limit(limit)
-    return session.scalar(select(func.count()).select_from(photos.subquery())) or 0
+    photos = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None))
+    return count_rows(session, photos, limit)

@@ -9,31 +9,34 @@ convert column values, with the same result from SQLite and PostgreSQL.
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 from uuid import UUID
 
-from sqlalchemy import JSON, BigInteger, Column, DateTime, Dialect, Index, MetaData, Uuid, text
+import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import ARRAY, JSONB
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
+from shared.errors import NotFound
 from shared.geodesy import EARTH_RADIUS_M, flush_to_zero
 
 SQLITE_DISTANCE_FUNCTION = "placewise_distance_m"
 
 Condition = ColumnElement[bool]
+Row = TypeVar("Row")
 
 
 class UtcDateTime(TypeDecorator[datetime]):
     """An aware UTC datetime in Python; `timestamptz` in PostgreSQL, sortable text in SQLite."""
 
-    impl = DateTime(timezone=True)
+    impl = sa.DateTime(timezone=True)
     cache_ok = True
 
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_bind_param(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         if value is None:
             return None
         if value.tzinfo is None:
@@ -41,7 +44,7 @@ class UtcDateTime(TypeDecorator[datetime]):
         value = value.astimezone(UTC)
         return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
 
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_result_value(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         if value is None:
             return None
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
@@ -53,17 +56,17 @@ class CoordinateColumn(TypeDecorator[float]):
     impl = Float
     cache_ok = True
 
-    def process_bind_param(self, value: float | None, dialect: Dialect) -> float | None:
+    def process_bind_param(self, value: float | None, dialect: sa.Dialect) -> float | None:
         return None if value is None else flush_to_zero(value)
 
 
-JsonValue = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
+JsonValue = sa.JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
 
 
 class Base(DeclarativeBase):
     """Declarative base of all tables; constraints get fixed names, which migrations refer to."""
 
-    metadata = MetaData(
+    metadata = sa.MetaData(
         naming_convention={
             "ix": "ix_%(table_name)s_%(column_0_N_name)s",
             "uq": "uq_%(table_name)s_%(column_0_N_name)s",
@@ -74,9 +77,9 @@ class Base(DeclarativeBase):
     )
 
 
-def partial_index(name: str, *columns: Any, only: Condition) -> Index:
+def partial_index(name: str, *columns: Any, only: Condition, unique: bool = False) -> sa.Index:
     """Return a partial index of the rows that match `only`."""
-    return Index(name, *columns, postgresql_where=only, sqlite_where=only)
+    return sa.Index(name, *columns, unique=unique, postgresql_where=only, sqlite_where=only)
 
 
 class db_now(FunctionElement[datetime]):
@@ -183,6 +186,66 @@ def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
     return f"{SQLITE_DISTANCE_FUNCTION}({compiler.process(element.clauses, **kw)})"
 
 
+def for_update(statement: sa.Select[Row]) -> sa.Select[Row]:
+    """Lock the rows of a SELECT until the end of the transaction, and refresh loaded objects."""
+    return statement.with_for_update().execution_options(populate_existing=True)
+
+
+def page_newest_first(
+    session: Session, statement: sa.Select[Row], id_column: Any, limit: int, before: UUID | None
+) -> list[Row]:
+    """Return up to `limit` rows by descending id (UUIDv7: newest first).
+
+    Args:
+        session: The session.
+        statement: SELECT of a table, with its conditions.
+        id_column: The id column of the table.
+        limit: Page size.
+        before: Cursor: the last id of the previous page, if any.
+    """
+    if before is not None:
+        statement = statement.where(id_column < before)
+    return list(session.scalars(statement.order_by(id_column.desc()).limit(limit)))
+
+
+def get_in_map(
+    session: Session, table: type[Row], map_id: UUID, row_id: UUID, *, lock: bool = False
+) -> Row:
+    """Return a row by its id and its map; NotFound (`job_not_found` for the table of jobs)."""
+    columns: Any = table
+    statement = sa.select(table).where(columns.id == row_id, columns.map_id == map_id)
+    row = session.scalar(for_update(statement) if lock else statement)
+    if row is None:
+        noun = table.__name__.lower()
+        raise NotFound(
+            f"{noun}_not_found",
+            f"There is no {noun} {row_id} in this map.",
+            **{f"{noun}_id": str(row_id)},
+        )
+    return row
+
+
+def get_or_insert(session: Session, statement: sa.Select[Row], row: Row) -> Row:
+    """Return the row that `statement` selects; if there is none, insert and return `row`."""
+    existing = session.scalar(statement)
+    if existing is not None:
+        return existing
+    try:
+        with session.begin_nested():
+            session.add(row)
+            session.flush()
+    except IntegrityError:  # another process inserted it between the two statements
+        return session.scalars(statement).one()
+    return row
+
+
+def count_rows(session: Session, statement: sa.Select[Any], limit: int | None = None) -> int:
+    """Count the rows of a SELECT, up to `limit`."""
+    one_each = statement.with_only_columns(sa.literal(1), maintain_column_froms=True)
+    rows = one_each.limit(limit).subquery()
+    return session.scalar(sa.select(sa.func.count()).select_from(rows)) or 0
+
+
 def affected_rows(result: Any) -> int:
     """Return the number of rows that an UPDATE or DELETE affected."""
     return int(result.rowcount)
@@ -196,9 +259,9 @@ class Journaled:
     """
 
     revision: Mapped[int] = mapped_column(
-        BigInteger, default=1, server_default="1", onupdate=text("revision + 1")
+        sa.BigInteger, default=1, server_default="1", onupdate=sa.text("revision + 1")
     )
-    journaled_revision: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
+    journaled_revision: Mapped[int] = mapped_column(sa.BigInteger, default=0, server_default="0")
 
 
 def is_journaled(table: type[Journaled]) -> Condition:
@@ -215,11 +278,11 @@ def to_json(value: Any) -> Any:
     return value
 
 
-def from_json(column: Column[Any], value: Any) -> Any:
+def from_json(column: sa.Column[Any], value: Any) -> Any:
     """Convert a JSON value of `to_json` back to the value of `column`."""
     if value is None:
         return None
-    if isinstance(column.type, Uuid):
+    if isinstance(column.type, sa.Uuid):
         return UUID(value)
     if isinstance(column.type, UtcDateTime):
         return datetime.fromisoformat(value)

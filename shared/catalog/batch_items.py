@@ -21,23 +21,10 @@ from itertools import islice
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import (
-    Boolean,
-    ForeignKey,
-    Index,
-    Integer,
-    String,
-    Text,
-    Uuid,
-    func,
-    insert,
-    or_,
-    select,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue
+from shared.catalog.base import Base, JsonValue, count_rows, for_update, partial_index
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority, WaitingFor
 from shared.catalog.maps import lock_map
@@ -61,32 +48,27 @@ class BatchItem(Base):
     __tablename__ = "batch_items"
 
     job_id: Mapped[UUID] = mapped_column(
-        Uuid, ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True
+        sa.Uuid, sa.ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True
     )
-    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    name: Mapped[str] = mapped_column(Text)
-    state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
+    number: Mapped[int] = mapped_column(sa.Integer, primary_key=True, autoincrement=False)
+    name: Mapped[str] = mapped_column(sa.Text)
+    state: Mapped[JobState] = mapped_column(sa.String(20), default=JobState.QUEUED)
     # The object with its bytes; null for a member of an archive.
-    object_key: Mapped[str | None] = mapped_column(Text)
+    object_key: Mapped[str | None] = mapped_column(sa.Text)
     # Its location in the archive, or the size and hash of the uploaded file.
     source: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     fields: Mapped[dict[str, str]] = mapped_column(JsonValue, default=dict)
     # The line of the manifest with these fields.
-    line: Mapped[int | None] = mapped_column(Integer)
+    line: Mapped[int | None] = mapped_column(sa.Integer)
     # Either may have been deleted since.
-    photo_id: Mapped[UUID | None] = mapped_column(Uuid)
-    photo_job_id: Mapped[UUID | None] = mapped_column(Uuid)
-    already_there: Mapped[bool] = mapped_column(Boolean, default=False)
+    photo_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
+    photo_job_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
+    already_there: Mapped[bool] = mapped_column(sa.Boolean, default=False)
     error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
 
     __table_args__ = (
-        Index("ix_batch_items_state", "job_id", "state", "number"),
-        Index(
-            "ix_batch_items_object_key",
-            "object_key",
-            postgresql_where=object_key.is_not(None),
-            sqlite_where=object_key.is_not(None),
-        ),
+        sa.Index("ix_batch_items_state", "job_id", "state", "number"),
+        partial_index("ix_batch_items_object_key", "object_key", only=object_key.is_not(None)),
     )
 
 
@@ -126,7 +108,7 @@ def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]])
     )
     total = 0
     while chunk := list(islice(rows, ITEMS_PER_STATEMENT)):
-        session.execute(insert(BatchItem), chunk)
+        session.execute(sa.insert(BatchItem), chunk)
         total += len(chunk)
     job.params = {**job.params, "listed": True}
     job.progress_total = total
@@ -143,7 +125,7 @@ def next_queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchI
     """Return the next items to import."""
     return list(
         session.scalars(
-            select(BatchItem)
+            sa.select(BatchItem)
             .where(BatchItem.job_id == job_id, BatchItem.state == JobState.QUEUED)
             .order_by(BatchItem.number)
             .limit(limit)
@@ -155,7 +137,7 @@ def list_batch_items(
     session: Session, job_id: UUID, states: list[JobState], limit: int, after: int
 ) -> list[BatchItem]:
     """List items in their order, up to `limit`, with numbers above `after`; empty `states`: all."""
-    statement = select(BatchItem).where(BatchItem.job_id == job_id, BatchItem.number > after)
+    statement = sa.select(BatchItem).where(BatchItem.job_id == job_id, BatchItem.number > after)
     if states:
         statement = statement.where(BatchItem.state.in_(states))
     return list(session.scalars(statement.order_by(BatchItem.number).limit(limit)))
@@ -166,34 +148,30 @@ def count_queued_photos(session: Session, limit: int) -> int:
 
     Photos that wait for a vocabulary don't count: a fit may need more of them.
     """
-    waiting = (
-        select(Job.id)
-        .where(
-            Job.state.in_(UNFINISHED_STATES),
-            Job.lease_token.is_(None),
-            Job.priority >= Priority.BATCH,
-            Job.kind == JobKind.INDEX,
-            Job.waiting_for.is_(None),
-        )
-        .limit(limit)
+    waiting = sa.select(Job.id).where(
+        Job.state.in_(UNFINISHED_STATES),
+        Job.lease_token.is_(None),
+        Job.priority >= Priority.BATCH,
+        Job.kind == JobKind.INDEX,
+        Job.waiting_for.is_(None),
     )
-    return session.scalar(select(func.count()).select_from(waiting.subquery())) or 0
+    return count_rows(session, waiting, limit)
 
 
 def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
     """End items whose photos' jobs have ended, update the progress; return the counts by state."""
     ended = session.execute(
-        select(BatchItem.number, Job.state, Job.error)
+        sa.select(BatchItem.number, Job.state, Job.error)
         .outerjoin(Job, Job.id == BatchItem.photo_job_id)
         .where(
             BatchItem.job_id == job.id,
             BatchItem.state == JobState.RUNNING,
-            or_(Job.id.is_(None), Job.state.not_in(UNFINISHED_STATES)),
+            sa.or_(Job.id.is_(None), Job.state.not_in(UNFINISHED_STATES)),
         )
     ).all()
     if ended:
         session.execute(
-            update(BatchItem),
+            sa.update(BatchItem),
             [
                 {
                     "job_id": job.id,
@@ -206,7 +184,7 @@ def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
             ],
         )
     rows = session.execute(
-        select(BatchItem.state, func.count())
+        sa.select(BatchItem.state, sa.func.count())
         .where(BatchItem.job_id == job.id)
         .group_by(BatchItem.state)
     )
@@ -225,7 +203,7 @@ def update_batch_progress(job: Job, counts: Counter[JobState]) -> None:
 def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
     """Return the result of an ended batch, as photo counts; `ignored` counts other members."""
     already_there = session.scalar(
-        select(func.count())
+        sa.select(sa.func.count())
         .select_from(BatchItem)
         .where(
             BatchItem.job_id == job.id,
@@ -251,12 +229,12 @@ def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
     if active_generation(session, job.map_id) is not None:
         return False
     other = (
-        select(BatchItem.number)
+        sa.select(BatchItem.number)
         .join(Job, Job.id == BatchItem.photo_job_id)
         .where(
             BatchItem.job_id == job.id,
             BatchItem.state == JobState.RUNNING,
-            or_(Job.waiting_for.is_(None), Job.waiting_for != WaitingFor.VOCABULARY),
+            sa.or_(Job.waiting_for.is_(None), Job.waiting_for != WaitingFor.VOCABULARY),
         )
         .limit(1)
     )
@@ -267,8 +245,5 @@ def lock_batch(session: Session, job: Job, token: UUID) -> Job | None:
     """Lock the map, then the batch; return the batch if it is still under the token."""
     lock_map(session, job.map_id)
     return session.scalar(
-        select(Job)
-        .where(Job.id == job.id, Job.lease_token == token)
-        .with_for_update()
-        .execution_options(populate_existing=True)
+        for_update(sa.select(Job).where(Job.id == job.id, Job.lease_token == token))
     )

@@ -10,22 +10,10 @@ from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    ForeignKey,
-    Index,
-    Integer,
-    Select,
-    String,
-    Text,
-    Uuid,
-    func,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, UtcDateTime, db_now
+from shared.catalog.base import Base, UtcDateTime, count_rows, db_now, partial_index
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
@@ -41,31 +29,22 @@ class Chunk(Base):
 
     __tablename__ = "chunks"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"), index=True)
-    slot: Mapped[int] = mapped_column(Integer)
-    object_key: Mapped[str] = mapped_column(Text, unique=True)
-    rows: Mapped[int] = mapped_column(Integer)
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
-    sha256: Mapped[str] = mapped_column(String(64))
-    sealed: Mapped[bool] = mapped_column(Boolean, default=False)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    generation_id: Mapped[UUID] = mapped_column(
+        sa.Uuid, sa.ForeignKey("generations.id"), index=True
+    )
+    slot: Mapped[int] = mapped_column(sa.Integer)
+    object_key: Mapped[str] = mapped_column(sa.Text, unique=True)
+    rows: Mapped[int] = mapped_column(sa.Integer)
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
+    sha256: Mapped[str] = mapped_column(sa.String(64))
+    sealed: Mapped[bool] = mapped_column(sa.Boolean, default=False)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     __table_args__ = (
-        Index(
-            "ix_chunks_live",
-            "generation_id",
-            "slot",
-            postgresql_where=superseded_at.is_(None),
-            sqlite_where=superseded_at.is_(None),
-        ),
-        Index(
-            "ix_chunks_superseded",
-            "superseded_at",
-            postgresql_where=superseded_at.is_not(None),
-            sqlite_where=superseded_at.is_not(None),
-        ),
+        partial_index("ix_chunks_live", "generation_id", "slot", only=superseded_at.is_(None)),
+        partial_index("ix_chunks_superseded", "superseded_at", only=superseded_at.is_not(None)),
     )
 
 
@@ -75,15 +54,15 @@ class Descriptor(Base):
     __tablename__ = "descriptors"
 
     generation_id: Mapped[UUID] = mapped_column(
-        Uuid, ForeignKey("generations.id"), primary_key=True
+        sa.Uuid, sa.ForeignKey("generations.id"), primary_key=True
     )
-    photo_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("photos.id"), primary_key=True)
-    chunk_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("chunks.id"))
-    row: Mapped[int] = mapped_column(Integer)
+    photo_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("photos.id"), primary_key=True)
+    chunk_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("chunks.id"))
+    row: Mapped[int] = mapped_column(sa.Integer)
 
     __table_args__ = (
-        Index("uq_descriptors_chunk_row", "chunk_id", "row", unique=True),
-        Index("ix_descriptors_photo", "photo_id"),
+        sa.Index("uq_descriptors_chunk_row", "chunk_id", "row", unique=True),
+        sa.Index("ix_descriptors_photo", "photo_id"),
     )
 
 
@@ -92,7 +71,7 @@ def find_descriptor(
 ) -> tuple[Descriptor, Chunk] | None:
     """Return the photo's descriptor in the generation and its chunk; None if there is none."""
     row = session.execute(
-        select(Descriptor, Chunk)
+        sa.select(Descriptor, Chunk)
         .join(Chunk, Chunk.id == Descriptor.chunk_id)
         .where(Descriptor.generation_id == generation_id, Descriptor.photo_id == photo_id)
     ).one_or_none()
@@ -110,7 +89,7 @@ def find_descriptor_rows(
     rows_by_key: dict[str, list[tuple[int, UUID]]] = {}
     for begin in range(0, len(photo_ids), IDS_PER_QUERY):
         located = session.execute(
-            select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
+            sa.select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
             .join(Chunk, Chunk.id == Descriptor.chunk_id)
             .where(
                 Descriptor.generation_id == generation_id,
@@ -128,7 +107,7 @@ def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
     """List the chunks of the generation that are not superseded, by slot."""
     return list(
         session.scalars(
-            select(Chunk)
+            sa.select(Chunk)
             .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
             .order_by(Chunk.slot, Chunk.id)
         )
@@ -145,7 +124,7 @@ def list_live_filter_values(
 ) -> list[tuple[int, PhotoFilterValues]]:
     """List (row, filter values of its photo) of the chunk's live rows, by row."""
     rows = session.execute(
-        select(Descriptor.row, *PhotoFilterValues.COLUMNS)
+        sa.select(Descriptor.row, *PhotoFilterValues.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
         .order_by(Descriptor.row)
@@ -155,15 +134,7 @@ def list_live_filter_values(
 
 def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos, of one role or of all, with a descriptor in the generation."""
-    statement = (
-        select(func.count())
-        .select_from(Descriptor)
-        .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
-    )
-    if role is not None:
-        statement = statement.where(Photo.role == role)
-    return session.scalar(statement) or 0
+    return count_rows(session, _select_described(generation_id, role))
 
 
 def estimate_described(session: Session, generation_id: UUID) -> int:
@@ -173,7 +144,7 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
     were deleted since the last compaction.
     """
     rows = session.scalar(
-        select(func.sum(Chunk.rows)).where(
+        sa.select(sa.func.sum(Chunk.rows)).where(
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
         )
     )
@@ -187,26 +158,22 @@ def count_searchable(session: Session, generation_id: UUID) -> int:
 
 def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:
     """Count the live geotagged photos of a role with a descriptor in the generation."""
-    geotagged = _select_geotagged(generation_id, role).subquery()
-    return session.scalar(select(func.count()).select_from(geotagged)) or 0
+    return count_rows(session, _select_described(generation_id, role).where(is_geotagged()))
 
 
 def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> bool:
     """Return whether `count_geotagged` is not 0."""
-    return session.scalar(_select_geotagged(generation_id, role).limit(1)) is not None
+    geotagged = _select_described(generation_id, role).where(is_geotagged())
+    return session.scalar(geotagged.limit(1)) is not None
 
 
-def _select_geotagged(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
-    return (
-        select(Descriptor.photo_id)
+def _select_described(generation_id: UUID, role: PhotoRole | None) -> sa.Select[UUID]:
+    statement = (
+        sa.select(Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(
-            Descriptor.generation_id == generation_id,
-            Photo.deleted_at.is_(None),
-            Photo.role == role,
-            is_geotagged(),
-        )
+        .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
     )
+    return statement if role is None else statement.where(Photo.role == role)
 
 
 def allocate_slot(generation: Generation, rows: int, slot_rows: int) -> int:

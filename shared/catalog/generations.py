@@ -14,8 +14,17 @@ from uuid import UUID
 from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, String, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now
-from shared.errors import NotFound
+from shared.catalog.base import (
+    Base,
+    Journaled,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    for_update,
+    get_in_map,
+    page_newest_first,
+    partial_index,
+)
 from shared.ids import new_id
 
 
@@ -71,19 +80,14 @@ class Generation(Journaled, Base):
 
     __table_args__ = (
         # One model change at a time: with two, each photo would be described three times.
-        Index(
+        partial_index(
             "uq_generations_one_building",
             "map_id",
+            only=state == GenerationState.BUILDING,
             unique=True,
-            postgresql_where=state == GenerationState.BUILDING,
-            sqlite_where=state == GenerationState.BUILDING,
         ),
-        Index(
-            "uq_generations_one_active",
-            "map_id",
-            unique=True,
-            postgresql_where=state == GenerationState.ACTIVE,
-            sqlite_where=state == GenerationState.ACTIVE,
+        partial_index(
+            "uq_generations_one_active", "map_id", only=state == GenerationState.ACTIVE, unique=True
         ),
     )
 
@@ -97,36 +101,15 @@ def active_generation(session: Session, map_id: UUID) -> Generation | None:
     )
 
 
-def building_generation(session: Session, map_id: UUID) -> Generation | None:
-    """Return the map's generation that is being built, if any."""
-    return session.scalar(
-        select(Generation).where(
-            Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
-        )
-    )
-
-
 def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
     """Return a generation of the map; NotFound (`generation_not_found`)."""
-    generation = session.scalar(
-        select(Generation).where(Generation.id == generation_id, Generation.map_id == map_id)
-    )
-    if generation is None:
-        raise NotFound(
-            "generation_not_found",
-            f"There is no generation {generation_id} in this map.",
-            generation_id=str(generation_id),
-        )
-    return generation
+    return get_in_map(session, Generation, map_id, generation_id)
 
 
 def lock_generation(session: Session, generation_id: UUID) -> Generation:
     """Lock the generation's row until the end of the transaction, and return it refreshed."""
     return session.scalars(
-        select(Generation)
-        .where(Generation.id == generation_id)
-        .with_for_update()
-        .execution_options(populate_existing=True)
+        for_update(select(Generation).where(Generation.id == generation_id))
     ).one()
 
 
@@ -164,9 +147,7 @@ def list_evaluations(
 ) -> list[Evaluation]:
     """List the map's evaluations, newest first, up to `limit`; `before` is the page's cursor."""
     statement = select(Evaluation).where(Evaluation.map_id == map_id)
-    if before is not None:
-        statement = statement.where(Evaluation.id < before)
-    return list(session.scalars(statement.order_by(Evaluation.id.desc()).limit(limit)))
+    return page_newest_first(session, statement, Evaluation.id, limit, before)
 
 
 def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:

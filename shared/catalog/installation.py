@@ -13,10 +13,9 @@ from pathlib import Path
 from uuid import UUID
 
 from sqlalchemy import BigInteger, CheckConstraint, Integer, Uuid, select
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, get_or_insert
 from shared.catalog.chunks import Chunk
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -25,7 +24,7 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.storage import OwnedStore
-from shared.storage.folder import OWNER_MARK
+from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import BucketLocation, bucket_location, check_free, claim_store
 
@@ -52,17 +51,7 @@ class Installation(Base):
 
 def get_or_create_installation(session: Session) -> Installation:
     """Return the installation's row, created on first use."""
-    existing: Installation | None = session.scalar(select(Installation))
-    if existing is not None:
-        return existing
-    try:
-        with session.begin_nested():
-            created = Installation()
-            session.add(created)
-            session.flush()
-    except IntegrityError:  # another process created it between the two statements
-        return session.scalars(select(Installation)).one()
-    return created
+    return get_or_insert(session, select(Installation), Installation())
 
 
 def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: bool) -> OwnedStore:

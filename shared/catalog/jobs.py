@@ -32,8 +32,16 @@ from uuid import UUID
 from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid, and_, or_, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Condition, JsonValue, UtcDateTime, db_now, partial_index
-from shared.errors import NotFound
+from shared.catalog.base import (
+    Base,
+    Condition,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    get_in_map,
+    page_newest_first,
+    partial_index,
+)
 from shared.ids import new_id
 from shared.telemetry.tracing import (
     MAX_REQUEST_ID_CHARACTERS,
@@ -205,15 +213,7 @@ def select_locked_job_ids(token: UUID) -> Select[UUID]:
 
 def get_job(session: Session, map_id: UUID, job_id: UUID, *, lock: bool = False) -> Job:
     """Return a job of the map; NotFound (`job_not_found`)."""
-    statement = select(Job).where(Job.id == job_id, Job.map_id == map_id)
-    job = session.scalar(statement.with_for_update() if lock else statement)
-    if job is None:
-        raise NotFound(
-            "job_not_found",
-            f"There is no job {job_id} in this map.",
-            job_id=str(job_id),
-        )
-    return job
+    return get_in_map(session, Job, map_id, job_id, lock=lock)
 
 
 def list_jobs(
@@ -242,6 +242,4 @@ def list_jobs(
         if kinds
         else statement.where(Job.kind != JobKind.REINDEX)
     )
-    if before is not None:
-        statement = statement.where(Job.id < before)
-    return list(session.scalars(statement.order_by(Job.id.desc()).limit(limit)))
+    return page_newest_first(session, statement, Job.id, limit, before)

@@ -16,27 +16,22 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    Select,
-    String,
-    Text,
-    Uuid,
-    false,
-    func,
-    literal,
-    select,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now, db_now_plus
+from shared.catalog.base import (
+    Base,
+    Journaled,
+    JsonValue,
+    UtcDateTime,
+    count_rows,
+    db_now,
+    db_now_plus,
+    for_update,
+    get_or_insert,
+    page_newest_first,
+)
 from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import Job
@@ -54,12 +49,12 @@ class Map(Journaled, Base):
 
     __tablename__ = "maps"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    name: Mapped[str] = mapped_column(String(100), unique=True)
-    extractor: Mapped[str] = mapped_column(String(200))
-    version: Mapped[int] = mapped_column(BigInteger, default=0)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(sa.String(100), unique=True)
+    extractor: Mapped[str] = mapped_column(sa.String(200))
+    version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
     place_labels_are_paths: Mapped[bool] = mapped_column(
-        Boolean, default=False, server_default=false()
+        sa.Boolean, default=False, server_default=sa.false()
     )
     """Whether `/` separates the levels of the place labels."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
@@ -87,7 +82,7 @@ def create_map(
 
 def list_maps(session: Session) -> list[Map]:
     """List the live maps by name."""
-    return list(session.scalars(select(Map).where(Map.deleted_at.is_(None)).order_by(Map.name)))
+    return list(session.scalars(sa.select(Map).where(Map.deleted_at.is_(None)).order_by(Map.name)))
 
 
 def mark_map_deleted(session: Session, map_: Map) -> None:
@@ -102,18 +97,13 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
 def get_or_create_default_map(session: Session, extractor: str) -> Map:
     """Return the map named `default`, created on first use."""
-    existing = session.scalar(select(Map).where(Map.name == DEFAULT_MAP))
-    if existing is not None:
-        return existing
-    try:
-        return create_map(session, DEFAULT_MAP, extractor)
-    except Conflict:  # another process created it between the two statements
-        return get_map(session, DEFAULT_MAP)
+    named_default = sa.select(Map).where(Map.name == DEFAULT_MAP)
+    return get_or_insert(session, named_default, Map(name=DEFAULT_MAP, extractor=extractor))
 
 
 def get_map(session: Session, name: str) -> Map:
     """Return the live map of this name; NotFound (`map_not_found`)."""
-    map_ = session.scalar(select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
+    map_ = session.scalar(sa.select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
     if map_ is None:
         raise NotFound(
             "map_not_found",
@@ -130,12 +120,7 @@ def lock_map(session: Session, map_id: UUID) -> Map:
     Publishing, activation and deletion take this lock, so the state of the map that they read stays
     valid until they commit. SQLite has one writer and needs no row lock.
     """
-    return session.scalars(
-        select(Map)
-        .where(Map.id == map_id)
-        .with_for_update()
-        .execution_options(populate_existing=True)
-    ).one()
+    return session.scalars(for_update(sa.select(Map).where(Map.id == map_id))).one()
 
 
 def increment_map_version(session: Session, map_id: UUID) -> int:
@@ -144,7 +129,10 @@ def increment_map_version(session: Session, map_id: UUID) -> int:
     The row stays locked until the commit, so versions become visible in the order of their numbers.
     """
     return session.execute(
-        update(Map).where(Map.id == map_id).values(version=Map.version + 1).returning(Map.version)
+        sa.update(Map)
+        .where(Map.id == map_id)
+        .values(version=Map.version + 1)
+        .returning(Map.version)
     ).scalar_one()
 
 
@@ -153,22 +141,22 @@ class Search(Base):
 
     __tablename__ = "searches"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
-    generation_id: Mapped[UUID] = mapped_column(Uuid)
-    query_photo_id: Mapped[UUID | None] = mapped_column(Uuid)
-    query_filename: Mapped[str] = mapped_column(Text)
-    top_k: Mapped[int] = mapped_column(Integer)
-    results: Mapped[int] = mapped_column(Integer)
-    processing_ms: Mapped[float] = mapped_column(Float)
-    best_score: Mapped[float | None] = mapped_column(Float)
-    in_map: Mapped[bool | None] = mapped_column(Boolean)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
+    generation_id: Mapped[UUID] = mapped_column(sa.Uuid)
+    query_photo_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
+    query_filename: Mapped[str] = mapped_column(sa.Text)
+    top_k: Mapped[int] = mapped_column(sa.Integer)
+    results: Mapped[int] = mapped_column(sa.Integer)
+    processing_ms: Mapped[float] = mapped_column(sa.Float)
+    best_score: Mapped[float | None] = mapped_column(sa.Float)
+    in_map: Mapped[bool | None] = mapped_column(sa.Boolean)
     searched_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     __table_args__ = (
-        Index("ix_searches_map_time", "map_id", "searched_at"),
-        Index("ix_searches_map_id", "map_id", "id"),
-        Index("ix_searches_time", "searched_at"),
+        sa.Index("ix_searches_map_time", "map_id", "searched_at"),
+        sa.Index("ix_searches_map_id", "map_id", "id"),
+        sa.Index("ix_searches_time", "searched_at"),
     )
 
 
@@ -176,10 +164,8 @@ def list_searches(
     session: Session, map_id: UUID, limit: int, before: UUID | None = None
 ) -> list[Search]:
     """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
-    statement = select(Search).where(Search.map_id == map_id)
-    if before is not None:
-        statement = statement.where(Search.id < before)
-    return list(session.scalars(statement.order_by(Search.id.desc()).limit(limit)))
+    statement = sa.select(Search).where(Search.map_id == map_id)
+    return page_newest_first(session, statement, Search.id, limit, before)
 
 
 MIN_STATISTICS_AGE_SECONDS = 30.0
@@ -193,10 +179,10 @@ class CachedMapStatistics(Base):
 
     __tablename__ = "map_figures"
 
-    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), primary_key=True)
+    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"), primary_key=True)
     figures: Mapped[dict[str, Any]] = mapped_column(JsonValue)
     counted_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
-    took_seconds: Mapped[float] = mapped_column(Float)
+    took_seconds: Mapped[float] = mapped_column(sa.Float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,20 +214,17 @@ def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, d
         cached = session.get(CachedMapStatistics, map_id)
         if cached is not None:
             return MapStatistics(**cached.figures), cached.counted_at
-    return compute_map_statistics(session, map_id), session.execute(select(db_now())).scalar_one()
+    return compute_map_statistics(session, map_id), session.execute(
+        sa.select(db_now())
+    ).scalar_one()
 
 
 def is_large_map(session: Session, map_id: UUID) -> bool:
     """Return whether the map has more than MAX_EXACT_COUNT photos, jobs or searches."""
-    row_selects: tuple[Select[Any], ...] = (
-        select(literal(1)).select_from(Photo).where(Photo.map_id == map_id),
-        select(literal(1)).select_from(Job).where(Job.map_id == map_id),
-        select(literal(1)).select_from(Search).where(Search.map_id == map_id),
-    )
     limit = MAX_EXACT_COUNT + 1
     return any(
-        session.scalar(select(func.count()).select_from(rows.limit(limit).subquery())) == limit
-        for rows in row_selects
+        count_rows(session, sa.select(table.id).where(table.map_id == map_id), limit) == limit
+        for table in (Photo, Job, Search)
     )
 
 
@@ -250,14 +233,13 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
     day_ago = db_now_plus(-DAY_SECONDS)
-    searches = select(func.count()).select_from(Search).where(Search.map_id == map_id)
+    searches = sa.select(Search.id).where(Search.map_id == map_id)
     average, longest = session.execute(
-        select(func.avg(Search.processing_ms), func.max(Search.processing_ms)).where(
+        sa.select(sa.func.avg(Search.processing_ms), sa.func.max(Search.processing_ms)).where(
             Search.map_id == map_id, Search.searched_at > db_now_plus(-7 * DAY_SECONDS)
         )
     ).one()
-    jobs = select(Job.state, func.count()).where(Job.map_id == map_id).group_by(Job.state)
-    recent = select(func.count()).select_from(Photo).where(live, Photo.uploaded_at > day_ago)
+    jobs = sa.select(Job.state, sa.func.count()).where(Job.map_id == map_id).group_by(Job.state)
     geotagged = (
         [count_geotagged(session, generation.id, role) for role in PhotoRole]
         if generation
@@ -266,13 +248,15 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     return MapStatistics(
         photos=count_live_photos(session, map_id, PhotoRole.DATABASE),
         labelled_queries=count_live_photos(session, map_id, PhotoRole.QUERY),
-        photo_bytes=int(session.scalar(select(func.sum(Photo.size_bytes)).where(live)) or 0),
-        uploads_24h=session.scalar(recent) or 0,
+        photo_bytes=int(session.scalar(sa.select(sa.func.sum(Photo.size_bytes)).where(live)) or 0),
+        uploads_24h=count_rows(
+            session, sa.select(Photo.id).where(live, Photo.uploaded_at > day_ago)
+        ),
         searchable=count_searchable(session, generation.id) if generation else 0,
         located=geotagged[0],
         located_queries=geotagged[1],
-        searches=session.scalar(searches) or 0,
-        searches_24h=session.scalar(searches.where(Search.searched_at > day_ago)) or 0,
+        searches=count_rows(session, searches),
+        searches_24h=count_rows(session, searches.where(Search.searched_at > day_ago)),
         average_ms=average,
         longest_ms=longest,
         jobs={str(state): count for state, count in session.execute(jobs)},
@@ -285,14 +269,14 @@ def are_statistics_stale(session: Session, map_id: UUID) -> bool:
     if cached is None:
         return True
     max_age = max(MIN_STATISTICS_AGE_SECONDS, RECOUNT_REST_FACTOR * cached.took_seconds)
-    is_stale = literal(cached.counted_at, UtcDateTime()) < db_now_plus(-max_age)
-    return bool(session.scalar(select(is_stale)))
+    is_stale = sa.literal(cached.counted_at, UtcDateTime()) < db_now_plus(-max_age)
+    return bool(session.scalar(sa.select(is_stale)))
 
 
 def cache_map_statistics(session: Session, map_id: UUID) -> None:
     """Count the map's rows and cache the statistics."""
     started = time.perf_counter()
-    now = session.execute(select(db_now())).scalar_one()
+    now = session.execute(sa.select(db_now())).scalar_one()
     figures = asdict(compute_map_statistics(session, map_id))
     took = time.perf_counter() - started
     session.merge(

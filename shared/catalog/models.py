@@ -11,11 +11,18 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import BigInteger, Index, Integer, String, Text, UniqueConstraint, Uuid, select
-from sqlalchemy.exc import IntegrityError
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now
+from shared.catalog.base import (
+    Base,
+    Journaled,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    for_update,
+    get_or_insert,
+)
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured, NotFound
@@ -34,24 +41,24 @@ class Model(Journaled, Base):
 
     __tablename__ = "models"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    name: Mapped[str] = mapped_column(String(200))
-    fingerprint: Mapped[str] = mapped_column(String(64))
-    licence: Mapped[str] = mapped_column(Text)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(sa.String(200))
+    fingerprint: Mapped[str] = mapped_column(sa.String(64))
+    licence: Mapped[str] = mapped_column(sa.Text)
     card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
-    added_name: Mapped[str | None] = mapped_column(String(100))
+    added_name: Mapped[str | None] = mapped_column(sa.String(100))
     added_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    object_key: Mapped[str | None] = mapped_column(Text)
-    sha256: Mapped[str | None] = mapped_column(String(64))
-    size_bytes: Mapped[int | None] = mapped_column(BigInteger)
-    dimension: Mapped[int | None] = mapped_column(Integer)
+    object_key: Mapped[str | None] = mapped_column(sa.Text)
+    sha256: Mapped[str | None] = mapped_column(sa.String(64))
+    size_bytes: Mapped[int | None] = mapped_column(sa.BigInteger)
+    dimension: Mapped[int | None] = mapped_column(sa.Integer)
     config: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
-    note: Mapped[str | None] = mapped_column(Text)
+    note: Mapped[str | None] = mapped_column(sa.Text)
 
     __table_args__ = (
-        UniqueConstraint("name", "fingerprint"),
-        Index("uq_models_added_name", "added_name", unique=True),
+        sa.UniqueConstraint("name", "fingerprint"),
+        sa.Index("uq_models_added_name", "added_name", unique=True),
     )
 
 
@@ -59,18 +66,9 @@ def get_or_create_model(
     session: Session, name: str, fingerprint: str, licence: str, card: dict[str, Any]
 ) -> Model:
     """Return the row of these weights, created on first use."""
-    statement = select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
-    existing = session.scalar(statement)
-    if existing is not None:
-        return existing
-    try:
-        with session.begin_nested():
-            created = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
-            session.add(created)
-            session.flush()
-    except IntegrityError:  # another worker loaded the same weights
-        return session.scalars(statement).one()
-    return created
+    statement = sa.select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
+    created = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
+    return get_or_insert(session, statement, created)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,32 +100,24 @@ def register_model(session: Session, registration: ModelRegistration) -> tuple[M
     Raises:
         Conflict: `model_name_taken`: the name belongs, or belonged, to other weights.
     """
-    existing = _find_model(session, registration.name, lock=True)
-    if existing is None:
-        row = Model(
-            id=new_id(),
-            name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
-            fingerprint=registration.fingerprint,
-            licence=registration.licence or "not said",
-            card=registration.card,
-            added_name=registration.name,
-            added_at=db_now(),
-            object_key=registration.object_key,
-            sha256=registration.sha256,
-            size_bytes=registration.size_bytes,
-            dimension=registration.dimension,
-            config=registration.config,
-            note=registration.note,
-        )
-        try:
-            with session.begin_nested():
-                session.add(row)
-                session.flush()
-        except IntegrityError:  # another worker registered it first
-            existing = _find_model(session, registration.name, lock=True)
-            assert existing is not None
-        else:
-            return row, True
+    row = Model(
+        id=new_id(),
+        name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
+        fingerprint=registration.fingerprint,
+        licence=registration.licence or "not said",
+        card=registration.card,
+        added_name=registration.name,
+        added_at=db_now(),
+        object_key=registration.object_key,
+        sha256=registration.sha256,
+        size_bytes=registration.size_bytes,
+        dimension=registration.dimension,
+        config=registration.config,
+        note=registration.note,
+    )
+    existing = get_or_insert(session, _select_model(registration.name, lock=True), row)
+    if existing is row:
+        return row, True
     if existing.fingerprint != registration.fingerprint:
         removed = "" if existing.object_key else "; they were removed, but names are not reused"
         raise Conflict(
@@ -153,7 +143,7 @@ def list_registered_models(session: Session) -> list[Model]:
     """List the added models that were not removed, by name."""
     return list(
         session.scalars(
-            select(Model)
+            sa.select(Model)
             .where(Model.added_name.is_not(None), Model.object_key.is_not(None))
             .order_by(Model.added_name)
         )
@@ -162,7 +152,7 @@ def list_registered_models(session: Session) -> list[Model]:
 
 def get_registered_model(session: Session, name: str) -> Model:
     """Return the added model of this name; NotFound (`model_missing`)."""
-    model = _find_model(session, name)
+    model = session.scalar(_select_model(name))
     if model is None or model.object_key is None:
         raise NotFound("model_missing", _model_missing_detail(name), model=name)
     return model
@@ -185,7 +175,7 @@ def get_model_for_loading(session: Session, name: str, *, lock: bool = False) ->
     Raises:
         Misconfigured: `model_missing`, as for other missing weights.
     """
-    model = _find_model(session, name, lock=lock)
+    model = session.scalar(_select_model(name, lock=lock))
     if model is None or model.object_key is None:
         raise Misconfigured("model_missing", _model_missing_detail(name), model=name)
     return model
@@ -199,7 +189,7 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
         Conflict: `model_in_use`: a map or a running model change uses it, or `new_map_extractor`,
             the extractor of new maps, does.
     """
-    row = _find_model(session, name, lock=True)
+    row = session.scalar(_select_model(name, lock=True))
     if row is None or row.object_key is None:
         raise NotFound("model_missing", _model_missing_detail(name), model=name)
     maps = list_maps_using_model(session, row)
@@ -229,7 +219,7 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
     A map uses it with its active generation, a generation that is being built, or its extractor.
     """
     by_generation = (
-        select(Map.name)
+        sa.select(Map.name)
         .join(Generation, Generation.map_id == Map.id)
         .where(
             Map.deleted_at.is_(None),
@@ -237,15 +227,13 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
             Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
         )
     )
-    by_extractor = select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
+    by_extractor = sa.select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
     return sorted({*session.scalars(by_generation), *session.scalars(by_extractor)})
 
 
-def _find_model(session: Session, name: str, *, lock: bool = False) -> Model | None:
-    statement = select(Model).where(Model.added_name == name)
-    if lock:
-        statement = statement.with_for_update().execution_options(populate_existing=True)
-    return session.scalar(statement)
+def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:
+    statement = sa.select(Model).where(Model.added_name == name)
+    return for_update(statement) if lock else statement
 
 
 def _model_missing_detail(name: str) -> str:

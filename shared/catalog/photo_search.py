@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session, aliased
 from shared.catalog.base import (
     Condition,
     UtcDateTime,
+    count_rows,
     db_distance_m,
     filename_trigrams,
     json_array_has,
@@ -114,8 +115,7 @@ def search_photos(
     on_postgres = session.get_bind().dialect.name == "postgresql"
     live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
     conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
-    matches = select(literal(1)).select_from(Photo).where(*conditions).limit(MAX_COUNTED_MATCHES)
-    total = session.scalar(select(func.count()).select_from(matches.subquery())) or 0
+    total = count_rows(session, select(Photo.id).where(*conditions), MAX_COUNTED_MATCHES)
     newest = (Photo.uploaded_at.desc(), Photo.id.desc())
     if after is not None:
         live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_cursor_bound(after)))

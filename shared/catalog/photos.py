@@ -10,27 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any, ClassVar
 from uuid import UUID
 
-from sqlalchemy import (
-    BigInteger,
-    CheckConstraint,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    String,
-    Text,
-    Uuid,
-    and_,
-    column,
-    func,
-    or_,
-    select,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import (
@@ -40,17 +23,14 @@ from shared.catalog.base import (
     Journaled,
     JsonValue,
     UtcDateTime,
+    count_rows,
     db_now,
     filename_trigrams,
     partial_index,
 )
+from shared.catalog.photo_role import PhotoRole as PhotoRole
 from shared.errors import Gone, NotFound
 from shared.ids import new_id
-
-
-class PhotoRole(StrEnum):
-    DATABASE = "database"  # indexed and searchable
-    QUERY = "query"  # a labelled query for evaluations: described, but never a search result
 
 
 class Photo(Journaled, Base):
@@ -62,92 +42,84 @@ class Photo(Journaled, Base):
 
     __tablename__ = "photos"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
-    job_id: Mapped[UUID | None] = mapped_column(Uuid)
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
+    job_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
     role: Mapped[PhotoRole] = mapped_column(
-        String(10), default=PhotoRole.DATABASE, server_default=PhotoRole.DATABASE
+        sa.String(10), default=PhotoRole.DATABASE, server_default=PhotoRole.DATABASE
     )
-    sha256: Mapped[str] = mapped_column(String(64))
-    object_key: Mapped[str] = mapped_column(Text)
-    filename: Mapped[str] = mapped_column(Text)
-    media_type: Mapped[str] = mapped_column(String(50))
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
-    width: Mapped[int] = mapped_column(Integer)
-    height: Mapped[int] = mapped_column(Integer)
+    sha256: Mapped[str] = mapped_column(sa.String(64))
+    object_key: Mapped[str] = mapped_column(sa.Text)
+    filename: Mapped[str] = mapped_column(sa.Text)
+    media_type: Mapped[str] = mapped_column(sa.String(50))
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
+    width: Mapped[int] = mapped_column(sa.Integer)
+    height: Mapped[int] = mapped_column(sa.Integer)
     latitude: Mapped[float | None] = mapped_column(CoordinateColumn)
     longitude: Mapped[float | None] = mapped_column(CoordinateColumn)
-    heading: Mapped[float | None] = mapped_column(Float)
+    heading: Mapped[float | None] = mapped_column(sa.Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    place: Mapped[str | None] = mapped_column(Text)
+    place: Mapped[str | None] = mapped_column(sa.Text)
     tags: Mapped[list[str]] = mapped_column(JsonValue, default=list)
     attributes: Mapped[dict[str, Any]] = mapped_column("metadata", JsonValue, default=dict)
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    changed_version: Mapped[int] = mapped_column(BigInteger, default=0)
-    key_id: Mapped[UUID | None] = mapped_column(Uuid)  # the API key of the upload, if any
+    changed_version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
+    key_id: Mapped[UUID | None] = mapped_column(sa.Uuid)  # the API key of the upload, if any
 
     __table_args__ = (
-        CheckConstraint(
+        sa.CheckConstraint(
             "(latitude IS NULL) = (longitude IS NULL)", name="coordinates_come_in_pairs"
         ),
-        Index(
-            "uq_photos_live_sha256",
-            "map_id",
-            "sha256",
-            unique=True,
-            postgresql_where=deleted_at.is_(None),
-            sqlite_where=deleted_at.is_(None),
-        ),
-        Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
-        Index("ix_photos_map_changed", "map_id", "changed_version"),
-        Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
-        Index("ix_photos_object_key", "object_key"),
         partial_index(
-            "ix_photos_not_journaled", "id", only=column("revision") != column("journaled_revision")
+            "uq_photos_live_sha256", "map_id", "sha256", only=deleted_at.is_(None), unique=True
+        ),
+        sa.Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
+        sa.Index("ix_photos_map_changed", "map_id", "changed_version"),
+        sa.Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
+        sa.Index("ix_photos_object_key", "object_key"),
+        partial_index(
+            "ix_photos_not_journaled",
+            "id",
+            only=sa.column("revision") != sa.column("journaled_revision"),
         ),
         partial_index(
-            "ix_photos_key", "key_id", only=and_(deleted_at.is_(None), key_id.is_not(None))
+            "ix_photos_key", "key_id", only=sa.and_(deleted_at.is_(None), key_id.is_not(None))
         ),
         partial_index("ix_photos_map_size", "map_id", "size_bytes", only=deleted_at.is_(None)),
         partial_index(
             "ix_photos_map_captured",
             "map_id",
             "captured_at",
-            only=and_(deleted_at.is_(None), captured_at.is_not(None)),
+            only=sa.and_(deleted_at.is_(None), captured_at.is_not(None)),
         ),
         partial_index(
             "ix_photos_map_place",
             "map_id",
             "place",
-            only=and_(deleted_at.is_(None), place.is_not(None)),
+            only=sa.and_(deleted_at.is_(None), place.is_not(None)),
         ),
         partial_index(
             "ix_photos_map_labelled",
             "map_id",
             "id",
-            only=and_(deleted_at.is_(None), role == PhotoRole.QUERY),
+            only=sa.and_(deleted_at.is_(None), role == PhotoRole.QUERY),
         ),
         # Over all maps: a GIN index on an array can't have the map as its first column.
-        Index(
+        sa.Index(
             "ix_photos_tags",
             "tags",
             postgresql_using="gin",
             postgresql_ops={"tags": "jsonb_path_ops"},
             postgresql_where=deleted_at.is_(None),
         ).ddl_if(dialect="postgresql"),
-        Index(
+        sa.Index(
             "ix_photos_filename",
             filename_trigrams(filename),
             postgresql_using="gin",
             postgresql_where=deleted_at.is_(None),
         ).ddl_if(dialect="postgresql"),
-        Index(
-            "ix_photos_deleted",
-            "deleted_at",
-            postgresql_where=deleted_at.is_not(None),
-            sqlite_where=deleted_at.is_not(None),
-        ),
+        partial_index("ix_photos_deleted", "deleted_at", only=deleted_at.is_not(None)),
     )
 
 
@@ -184,15 +156,13 @@ class PhotoFilterValues:
 def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
     """Return a live photo of the map; NotFound (`photo_not_found`)."""
     photo = session.scalar(
-        select(Photo).where(
+        sa.select(Photo).where(
             Photo.id == photo_id, Photo.map_id == map_id, Photo.deleted_at.is_(None)
         )
     )
     if photo is None:
         raise NotFound(
-            "photo_not_found",
-            f"There is no photo {photo_id} in this map.",
-            file_id=str(photo_id),
+            "photo_not_found", f"There is no photo {photo_id} in this map.", file_id=str(photo_id)
         )
     return photo
 
@@ -200,7 +170,7 @@ def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
 def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
     """Return the map's live photo with this hash, if any."""
     return session.scalar(
-        select(Photo).where(
+        sa.select(Photo).where(
             Photo.map_id == map_id, Photo.sha256 == sha256, Photo.deleted_at.is_(None)
         )
     )
@@ -209,7 +179,7 @@ def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo |
 def get_live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
     """Return the live photos among the ids, by id."""
     photos = session.scalars(
-        select(Photo).where(Photo.id.in_(list(photo_ids)), Photo.deleted_at.is_(None))
+        sa.select(Photo).where(Photo.id.in_(list(photo_ids)), Photo.deleted_at.is_(None))
     )
     return {photo.id: photo for photo in photos}
 
@@ -219,7 +189,7 @@ def list_photos_changed_since(
 ) -> list[PhotoFilterValues]:
     """Return the current values of the photos that were changed or deleted after `version`."""
     rows = session.execute(
-        select(*PhotoFilterValues.COLUMNS).where(
+        sa.select(*PhotoFilterValues.COLUMNS).where(
             Photo.map_id == map_id, Photo.changed_version > version
         )
     )
@@ -228,19 +198,13 @@ def list_photos_changed_since(
 
 def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos of the map, of one role or of all."""
-    statement = (
-        select(func.count())
-        .select_from(Photo)
-        .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
-    )
-    if role is not None:
-        statement = statement.where(Photo.role == role)
-    return session.scalar(statement) or 0
+    statement = sa.select(Photo.id).where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+    return count_rows(session, statement if role is None else statement.where(Photo.role == role))
 
 
 def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     """Return whether the map has a live photo of the role."""
-    statement = select(Photo.id).where(
+    statement = sa.select(Photo.id).where(
         Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
     )
     return session.scalar(statement.limit(1)) is not None
@@ -248,37 +212,37 @@ def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
 
 def is_geotagged() -> Condition:
     """Condition for photos with coordinates or a place label."""
-    return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
+    return sa.or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
 
 
 def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
     """Hide the photo from all responses from this commit on; its objects are deleted later."""
     session.execute(
-        update(Photo)
+        sa.update(Photo)
         .where(Photo.id == photo.id)
         .values(deleted_at=db_now(), changed_version=version)
     )
 
 
 class PresignedUpload(Base):
-    """A presigned upload. `status` and `answer` are the response of its completion."""
+    """A presigned upload. `status` and `response_body` are the response of its completion."""
 
     __tablename__ = "direct_uploads"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
-    filename: Mapped[str] = mapped_column(Text)
-    size_bytes: Mapped[int] = mapped_column(BigInteger)
-    sha256: Mapped[str] = mapped_column(String(64))
-    said: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
-    status: Mapped[int | None] = mapped_column(Integer)
-    answer: Mapped[str | None] = mapped_column(Text)  # JSON, as it was sent
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
+    filename: Mapped[str] = mapped_column(sa.Text)
+    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
+    sha256: Mapped[str] = mapped_column(sa.String(64))
+    photo_fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
+    status: Mapped[int | None] = mapped_column(sa.Integer)
+    response_body: Mapped[str | None] = mapped_column("answer", sa.Text)  # JSON, as it was sent
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     expires_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
     __table_args__ = (
-        Index("ix_direct_uploads_expires_at", "expires_at"),
-        Index("ix_direct_uploads_map", "map_id"),
+        sa.Index("ix_direct_uploads_expires_at", "expires_at"),
+        sa.Index("ix_direct_uploads_map", "map_id"),
     )
 
 
@@ -292,7 +256,7 @@ def get_presigned_upload(
         Gone: `upload_expired`.
     """
     statement = (
-        select(PresignedUpload, (PresignedUpload.expires_at <= db_now()).label("expired"))
+        sa.select(PresignedUpload, (PresignedUpload.expires_at <= db_now()).label("expired"))
         .where(PresignedUpload.id == upload_id, PresignedUpload.map_id == map_id)
         .execution_options(populate_existing=True)
     )
@@ -303,7 +267,7 @@ def get_presigned_upload(
             f"There is no upload {upload_id} in this map. Start one: POST /api/v1/uploads/presign.",
         )
     upload: PresignedUpload = row[0]
-    if row.expired and upload.answer is None:
+    if row.expired and upload.response_body is None:
         raise Gone(
             "upload_expired",
             f"The upload {upload_id} expired before it was completed. Start another one: POST "

@@ -1,8 +1,6 @@
-"""Database sessions: engine, connection pool, timeouts, transactions and their retries.
+"""Database sessions: SQLite engine, pool and timeout settings, transactions and their retries.
 
-Timeouts are set inside the transaction (`SET LOCAL`) and no statements are prepared on the server,
-so that PgBouncer in transaction mode works. Without prepared statements the planner also sees the
-values: a plan that is good for a map with a million photos is bad for one with ten.
+`shared.catalog.postgres` has the engine for PostgreSQL.
 """
 
 from __future__ import annotations
@@ -17,10 +15,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Self, TypeVar
 
-import psycopg
-from psycopg.abc import RV, PQGen
-from sqlalchemy import Connection, Engine, create_engine, event
-from sqlalchemy.engine import URL, make_url
+from sqlalchemy import create_engine, event
+from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
@@ -34,18 +30,6 @@ log = logging.getLogger(__name__)
 # idle_in_transaction_session_timeout: a transaction is idle only between two statements, which
 # takes no time unless the process hangs. PostgreSQL then ends it and releases its locks.
 PING_AFTER_IDLE_SECONDS = 60.0
-# Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
-ANSWER_MARGIN_SECONDS = 2.0
-PING_TIMEOUT_SECONDS = 2.0
-
-# Detects a peer that disappeared without closing the connection (lost network or machine).
-TCP_KEEPALIVE_OPTIONS = {
-    "keepalives": 1,
-    "keepalives_idle": 10,  # seconds
-    "keepalives_interval": 3,  # seconds
-    "keepalives_count": 3,
-    "tcp_user_timeout": 10_000,  # milliseconds that sent bytes may stay unacknowledged
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,77 +87,6 @@ class PoolConfig:
         )
 
 
-class TimeoutConnection(psycopg.Connection[Any]):
-    """A connection with a client-side timeout for responses.
-
-    The server's own timeouts need a working server: one that is frozen, or whose disk hangs, keeps
-    its connections open and does not respond.
-    """
-
-    answer_seconds: float | None = PING_TIMEOUT_SECONDS
-    """Response timeout; None for no timeout."""
-
-    def wait(self, gen: PQGen[RV], interval: float = 0.1, timeout: float | None = None) -> RV:
-        try:
-            return super().wait(gen, interval, self.answer_seconds if timeout is None else timeout)
-        except psycopg.OperationalError:
-            if self.pgconn.transaction_status == psycopg.pq.TransactionStatus.ACTIVE:
-                self.pgconn.finish()  # a late response must not be read as that of another query
-            raise
-
-
-def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
-    """Create the engine.
-
-    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions.
-    """
-    engine = create_engine(
-        url,
-        pool_size=pool.size,
-        max_overflow=pool.overflow,
-        pool_timeout=pool.wait_seconds,
-        pool_pre_ping=True,
-        creator=_connector(url, pool),
-    )
-    event.listen(engine, "begin", _set_timeouts)
-    event.listen(engine, "checkin", _limit_ping)
-    return engine
-
-
-def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
-    arguments: dict[str, Any] = {
-        "application_name": pool.name,
-        # psycopg accepts whole seconds from 2 on.
-        "connect_timeout": max(2, round(pool.connect_seconds)),
-        **TCP_KEEPALIVE_OPTIONS,
-        **url.translate_connect_args(username="user", database="dbname"),
-        **url.query,  # the operator's options override the others
-    }
-
-    def connect() -> TimeoutConnection:
-        return TimeoutConnection.connect(prepare_threshold=None, **arguments)
-
-    return connect
-
-
-def _set_timeouts(connection: Connection) -> None:
-    limits: TransactionTimeouts | None = connection.get_execution_options().get("placewise_limits")
-    driver = connection.connection.driver_connection
-    assert isinstance(driver, TimeoutConnection)
-    driver.answer_seconds = None
-    if limits is None:
-        return
-    if limits.statement_seconds:
-        driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
-    if not driver.autocommit:  # SET LOCAL needs a transaction
-        connection.exec_driver_sql(limits.sql())
-
-
-def _limit_ping(connection: TimeoutConnection | None, _record: object) -> None:
-    if connection is not None:  # None: the connection was invalidated
-        connection.answer_seconds = PING_TIMEOUT_SECONDS
-
-
 # A longer wait for SQLite's single write lock is caused by a bug, not by load.
 SQLITE_BUSY_SECONDS = 60
 
@@ -203,15 +116,14 @@ class Catalog:
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.engine = create_engine(
-                self.url,
-                connect_args={
-                    "timeout": SQLITE_BUSY_SECONDS,
-                    "check_same_thread": False,
-                },
+                self.url, connect_args={"timeout": SQLITE_BUSY_SECONDS, "check_same_thread": False}
             )
             event.listen(self.engine, "connect", _prepare_sqlite)
             event.listen(self.engine, "begin", _begin_sqlite)
         else:
+            # Imported here, because psycopg takes a while to load.
+            from shared.catalog.postgres import make_postgres_engine
+
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
         # SQLite has one writer: a lock is fair and does not poll, unlike SQLite's busy handler.

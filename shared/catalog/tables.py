@@ -9,22 +9,23 @@ from sqlalchemy import String
 from sqlalchemy.orm import Mapped, mapped_column
 
 # A foreign key may refer to a table whose module a service does not import itself.
-import shared.catalog.tables  # noqa: F401
-from shared.catalog.api_keys import ApiKey
+from shared.catalog import (  # noqa: F401
+    api_keys,
+    batch_items,
+    chunks,
+    generations,
+    idempotency,
+    installation,
+    jobs,
+    maps,
+    models,
+    photos,
+    processes,
+    vocabularies,
+    webhooks,
+)
 from shared.catalog.base import Base
-from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.idempotency import IdempotencyRecord
-from shared.catalog.installation import Installation
-from shared.catalog.jobs import Job
-from shared.catalog.maps import CachedMapStatistics, Map, Search
-from shared.catalog.models import Model
-from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.processes import RegisteredProcess, RegisteredSearchWorker
 from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
-from shared.catalog.vocabularies import StoredWhitening, Vocabulary
-from shared.catalog.webhooks import Delivery, Webhook
 from shared.config.settings import Settings
 
 
@@ -51,29 +52,3 @@ def open_catalog(
         PoolConfig.from_settings(settings, service),
         TransactionTimeouts.for_background(settings) if limits is None else limits,
     )
-
-
-__all__ = [
-    "ApiKey",
-    "BatchItem",
-    "CachedMapStatistics",
-    "Chunk",
-    "Delivery",
-    "Descriptor",
-    "Evaluation",
-    "Generation",
-    "IdempotencyRecord",
-    "Installation",
-    "Job",
-    "Map",
-    "Model",
-    "Photo",
-    "PresignedUpload",
-    "RegisteredProcess",
-    "RegisteredSearchWorker",
-    "SchemaCompatibility",
-    "Search",
-    "StoredWhitening",
-    "Vocabulary",
-    "Webhook",
-]

@@ -10,9 +10,9 @@ from uuid import UUID
 from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now
+from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
 from shared.catalog.generations import Generation, active_generation
-from shared.errors import Conflict, NotFound
+from shared.errors import Conflict
 from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES
 from shared.ids import new_id
 
@@ -101,16 +101,7 @@ def add_vocabulary(
 
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
     """Return a vocabulary of the map; NotFound (`vocabulary_not_found`)."""
-    vocabulary = session.scalar(
-        select(Vocabulary).where(Vocabulary.id == vocabulary_id, Vocabulary.map_id == map_id)
-    )
-    if vocabulary is None:
-        raise NotFound(
-            "vocabulary_not_found",
-            f"There is no vocabulary {vocabulary_id} in this map.",
-            vocabulary_id=str(vocabulary_id),
-        )
-    return vocabulary
+    return get_in_map(session, Vocabulary, map_id, vocabulary_id)
 
 
 def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:

@@ -18,7 +18,14 @@ from uuid import UUID
 from sqlalchemy import Index, Integer, String, Text, Uuid, delete, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, partial_index
+from shared.catalog.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    page_newest_first,
+    partial_index,
+)
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -121,9 +128,7 @@ def list_deliveries(
 ) -> list[Delivery]:
     """List the webhook's deliveries, newest first, up to `limit`; `before` is the page's cursor."""
     statement = select(Delivery).where(Delivery.webhook_id == webhook_id)
-    if before is not None:
-        statement = statement.where(Delivery.id < before)
-    return list(session.scalars(statement.order_by(Delivery.id.desc()).limit(limit)))
+    return page_newest_first(session, statement, Delivery.id, limit, before)
 
 
 def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:

@@ -38,7 +38,7 @@ from shared.codes.rotation import Floats, get_rotation
 from shared.codes.sign_codes import ROWS_PER_BLOCK
 
 INT8_MAX = 127
-QUERY_MAX = 127 * 128 + 63  # so that both parts of 128 high + low are int8
+QUERY_MAX = 127 * 128 + 63
 ROUNDING_MARGIN = 1e-9
 MIN_SCALE = 1e-30  # rows without a larger number become zeros: their scale would leave float32
 
@@ -90,12 +90,6 @@ class Int8Query:
         scale, residual, _, _ = measures[0].tolist()
         error = (residual + 1.01 * (rotation.error + 2.0**-24)) * (1 + ROUNDING_MARGIN)
         return cls(numbers[0], scale, error)
-
-    @property
-    def parts(self) -> Bytes:
-        """(2, padded) int8: 128 times the first part plus the second is `numbers`."""
-        high = (self.numbers + 64) >> 7
-        return np.stack([high, self.numbers - 128 * high]).astype(np.int8)
 
 
 def int8_codes(rows: Floats) -> Int8Codes:

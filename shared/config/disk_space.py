@@ -54,7 +54,7 @@ class DiskReserve:
                 RESERVE_BYTES,
             )
 
-    def keep(self) -> None:
+    def maintain(self) -> None:
         """Delete the reserve when the disk is nearly full; write it when there is enough space."""
         self.release()
         if not self._file.exists() and shutil.disk_usage(self._folder).free >= self._needed_bytes:

@@ -159,7 +159,7 @@ class ExtractorSettings(BaseSettings):
             vlad_desc_dim=self.vlad_desc_dim,
         )
 
-    def recipe(self, name: str) -> ExtractorConfig:
+    def extractor_config(self, name: str) -> ExtractorConfig:
         """Return the configuration of an extractor that this installation may load.
 
         Raises:

@@ -134,7 +134,6 @@ PATH_COLUMNS = ("path", "filename", "file")
 COLUMN_ALIASES = {"lat": "latitude", "lon": "longitude", "UTMx": "easting", "UTMy": "northing"}
 """Canonical columns by the names that other datasets use"""
 NUMBER_COLUMNS = ("latitude", "longitude", "easting", "northing", "heading")
-TEXT_COLUMNS = ("zone", "place", "sequence")
 
 
 def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhoto, ...]:

@@ -130,7 +130,7 @@ class Extractor:
         self.preprocessing: Preprocessing = _preprocessing(recipe, self.backbone)
         assert recipe.width in (None, self.backbone.width), "recipe.width must match the backbone"
 
-    def at(self, precision: Precision) -> Extractor:
+    def with_precision(self, precision: Precision) -> Extractor:
         """Return an extractor with the same weights that computes in `precision`."""
         if precision == self.precision:
             return self

@@ -41,21 +41,6 @@ class PointSource(Protocol):
         """Return rows [begin, end) on the CPU."""
 
 
-class InMemoryPoints:
-    """A PointSource in memory."""
-
-    def __init__(self, points: torch.Tensor) -> None:
-        """`points`: (n, D) float32 on the CPU."""
-        self._points = points
-        self.width = points.shape[1]
-
-    def __len__(self) -> int:
-        return len(self._points)
-
-    def read(self, begin: int, end: int) -> torch.Tensor:
-        return self._points[begin:end]
-
-
 class PointBatches:
     """Points in batches of about equal size, read in blocks of several batches.
 

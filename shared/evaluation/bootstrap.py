@@ -38,6 +38,10 @@ class ConfidenceInterval:
     def as_json(self) -> list[float]:
         return [self.low, self.high]
 
+    def as_percent(self) -> str:
+        """Return the bounds in per cent: `41.2 to 57.0`."""
+        return f"{100 * self.low:.1f} to {100 * self.high:.1f}"
+
 
 @dataclass(frozen=True, slots=True)
 class PairedDifference:
@@ -56,6 +60,12 @@ class PairedDifference:
     def is_significant(self) -> bool:
         """Whether the interval excludes 0."""
         return self.low is not None and self.high is not None and not self.low <= 0 <= self.high
+
+    def interval_in_points(self) -> str | None:
+        """Return the interval in percentage points: `-1.2 to +3.4`; None with too few clusters."""
+        if self.low is None or self.high is None:
+            return None
+        return f"{100 * self.low:+.1f} to {100 * self.high:+.1f}"
 
     def as_json(self) -> dict[str, float | int | bool | None]:
         return {**asdict(self), "beyond_chance": self.is_significant}

@@ -474,6 +474,8 @@ def _choose_thresholds(
             and (position > 0 or limit is None or s.not_in_map <= limit)
         ]
         threshold = _lowest_threshold(eligible, position, certainty)
+        if position == 0 and threshold is not None:
+            threshold = max(threshold, cut)  # the limit holds above it only
         levels.append(threshold)
         cut = certainty if threshold is None else threshold
         answered = {id(s) for s in eligible if s.probabilities[position] >= cut}

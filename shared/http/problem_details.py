@@ -128,7 +128,7 @@ async def _handle_validation_error(request: Request, error: Exception) -> JSONRe
         errors = [
             {
                 "field": ".".join(str(part) for part in failure["loc"][1:]),
-                "detail": failure["msg"],
+                "detail": "is unknown" if failure["type"] == "extra_forbidden" else failure["msg"],
             }
             for failure in failures
         ]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from shared.catalog.photos import PhotoRole
+from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error
 
 MAX_TAGS = 50

@@ -15,6 +15,7 @@ from shared.imaging.file_formats import ACCEPTED_PHOTOS, PHOTO_SIGNATURE_BYTES, 
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, read_form_fields
 from shared.storage import ObjectStore
+from shared.storage.copying import hash_file
 
 MAX_NAME_CHARACTERS = 255
 
@@ -33,6 +34,15 @@ class StoredUpload:
     """Values by the names of the upload form."""
     content: bytes | None = None
     """The whole file, if it is small and still in memory."""
+
+    @classmethod
+    def read(cls, store: ObjectStore, key: str, filename: str) -> StoredUpload:
+        """Read a stored object. NotFound when it is missing."""
+        with store.open(key) as file:
+            first_bytes = file.read(PHOTO_SIGNATURE_BYTES)
+            file.seek(0)
+            size_bytes, sha256 = hash_file(file)
+        return cls(key, filename, size_bytes, sha256, first_bytes)
 
     def open(self, store: ObjectStore) -> BinaryIO:
         """Open the file, from memory or from the store."""

@@ -39,6 +39,7 @@ from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import Wakeups
 from shared.storage import ObjectStore
 from shared.storage.chunks import decode_rows, manifest_key, rows_are_valid
+from shared.storage.copying import hash_object
 
 
 class FaultKind(StrEnum):
@@ -147,8 +148,6 @@ def verify_chunk(
         yield IntegrityFault(FaultKind.DIFFERENT, "chunk", object_key, detail, chunk_id)
 
 
-READ_BLOCK_BYTES = 1024 * 1024
-
 VerifyProgress = Callable[[str, int, int], object]
 """Progress callback: kind of objects, number done, total."""
 
@@ -228,17 +227,14 @@ def _verify_object(
 def _verify_content(
     store: ObjectStore, one: ReferencedObject, report: IntegrityReport
 ) -> Iterator[IntegrityFault]:
-    digest = hashlib.sha256()
     try:
-        with store.open(one.key) as file:
-            while block := file.read(READ_BLOCK_BYTES):
-                digest.update(block)
-                report.read_bytes += len(block)
+        size_bytes, sha256 = hash_object(store, one.key)
     except NotFound:
         yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
         return
+    report.read_bytes += size_bytes
     report.checked[one.what] += 1
-    if digest.hexdigest() != one.sha256:
+    if sha256 != one.sha256:
         yield IntegrityFault(
             FaultKind.DAMAGED, one.what, one.key, f"{one.what} {one.row_id}: its hash differs"
         )

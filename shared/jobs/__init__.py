@@ -1,4 +1,4 @@
-"""The job queue: claims, leases, state transitions and wake-ups.
+"""The job queue: claims, leases, the job runner, state transitions and wake-ups.
 
 The `jobs` table is the queue and the only source of truth. A wake-up (`shared.jobs.wakeups`), also
 called a hint, only makes a worker look at the table sooner.
@@ -6,7 +6,8 @@ called a hint, only makes a worker look at the table sooner.
 
 from shared.catalog.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.claim import claim_jobs, mark_started
-from shared.jobs.leases import extend_lease, maintain_lease, reclaim_expired_leases
+from shared.jobs.leases import extend_lease, maintain_lease
+from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.wakeups import InProcessWakeups, Wakeups
 
 __all__ = [

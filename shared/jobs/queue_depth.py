@@ -1,9 +1,12 @@
-"""Queue depth and throughput, measured with bounded counts."""
+"""Queue depth and throughput: bounded counts, and a cache that bounds the cost of polling them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -17,6 +20,47 @@ MAX_COUNTED_FINISHED = 100_000  # in THROUGHPUT_WINDOW_SECONDS: above any real t
 
 # All but `reindex`: a model change queues every photo of its map, with the lowest priority.
 BACKLOG_PRIORITIES = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
+
+
+POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
+
+T = TypeVar("T")
+
+
+class PolledValue(Generic[T]):
+    """A value that is polled when it is read, but at most once per interval. Thread-safe.
+
+    While one thread polls, the others get the previous value; they wait for the first one.
+
+    Args:
+        poll: Returns the value. Its exceptions reach the reader, and the next reader polls again.
+        interval_seconds: Minimum time between two polls; longer if a poll is slow.
+    """
+
+    _value: T
+
+    def __init__(self, poll: Callable[[], T], interval_seconds: float) -> None:
+        self._poll = poll
+        self._interval_seconds = interval_seconds
+        self._lock = threading.Lock()
+        self._next_poll: float | None = None
+
+    def get(self) -> T:
+        """Return the value."""
+        if self._is_due() and self._lock.acquire(blocking=self._next_poll is None):
+            try:
+                if self._is_due():  # otherwise another thread has polled meanwhile
+                    started = time.monotonic()
+                    self._value = self._poll()
+                    elapsed = time.monotonic() - started
+                    pause = max(self._interval_seconds, POLL_COST_DIVISOR * elapsed)
+                    self._next_poll = started + pause
+            finally:
+                self._lock.release()
+        return self._value
+
+    def _is_due(self) -> bool:
+        return self._next_poll is None or time.monotonic() >= self._next_poll
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,11 @@ def _event_data(session: Session, job: Job) -> dict[str, Any]:
 
 
 def release_job(
-    job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None
+    job: Job,
+    *,
+    after_seconds: float = 0.0,
+    waiting_for: WaitingFor | None = None,
+    problem: dict[str, Any] | None = None,
 ) -> None:
     """End the job's lease without counting an attempt, so that it is claimed again later.
 
@@ -98,10 +102,12 @@ def release_job(
         job: The claimed job.
         after_seconds: Delay before it may be claimed.
         waiting_for: What it waits for; it can't be claimed until `wake_waiting_jobs`.
+        problem: Why it has to be retried, an RFC 9457 problem.
     """
     job.state = JobState.RUNNING if job.kind in CHECKPOINTED_JOBS else JobState.QUEUED
     job.waiting_for = waiting_for
     job.run_after = db_now_plus(after_seconds) if after_seconds else None
+    job.error = problem
     _drop_lease(job)
 
 

@@ -32,7 +32,6 @@ from shared.catalog.photos import Photo, get_live_photos
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
-from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
 from shared.ingest.store_photo import insert_photo, retry_on_conflict
 from shared.ingest.validation import StoredUpload, ValidatedPhoto, validate_photo
 from shared.rebuild.rows import ROWS_PER_STATEMENT, Progress
@@ -211,9 +210,6 @@ def _read_manifest(store: ObjectStore, key: str) -> _Manifest | None:
         return None
 
 
-BLOCK_BYTES = 1024 * 1024
-
-
 @dataclass(slots=True)
 class RecoveredOriginals:
     """Counts of the recovered originals."""
@@ -244,13 +240,13 @@ def recover_originals(
         progress: called for each original.
     """
     recovered = RecoveredOriginals()
-    for done, (key, size_bytes, modified_at) in enumerate(unnamed, start=1):
+    for done, (key, _, modified_at) in enumerate(unnamed, start=1):
         progress("originals that are not in the journal", done, len(unnamed))
         with catalog.read() as session:
             if _is_known(session, key):
                 continue
         try:
-            received = _read_upload(store, key, size_bytes)
+            received = StoredUpload.read(store, key, f"{key.removeprefix(ORIGINALS)}.photo")
             incoming = validate_photo(store, received, settings.max_image_pixels)
         except NotFound:
             continue  # deleted since it was listed
@@ -292,7 +288,7 @@ def _default_map(session: Session, settings: Settings, extractor: str | None) ->
     if extractor is not None:
         # The extractor may not be loadable here; the photos are then described with the default.
         with contextlib.suppress(Misconfigured):
-            name = settings.recipe(extractor).name
+            name = settings.extractor_config(extractor).name
     return get_or_create_default_map(session, name).id
 
 
@@ -303,13 +299,3 @@ def _is_known(session: Session, key: str) -> bool:
         or session.scalar(select(BatchItem.job_id).where(BatchItem.object_key == key).limit(1))
         is not None
     )
-
-
-def _read_upload(store: ObjectStore, key: str, size_bytes: int) -> StoredUpload:
-    digest, first_bytes = hashlib.sha256(), b""
-    with store.open(key) as file:
-        while block := file.read(BLOCK_BYTES):
-            first_bytes = first_bytes or block[:PHOTO_SIGNATURE_BYTES]
-            digest.update(block)
-    name = f"{key.removeprefix(ORIGINALS)}.photo"
-    return StoredUpload(key, name, size_bytes, digest.hexdigest(), first_bytes)

@@ -133,8 +133,6 @@ RESPONSE_MARGIN_SECONDS = 0.2  # for a call that times out at the deadline to re
 RETRY_PAUSE_SECONDS = 0.05  # before lagging workers are called again
 
 BEHIND, UNREADABLE = "search_behind", "chunk_unreadable"
-RETRYABLE_CODES = (BEHIND, "codes_being_made")  # the worker may answer in a moment
-PERMANENT_CODES = (UNREADABLE, "codes_not_made")
 
 
 class HttpSearchClient:
@@ -145,9 +143,8 @@ class HttpSearchClient:
 
     Raises:
         Gone, NotFound: As the workers raise them.
-        Unavailable: `chunk_unreadable`, `codes_being_made`, `codes_not_made` as the workers raise
-            them; `search_behind` when no shard reaches `min_version` in time; `search_unavailable`
-            when no shard answers.
+        Unavailable: `chunk_unreadable` as the workers raise it; `search_behind` when no shard
+            reaches `min_version` in time; `search_unavailable` when no shard answers.
     """
 
     def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
@@ -247,9 +244,9 @@ class HttpSearchClient:
                     self._workers.mark_down(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)
-                    if error.code in RETRYABLE_CODES:
+                    if error.code == BEHIND:  # the worker may answer in a moment
                         behind, retry = error, True
-                    elif error.code in PERMANENT_CODES:
+                    elif error.code == UNREADABLE:
                         unreadable = error
             if unreadable is not None:
                 raise unreadable  # permanent, and no other worker could answer

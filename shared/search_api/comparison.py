@@ -16,27 +16,13 @@ from pydantic import BaseModel, ConfigDict
 
 from shared.errors import Gone, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
+from shared.search_api.protocol import SearchHit
 
 MAX_RERANK_CANDIDATES = 50  # about three batches of photos, for which other queries have to wait
 
 
 class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class RerankCandidate(_Message):
-    """A search hit that is to be reranked or explained."""
-
-    photo_id: UUID
-    score: float
-    """Cosine similarity in [-1, 1]."""
-    weighted_score: float | None = None
-    """Cosine similarity to the query with weighted words; None for a plain ranking."""
-
-    @property
-    def ranked_by(self) -> float:
-        """The score that the search ranked by."""
-        return self.score if self.weighted_score is None else self.weighted_score
 
 
 class CompareRequest(_Message):
@@ -49,7 +35,7 @@ class CompareRequest(_Message):
 
     query_photo_id: UUID | None
     query_job_id: UUID | None
-    candidates: tuple[RerankCandidate, ...]
+    candidates: tuple[SearchHit, ...]
     rerank: int
     explain: int
     word_weights: tuple[float, ...] = ()
@@ -126,7 +112,4 @@ def check_explainable(recipe: ExtractorConfig, spec: Mapping[str, Any] | None) -
 
 def query_expired_error() -> Gone:
     """Error for a query whose photo or descriptor has expired."""
-    return Gone(
-        "query_expired",
-        "The query has expired (QUERY_TTL_SECONDS). Send the query again.",
-    )
+    return Gone("query_expired", "The query has expired (QUERY_TTL_SECONDS). Send the query again.")

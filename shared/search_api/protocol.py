@@ -149,7 +149,7 @@ class DeviceStatus(_Message):
     resident_bytes: int
     """Bytes of descriptors in the GPU's memory."""
     generations: dict[UUID, str]
-    """Generations searched on the GPU, with their row format, `float16` or `int8`; the others are
+    """Generations searched on the GPU, with their row format, `float16`; the others are
     searched on the CPU."""
     failure: str | None = None
     """Last error, after which the CPU searches until the next attempt; None if there is none."""

@@ -52,13 +52,7 @@ def call_search(
         WorkerUnavailable: The worker could not be reached, or failed.
         PlacewiseError: As the worker answered it.
     """
-    body = _call(
-        http,
-        "POST",
-        f"{url}/search",
-        timeout_seconds,
-        content=request.as_json(),
-    )
+    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.as_json())
     return _read(SearchResponse, url, body)
 
 
@@ -75,11 +69,7 @@ def _read(kind: type[Message], url: str, body: bytes) -> Message:
 
 
 def _call(
-    http: httpx2.Client,
-    method: str,
-    url: str,
-    timeout_seconds: float,
-    content: str | None = None,
+    http: httpx2.Client, method: str, url: str, timeout_seconds: float, content: str | None = None
 ) -> bytes:
     headers = {"Content-Type": "application/json"} if content is not None else {}
     request_id = current_request_id()

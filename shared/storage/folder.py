@@ -19,9 +19,16 @@ from typing import BinaryIO
 
 from shared.config.disk_space import DISK_FULL
 from shared.config.private_files import create_private_file, make_private_folder, write_private
-from shared.errors import NotFound, StorageFull, Unavailable
+from shared.errors import StorageFull, Unavailable
 from shared.ids import new_id
-from shared.storage.keys import TRASH, check_key, is_valid_key
+from shared.storage.keys import (
+    OWNER_MARK,
+    TRASH,
+    check_key,
+    check_note_name,
+    is_valid_key,
+    object_not_found_error,
+)
 from shared.storage.protocol import ObjectInfo
 
 log = logging.getLogger(__name__)
@@ -29,12 +36,10 @@ log = logging.getLogger(__name__)
 # A missing file, a file among the parents, or a folder: for a store of keys, all are missing keys.
 NOT_FOUND_ERRORS = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 # The folder of files being written, on the same file system, so that a rename is atomic.
-PARTIAL_SUFFIX = ".partial"
-OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
+PARTIAL_FOLDER = ".partial"
 # The trash of such a separate folder, on the same disk, so that moving there is a rename.
 SEPARATE_TRASH = f"{OWNER_MARK}-trash"
 FULL_RETRY_SECONDS = 60
-BLOCK_BYTES = 1024 * 1024
 RESERVED_FREE_BYTES = 16 * 1024 * 1024  # left to the catalog, which needs space to delete rows
 
 
@@ -59,8 +64,8 @@ class FolderStore:
         self.root = root
         self._separate_folders = dict(separate_folders or {})
         for folder in self._folders():
-            make_private_folder(folder / PARTIAL_SUFFIX)
-            for partial in (folder / PARTIAL_SUFFIX).iterdir() if exclusive else ():
+            make_private_folder(folder / PARTIAL_FOLDER)
+            for partial in (folder / PARTIAL_FOLDER).iterdir() if exclusive else ():
                 partial.unlink()
 
     def path(self, key: str) -> Path:
@@ -72,7 +77,7 @@ class FolderStore:
         folder, parts = self._locate(key)
         return FolderWriter(
             folder.joinpath(*parts),
-            folder / PARTIAL_SUFFIX / str(new_id()),
+            folder / PARTIAL_FOLDER / str(new_id()),
             lambda: self._empty_trash(folder) > 0,
         )
 
@@ -92,7 +97,7 @@ class FolderStore:
         try:
             return self.path(key).open("rb")
         except NOT_FOUND_ERRORS:
-            raise _not_found_error(key) from None
+            raise object_not_found_error(key) from None
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         with self.open(key) as file:
@@ -128,7 +133,7 @@ class FolderStore:
     def move(self, source: str, target: str) -> None:
         old, new = self.path(source), self.path(target)
         if self.head(source) is None:
-            raise _not_found_error(source)
+            raise object_not_found_error(source)
         try:
             os.utime(old)
             changed_folders = _make_parents(new)
@@ -140,7 +145,7 @@ class FolderStore:
                 self._copy(old, target)  # one of the folders is a mount point
                 old.unlink()
         except NOT_FOUND_ERRORS:
-            raise _not_found_error(source) from None
+            raise object_not_found_error(source) from None
         for folder in (*changed_folders, old.parent):
             _sync_folder(folder)
 
@@ -154,7 +159,7 @@ class FolderStore:
             return None
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
-        note, partial = self._note(name), self.root / PARTIAL_SUFFIX / str(new_id())
+        note, partial = self._note(name), self.root / PARTIAL_FOLDER / str(new_id())
         write_private(partial, data.decode())
         if replace:
             partial.replace(note)
@@ -169,7 +174,7 @@ class FolderStore:
 
     def check(self) -> None:
         for folder in self._folders():
-            probe = folder / PARTIAL_SUFFIX / str(new_id())
+            probe = folder / PARTIAL_FOLDER / str(new_id())
             try:
                 with create_private_file(probe) as file:
                     file.write(b"ok")
@@ -199,9 +204,7 @@ class FolderStore:
         return folder, parts
 
     def _note(self, name: str) -> Path:
-        if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
-            raise ValueError(f"not the name of a note: {name!r}")
-        return self.root / name
+        return self.root / check_note_name(name)
 
     def _trash_of(self, folder: Path) -> Path:
         return folder / (TRASH.rstrip("/") if folder == self.root else SEPARATE_TRASH)
@@ -232,8 +235,7 @@ class FolderStore:
         writer = self.writer(key)
         try:
             with path.open("rb") as file:
-                while block := file.read(BLOCK_BYTES):
-                    writer.write(block)
+                shutil.copyfileobj(file, writer)
             writer.commit()
         finally:
             writer.abort()
@@ -292,7 +294,7 @@ class FolderWriter:
     def __init__(self, target: Path, partial: Path, free_space: Callable[[], bool]) -> None:
         self._target = target
         self._partial = partial
-        self._make_room = free_space
+        self._free_space = free_space
         while shutil.disk_usage(partial.parent).free < RESERVED_FREE_BYTES:
             if not free_space():
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -306,7 +308,7 @@ class FolderWriter:
             try:
                 remaining = remaining[self._file.write(remaining) :]
             except OSError as error:
-                if error.errno not in DISK_FULL or not self._make_room():
+                if error.errno not in DISK_FULL or not self._free_space():
                     raise
 
     @_raise_storage_full()
@@ -328,13 +330,9 @@ class FolderWriter:
         self._partial.unlink(missing_ok=True)
 
 
-def _not_found_error(key: str) -> NotFound:
-    return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
-
-
 def _is_reserved(name: str) -> bool:
     """Return whether the store uses a top-level name itself, so that no object may have it."""
-    return name == PARTIAL_SUFFIX or name.startswith(OWNER_MARK)
+    return name == PARTIAL_FOLDER or name.startswith(OWNER_MARK)
 
 
 def _make_parents(file: Path) -> Sequence[Path]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from datetime import date
 from uuid import UUID
 
-from shared.errors import Misconfigured
+from shared.errors import Misconfigured, NotFound
 from shared.ids import new_id
+
+OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
 
 INCOMING = "incoming/"
 ARCHIVES = "archives/"
@@ -55,6 +57,17 @@ def check_key(key: str) -> str:
     if not is_valid_key(key):
         raise ValueError(f"not an object key: {key!r}")
     return key
+
+
+def check_note_name(name: str) -> str:
+    """Return the name of a note; ValueError where it is not valid."""
+    if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
+        raise ValueError(f"not the name of a note: {name!r}")
+    return name
+
+
+def object_not_found_error(key: str) -> NotFound:
+    return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
 
 
 def trash_key(key: str, day: date) -> str:

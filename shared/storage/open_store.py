@@ -17,10 +17,9 @@ from shared.config.private_files import make_private_folder, write_private
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.storage.folder import OWNER_MARK, FolderStore
-from shared.storage.keys import ORIGINALS, check_import_prefix
+from shared.storage.folder import FolderStore
+from shared.storage.keys import ORIGINALS, OWNER_MARK, check_import_prefix
 from shared.storage.protocol import OwnedStore
-from shared.storage.s3 import Bucket, S3Store
 
 ORIGINALS_FOLDER = ORIGINALS.rstrip("/")
 
@@ -113,6 +112,8 @@ def open_store(settings: Settings, *, exclusive: bool = True) -> OwnedStore:
     """
     check_import_prefix(settings.import_prefix)
     if settings.s3_endpoint is not None:
+        from shared.storage.s3 import Bucket, S3Store  # importing minio is slow
+
         return S3Store(Bucket.from_settings(settings))
     home = settings.placewise_home
     objects = home / "objects"

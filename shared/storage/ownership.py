@@ -14,10 +14,9 @@ from typing import TypedDict
 from uuid import UUID
 
 from shared.errors import Misconfigured
-from shared.storage.folder import OWNER_MARK, PARTIAL_SUFFIX, FolderStore
-from shared.storage.keys import ORIGINALS, QUERIES, WORK, is_original_key
+from shared.storage.folder import PARTIAL_FOLDER, FolderStore
+from shared.storage.keys import ORIGINALS, OWNER_MARK, QUERIES, WORK, is_original_key
 from shared.storage.protocol import OwnedStore
-from shared.storage.s3 import S3Store
 
 log = logging.getLogger(__name__)
 
@@ -94,8 +93,11 @@ def claim_store(
 
 def bucket_location(store: OwnedStore) -> BucketLocation | None:
     """Return the location of a bucket; None for a folder."""
-    if not isinstance(store, S3Store):
+    if isinstance(store, FolderStore):
         return None
+    from shared.storage.s3 import S3Store  # importing minio is slow
+
+    assert isinstance(store, S3Store), "there are two kinds"
     return BucketLocation(endpoint=store.bucket.endpoint, bucket=store.bucket.name)
 
 
@@ -114,7 +116,7 @@ def check_free(store: OwnedStore, import_prefix: str) -> None:
 
 def store_taken_error(store: OwnedStore, reason: str) -> Misconfigured:
     """Return the error for a store of another catalog, with advice for the operator."""
-    code = "bucket_taken" if isinstance(store, S3Store) else "folder_taken"
+    code = "folder_taken" if isinstance(store, FolderStore) else "bucket_taken"
     return Misconfigured(
         code,
         f"{_display_name(store)} {reason} (DATABASE_URL, or PLACEWISE_HOME where that is not set). "
@@ -152,21 +154,23 @@ def _has_objects(store: OwnedStore, import_prefix: str) -> bool:
         if info.key.startswith((OWNER_MARK, import_prefix)):
             continue
         is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if isinstance(store, S3Store) or not (is_foreign or info.key.startswith((QUERIES, WORK))):
-            return True
+        if isinstance(store, FolderStore) and (is_foreign or info.key.startswith((QUERIES, WORK))):
+            continue
+        return True
     return False
 
 
 def _display_name(store: OwnedStore) -> str:
-    if isinstance(store, S3Store):
-        return f"The bucket {store.bucket.name} (S3_BUCKET) at {store.bucket.endpoint}"
-    assert isinstance(store, FolderStore), "there are two kinds"
-    return f"The folder {store.root}"
+    if isinstance(store, FolderStore):
+        return f"The folder {store.root}"
+    location = bucket_location(store)
+    assert location is not None, "there are two kinds"
+    return f"The bucket {location['bucket']} (S3_BUCKET) at {location['endpoint']}"
 
 
 def _check_no_objects(folder: Path) -> None:
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != OWNER_MARK)
-    if any(PARTIAL_SUFFIX not in path.parts for path in files):
+    if any(PARTIAL_FOLDER not in path.parts for path in files):
         raise Misconfigured(
             "object_store_changed",
             f"There are objects in {folder}, which would be missing with a bucket. Unset "

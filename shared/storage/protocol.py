@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Protocol, runtime_checkable
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +122,7 @@ class OwnedStore(ObjectStore, Protocol):
         """Delete the note; a missing one is not an error."""
 
 
+@runtime_checkable
 class PresigningStore(OwnedStore, Protocol):
     """A store with presigned uploads: a bucket."""
 

@@ -17,8 +17,7 @@ from datetime import date, datetime
 from enum import StrEnum
 
 from shared.errors import NotFound
-from shared.storage.folder import OWNER_MARK
-from shared.storage.keys import TRASH, key_before_trash, trash_key
+from shared.storage.keys import OWNER_MARK, TRASH, key_before_trash, trash_key
 from shared.storage.protocol import ObjectInfo, ObjectStore, OwnedStore
 
 

@@ -8,10 +8,13 @@ training photos, so that no place of the evaluation is in the training set.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.datasets.utm_filenames import UtmFileName
 from shared.synthetic_city.camera import Camera
@@ -78,6 +81,9 @@ class PlannedPhoto:
     """Relative to the dataset's root"""
     name: str
 
+    def path(self, root: Path) -> Path:
+        return root / self.folder / self.name
+
 
 @dataclass(frozen=True, slots=True)
 class CityPlan:
@@ -87,6 +93,17 @@ class CityPlan:
     quarters: dict[str, Quarter]
     photos: list[PlannedPhoto]
     """Sorted so that neighbours in a street follow each other"""
+
+    def evaluation_photos(self) -> tuple[list[PlannedPhoto], list[PlannedPhoto]]:
+        """Return the database photos, and the queries whose place is in the map."""
+        database = [photo for photo in self.photos if photo.role == "database"]
+        queries = [p for p in self.photos if p.role == "query" and p.kind != "out_of_map"]
+        return database, queries
+
+
+def positions_m(photos: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
+    """Return the (n, 2) UTM metres of the photos' cameras."""
+    return np.array([(photo.camera.x, photo.camera.y) for photo in photos])
 
 
 def city_name(options: CityOptions) -> str:

@@ -210,7 +210,7 @@ class _RenderWorker:
         """Render and write the photos [start, stop) of the plan; return their number."""
         photos = self.plan.photos[start:stop]
         for photo in photos:
-            (self.out / photo.folder / photo.name).write_bytes(self.render_photo(photo))
+            photo.path(self.out).write_bytes(self.render_photo(photo))
         return len(photos)
 
     def render_photo(self, photo: PlannedPhoto) -> bytes:

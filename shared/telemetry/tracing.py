@@ -1,8 +1,8 @@
 """Distributed tracing with OpenTelemetry, and the id of the current request.
 
-Tracing is on where OTEL_EXPORTER_OTLP_ENDPOINT is set. Otherwise OpenTelemetry is not imported, and
-a span costs next to nothing. A trace leads from a request through its job to the transaction that
-completes it: the job's row carries the W3C `traceparent` (https://www.w3.org/TR/trace-context/).
+Tracing is on where OTEL_EXPORTER_OTLP_ENDPOINT is set. Otherwise the spans of `opentelemetry-api`
+do nothing. A trace leads from a request through its job to the transaction that completes it: the
+job's row carries the W3C `traceparent` (https://www.w3.org/TR/trace-context/).
 
 The gateway takes the request id from `X-Request-ID` or creates one. It is stored in the job's row,
 and the worker runs the job under the same id. Log lines, spans and requests to search carry it.
@@ -14,7 +14,18 @@ import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
+
+from opentelemetry.context import Context
+from opentelemetry.trace import (
+    Link,
+    NoOpTracer,
+    Span,
+    Tracer,
+    format_trace_id,
+    get_current_span,
+)
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -26,36 +37,15 @@ if TYPE_CHECKING:
 
 Attribute = str | int | float | bool | Sequence[str]
 
+MAX_SPAN_LINKS = 64  # per span; most backends drop further ones
 
-class SpanUpdate(Protocol):
-    """Renames the current span and adds attributes to it."""
-
-    def __call__(self, name: str, **attributes: Attribute) -> object: ...
-
-
-class Tracer(Protocol):
-    """The tracer that `configure_tracing` installs."""
-
-    def span(
-        self,
-        name: str,
-        parents: Sequence[str],
-        attributes: dict[str, Attribute],
-    ) -> contextlib.AbstractContextManager[SpanUpdate]: ...
-
-    def traceparent(self) -> str | None: ...
-
-    def close(self) -> None: ...
+_tracer: Tracer = NoOpTracer()
+_propagator = TraceContextTextMapPropagator()
 
 
-_tracer: Tracer | None = None
-_trace_id: ContextVar[str | None] = ContextVar("trace_id", default=None)
-
-
-@contextlib.contextmanager
 def span(
     name: str, parents: Sequence[str | None] = (), **attributes: Attribute | None
-) -> Iterator[SpanUpdate]:
+) -> contextlib.AbstractContextManager[Span]:
     """Trace the block as a span; an exception of the block is recorded in it.
 
     Args:
@@ -64,41 +54,39 @@ def span(
             batch of several requests' jobs, it is linked to all. Without any it is a child of the
             current span. None values are ignored.
         attributes: attributes of the span; None values are ignored.
-
-    Yields:
-        A function that renames the span and adds attributes.
     """
-    if _tracer is None:
-        yield _ignore_update
-        return
-    traceparents = [parent for parent in parents if parent is not None]
-    set_attributes = {key: value for key, value in attributes.items() if value is not None}
-    with _tracer.span(name, traceparents, set_attributes) as update:
-        parent = _tracer.traceparent()
-        token = _trace_id.set(parent.split("-")[1] if parent else None)
-        try:
-            yield update
-        finally:
-            _trace_id.reset(token)
-
-
-def _ignore_update(name: str, **attributes: Attribute) -> None:
-    pass
+    contexts = [
+        _propagator.extract({"traceparent": parent}, Context())
+        for parent in dict.fromkeys(parents)
+        if parent is not None
+    ]
+    several = len(contexts) > 1
+    links = [Link(get_current_span(context).get_span_context()) for context in contexts]
+    return _tracer.start_as_current_span(
+        name,
+        context=None if several or not contexts else contexts[0],
+        links=links[:MAX_SPAN_LINKS] if several else None,
+        attributes={key: value for key, value in attributes.items() if value is not None},
+    )
 
 
 def current_traceparent() -> str | None:
     """Return the W3C `traceparent` of the current span; None without tracing."""
-    return _tracer.traceparent() if _tracer is not None else None
+    carrier: dict[str, str] = {}
+    _propagator.inject(carrier)
+    return carrier.get("traceparent")
 
 
 def current_trace_id() -> str | None:
     """Return the id of the current trace, 32 hexadecimal digits; None without tracing."""
-    return _trace_id.get()
+    context = get_current_span().get_span_context()
+    return format_trace_id(context.trace_id) if context.is_valid else None
 
 
+@contextlib.contextmanager
 def configure_tracing(
     settings: Settings, service: str, exporter: SpanExporter | None = None
-) -> contextlib.AbstractContextManager[None]:
+) -> Iterator[None]:
     """Trace this process while the block runs, and flush the remaining spans at its end.
 
     Args:
@@ -109,10 +97,16 @@ def configure_tracing(
     Raises:
         Misconfigured: `otel_missing` where tracing is on without the extra `otel`.
     """
-    if settings.otel_exporter_otlp_endpoint is None and exporter is None:
-        return contextlib.nullcontext()
+    global _tracer
+    endpoint = settings.otel_exporter_otlp_endpoint
+    if endpoint is None and exporter is None:
+        yield
+        return
     try:
-        from shared.telemetry.otlp import OpenTelemetryTracer
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+        from opentelemetry.sdk.resources import Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ModuleNotFoundError as error:
         raise Misconfigured(
             "otel_missing",
@@ -120,18 +114,18 @@ def configure_tracing(
             "Install the extra `otel` (uv pip install '.[otel]'; the images include it), or unset "
             "the variable.",
         ) from None
-    return _tracing(OpenTelemetryTracer(service, settings.otel_exporter_otlp_endpoint, exporter))
-
-
-@contextlib.contextmanager
-def _tracing(tracer: Tracer) -> Iterator[None]:
-    global _tracer
-    _tracer = tracer
+    if exporter is None:
+        # By the OTLP specification, the base endpoint is shared, and each signal adds its path.
+        exporter = OTLPSpanExporter(endpoint=f"{str(endpoint).rstrip('/')}/v1/traces")
+    # The SDK adds OTEL_RESOURCE_ATTRIBUTES and reads OTEL_EXPORTER_OTLP_HEADERS and the like.
+    provider = TracerProvider(resource=Resource.create({"service.name": f"placewise-{service}"}))
+    provider.add_span_processor(BatchSpanProcessor(exporter))
+    _tracer = provider.get_tracer("placewise")
     try:
         yield
     finally:
-        _tracer = None
-        tracer.close()
+        _tracer = NoOpTracer()
+        provider.shutdown()
 
 
 REQUEST_ID_HEADER = "X-Request-ID"

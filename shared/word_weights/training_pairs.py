@@ -54,7 +54,7 @@ class PairBatch:
 class PairSplit:
     """Training pairs of both halves of the map."""
 
-    by: PairSource
+    source: PairSource
     halves: list[int]
     """half (0 or 1) of each of the map's photos"""
     batches: tuple[list[PairBatch], list[PairBatch]]
@@ -85,8 +85,8 @@ def sample_pairs(locations: Sequence[PhotoLocation], seed: int, batch_photos: in
         batch_photos: maximum number of photos in a batch.
     """
     candidates = []
-    for by in PairSource:
-        split = _sample_from(locations, by, np.random.default_rng(seed), batch_photos)
+    for source in PairSource:
+        split = _sample_from(locations, source, np.random.default_rng(seed), batch_photos)
         if split.is_enough:
             return split
         candidates.append(split)
@@ -95,14 +95,14 @@ def sample_pairs(locations: Sequence[PhotoLocation], seed: int, batch_photos: in
 
 def _sample_from(
     locations: Sequence[PhotoLocation],
-    by: PairSource,
+    source: PairSource,
     rng: np.random.Generator,
     batch_photos: int,
 ) -> PairSplit:
-    halves = _assign_halves([_cell(location, by) for location in locations], rng)
+    halves = _assign_halves([_cell(location, source) for location in locations], rng)
     is_known: Callable[[PhotoLocation], bool] = (
         (lambda location: location.latitude is not None)
-        if by == PairSource.COORDINATES
+        if source == PairSource.COORDINATES
         else (lambda location: location.place is not None)
     )
     batches: list[list[PairBatch]] = []
@@ -110,18 +110,18 @@ def _sample_from(
         members = [
             i for i, location in enumerate(locations) if halves[i] == half and is_known(location)
         ]
-        near = (_near_by_distance if by == PairSource.COORDINATES else _near_by_label)(
+        near = (_near_by_distance if source == PairSource.COORDINATES else _near_by_label)(
             locations, members, rng
         )
-        batches.append(_make_batches(locations, near, by, rng, batch_photos))
-    return PairSplit(by, halves, (batches[0], batches[1]))
+        batches.append(_make_batches(locations, near, source, rng, batch_photos))
+    return PairSplit(source, halves, (batches[0], batches[1]))
 
 
-def _cell(location: PhotoLocation, by: PairSource) -> Hashable:
+def _cell(location: PhotoLocation, source: PairSource) -> Hashable:
     """Return the key of the photos that must be in the same half."""
     if location.latitude is None or location.longitude is None:
         return location.place
-    if by == PairSource.PLACES and location.place is not None:
+    if source == PairSource.PLACES and location.place is not None:
         return location.place
     cell_degrees = math.degrees(CELL_M / EARTH_RADIUS_M)
     row = math.floor(location.latitude / cell_degrees)
@@ -202,7 +202,7 @@ def _sample_near_pairs(
 def _make_batches(
     locations: Sequence[PhotoLocation],
     near: Sequence[tuple[int, int]],
-    by: PairSource,
+    source: PairSource,
     rng: np.random.Generator,
     batch_photos: int,
 ) -> list[PairBatch]:
@@ -217,7 +217,7 @@ def _make_batches(
     def close_batch() -> None:
         if pairs:
             photos = list(positions)
-            far = _sample_far_pairs([locations[i] for i in photos], len(pairs), by, rng)
+            far = _sample_far_pairs([locations[i] for i in photos], len(pairs), source, rng)
             batches.append(PairBatch(photos, np.array(pairs, dtype=np.int64), far))
 
     for index in rng.permutation(len(near)).tolist():
@@ -232,20 +232,20 @@ def _make_batches(
 
 
 def _sample_far_pairs(
-    locations: Sequence[PhotoLocation], count: int, by: PairSource, rng: np.random.Generator
+    locations: Sequence[PhotoLocation], count: int, source: PairSource, rng: np.random.Generator
 ) -> Indices:
     """Sample up to `count` distinct different-place pairs, as (m, 2) indices."""
     pairs: dict[tuple[int, int], None] = {}
     for a, b in rng.integers(len(locations), size=(MAX_TRIES * count, 2)).tolist():
-        if a != b and _are_far(locations[a], locations[b], by):
+        if a != b and _are_far(locations[a], locations[b], source):
             pairs[min(a, b), max(a, b)] = None
         if len(pairs) == count:
             break
     return np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def _are_far(a: PhotoLocation, b: PhotoLocation, by: PairSource) -> bool:
-    if by == PairSource.PLACES:
+def _are_far(a: PhotoLocation, b: PhotoLocation, source: PairSource) -> bool:
+    if source == PairSource.PLACES:
         return a.place != b.place
     distance = distance_between_m(a, b)
     return distance is not None and distance > FAR_M

@@ -87,9 +87,9 @@ class Town:
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def work(self, path: str, **wanted: Any) -> None:
+    def work(self, path: str, **params: Any) -> None:
         """Start the map's job and see it through."""
-        started = self.server.client.post(f"/api/v1{path}", params={"map": MAP}, json=wanted)
+        started = self.server.client.post(f"/api/v1{path}", params={"map": MAP}, json=params)
         assert started.status_code == 202, started.text
         finished(self.server, MAP, started.json()["job_id"])
 

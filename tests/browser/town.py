@@ -35,13 +35,13 @@ def build_town(server: ServerProcess, folder: Path, map_name: str) -> list[Path]
     made = server.client.post("/api/v1/maps", json={"name": map_name})
     assert made.status_code == 201, made.text
     queries = sorted((folder / "queries").glob("*.jpg"))
-    asked, labelled = queries[::2], queries[1::2]
+    searched, labelled = queries[::2], queries[1::2]
     _bring_in(server, map_name, sorted((folder / "database").glob("*.jpg")), "database")
     _bring_in(server, map_name, labelled, "query")
     measured = server.client.post("/api/v1/evaluations", params={"map": map_name}, json={})
     assert measured.status_code == 202, measured.text
     finished(server, map_name, measured.json()["job_id"])
-    return asked
+    return searched
 
 
 def _bring_in(server: ServerProcess, map_name: str, photos: list[Path], role: str) -> None:
@@ -51,14 +51,14 @@ def _bring_in(server: ServerProcess, map_name: str, photos: list[Path], role: st
         season = SEASON.search(photo.name)
         assert season, photo.name
         name = f"{season[1]}-street-{number:03}.jpg"
-        said = {
+        values = {
             "filename": name,
             "latitude": float(fields["latitude"]),
             "longitude": float(fields["longitude"]),
             "tags": [season[1]],
             "role": role,
         }
-        lines.append(json.dumps(said))
+        lines.append(json.dumps(values))
         files.append(("file", (name, photo.read_bytes())))
     answer = server.client.post(
         "/api/v1/upload/batch",

@@ -69,10 +69,10 @@ def services(
     file: Path, project: Path, values: Mapping[str, str], profiles: Sequence[str] = PROFILES
 ) -> dict[str, Json]:
     """Each service in full, by its name."""
-    said = read_by_docker(file, project, values, profiles, "--format", "json")
-    assert said.returncode == 0, said.stderr
+    result = read_by_docker(file, project, values, profiles, "--format", "json")
+    assert result.returncode == 0, result.stderr
     # What is meant as a dollar comes out doubled, so that it could be read again.
-    read: dict[str, Json] = json.loads(said.stdout.replace("$$", "$"))["services"]
+    read: dict[str, Json] = json.loads(result.stdout.replace("$$", "$"))["services"]
     return read
 
 

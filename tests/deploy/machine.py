@@ -136,8 +136,8 @@ class Machine:
         base = environment(self.folder(service))
         for name in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS", "DECODE_PROCESSES", "PLACEWISE_HOME"):
             del base[name]  # placewise.env and the image say
-        said = self._services[service].get("environment") or {}
-        read = {name: self._here(service, value) for name, value in said.items()}
+        reported = self._services[service].get("environment") or {}
+        read = {name: self._here(service, value) for name, value in reported.items()}
         for port in ("PORT", "FLOWER_PORT"):
             if port in read:
                 read[port] = str(self._ports[service])

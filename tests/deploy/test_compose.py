@@ -96,10 +96,10 @@ def test_without_a_secret_nothing_starts_and_the_answer_says_what_to_do(
     missing: str, tmp_path: Path, values: dict[str, str]
 ) -> None:
     for given in ({**values, missing: ""}, {k: v for k, v in values.items() if k != missing}):
-        said = read_by_docker(SERVICES, tmp_path, given, (), "-q")
-        assert said.returncode != 0
-        assert missing in said.stderr
-        assert "make env" in said.stderr
+        result = read_by_docker(SERVICES, tmp_path, given, (), "-q")
+        assert result.returncode != 0
+        assert missing in result.stderr
+        assert "make env" in result.stderr
 
 
 def test_make_env_sets_every_secret_anew_and_readable_by_its_user_alone(

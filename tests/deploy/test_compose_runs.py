@@ -48,9 +48,9 @@ def machine(
         made.close()
 
 
-def make_database(admin: URL, said: dict[str, str]) -> None:
+def make_database(admin: URL, fields: dict[str, str]) -> None:
     """What the image of PostgreSQL does at its first start."""
-    user, password, name = (said[f"POSTGRES_{part}"] for part in ("USER", "PASSWORD", "DB"))
+    user, password, name = (fields[f"POSTGRES_{part}"] for part in ("USER", "PASSWORD", "DB"))
     url = admin.set(drivername="postgresql").render_as_string(hide_password=False)
     with psycopg.connect(url, autocommit=True) as connection:
         connection.execute(f"CREATE ROLE {user} LOGIN PASSWORD '{password}'")

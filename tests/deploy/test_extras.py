@@ -16,7 +16,7 @@ from tests.support.server import environment
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {
-    "embedded": ["services.standalone"],
+    "embedded": ["services.standalone", "services.extractor.worker"],
     "extractor": ["services.extractor.service", "tools.make_shipped_vocabulary"],
     "flower": ["flower", "celery"],
     "gateway": ["services.gateway.app", "services.gateway.authentication", "services.http_server"],
@@ -28,7 +28,15 @@ EXTRAS = {
     ],
 }
 # What every image's command imports, whatever service it runs.
-COMMAND = ["services.cli.main", "shared.catalog.installation", "shared.telemetry.heartbeat"]
+COMMAND = [
+    "services.cli.main",
+    "shared.catalog.installation",
+    "shared.telemetry.heartbeat",
+    # Imported at their first use.
+    "alembic.command",
+    "shared.catalog.postgres",
+    "shared.storage.s3",
+]
 HINTS = ["shared.jobs.celery_wakeups", "shared.jobs.celery_wakeups"]
 NEEDED_BY_HINTS = {"extractor", "gateway", "steward"}
 
@@ -71,9 +79,9 @@ def requirements(extra: str) -> set[str]:
 def installed_with(extra: str) -> set[str]:
     """Every distribution that would be in the image."""
     found: set[str] = set()
-    wanted = requirements(extra) | {name_of(line) for line in PROJECT["dependencies"]}
-    while wanted:
-        name = wanted.pop()
+    expected = requirements(extra) | {name_of(line) for line in PROJECT["dependencies"]}
+    while expected:
+        name = expected.pop()
         if name in found:
             continue
         try:
@@ -82,7 +90,7 @@ def installed_with(extra: str) -> set[str]:
             continue
         found.add(name)
         # Optional requirements: none of them is needed to import anything.
-        wanted |= {name_of(line) for line in lines if "extra ==" not in line}
+        expected |= {name_of(line) for line in lines if "extra ==" not in line}
     return found
 
 

@@ -115,7 +115,7 @@ def test_checks_and_commands_are_those_of_the_compose_file(tmp_path: Path) -> No
 def test_no_manifest_holds_a_secret_and_each_service_gets_only_its_own(build: str) -> None:
     assert not of_kind(build, "Secret")
     catalog, objects = {"DATABASE_URL"}, {"S3_ACCESS_KEY", "S3_SECRET_KEY"}
-    wanted = {
+    params = {
         "gateway": catalog | objects | {"REDIS_URL", "ADMIN_KEY"},
         "extractor": catalog | objects | {"REDIS_URL"},
         "steward": catalog | objects | {"REDIS_URL"},
@@ -126,7 +126,7 @@ def test_no_manifest_holds_a_secret_and_each_service_gets_only_its_own(build: st
     }
     for name, workload in of_kind(build, *WORKLOADS).items():
         secret = {n for n, variable in variables(workload).items() if "valueFrom" in variable}
-        assert secret == wanted[name], name
+        assert secret == params[name], name
     (config,) = of_kind(build, "ConfigMap").values()
     assert all(name.lower() in Settings.model_fields for name in config["data"])
     assert not {name for name in config["data"] if "KEY" in name or "PASSWORD" in name}

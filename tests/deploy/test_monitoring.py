@@ -28,14 +28,14 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_every_process_of_the_compose_file_is_asked_on_its_port(everything: dict[str, Any]) -> None:
     config = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())
     assert config["rule_files"] == ["alerts.yml"]
-    asked = {}
+    searched = {}
     for job in config["scrape_configs"]:
         for found in job.get("dns_sd_configs", []):
             for name in found["names"]:
-                asked[name] = (job["job_name"], found["port"])
+                searched[name] = (job["job_name"], found["port"])
     measured = {n: s for n, s in everything.items() if "METRICS_PORT" in s.get("environment", {})}
-    assert set(asked) == set(measured)
-    for name, (job, port) in asked.items():
+    assert set(searched) == set(measured)
+    for name, (job, port) in searched.items():
         environment = measured[name]["environment"]
         assert environment["METRICS_PORT"] == str(port)
         assert environment["HOST"] == "0.0.0.0"
@@ -55,8 +55,8 @@ def test_every_alert_says_how_bad_it_is_what_it_means_and_where_to_begin() -> No
         assert re.fullmatch(r"\d+[smh]", rule.get("for", "1m"))
         for placeholder in re.findall(r"{{(.*?)}}", rule["annotations"]["summary"]):
             assert re.match(r" \$(value|labels\.\w+)( \| humaniz\w+)? $", placeholder)
-    told = (ROOT / "docs/how-to/monitor.md").read_text()
-    assert [name for name in names if name not in told] == []
+    text = (ROOT / "docs/how-to/monitor.md").read_text()
+    assert [name for name in names if name not in text] == []
 
 
 @pytest.mark.parametrize("file", DASHBOARDS, ids=lambda file: file.stem)

@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from shared.client import Client
+from placewise.client import Client
 from shared.config.embedded_home import server_address_file
 from shared.errors import Unauthorized
 from tests.support.photos import photo_bytes
@@ -140,7 +140,7 @@ def test_the_client_sends_its_key_and_raises_what_is_refused(
 ) -> None:
     url = str(server.client.base_url)
     with Client(url, key=key) as places:
-        assert places.stats()["map"] == "default"
+        assert places.stats().map == "default"
     for wrong, code in ((None, "key_missing"), ("pw_wrong", "key_unknown")):
         with Client(url, key=wrong) as places, pytest.raises(Unauthorized) as caught:
             places.stats()

@@ -90,11 +90,11 @@ def test_a_full_queue_refuses_uploads_and_asks_queries(server: ServerProcess) ->
         for answer in refused:
             problem(answer, 429, "queue_full")
             assert int(answer.headers["retry-after"]) >= 1
-        asked = server.ask(near_copy(0), wait=0)
-        assert asked.status_code == 202
+        response = server.ask(near_copy(0), wait=0)
+        assert response.status_code == 202
         load = server.client.get("/api/v1/health").json()["load"]
         assert load["max_queued_jobs"] == 1
-    assert server.finished(asked.json()["job_id"])["state"] == "succeeded"
+    assert server.finished(response.json()["job_id"])["state"] == "succeeded"
 
 
 def test_index_waits_for_a_full_queue_says_so_and_goes_on(

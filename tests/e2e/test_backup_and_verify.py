@@ -67,12 +67,12 @@ def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
 def test_one_scrape_of_the_embedded_server_tells_of_all_its_parts(server: ServerProcess) -> None:
     server.indexed(photo_bytes(20))
     assert server.ask(photo_bytes(21)).is_success
-    told = read(server.client.get("/metrics").text)
-    assert told["placewise_extractor_jobs_total"][(("kind", "index"), ("outcome", "succeeded"))] > 0
-    assert told["placewise_search_searches_total"][(("outcome", "answered"),)] > 0
-    assert told["placewise_search_rows"][()] > 0
-    assert told["placewise_steward_duties_total"][(("duty", "free_leases"), ("outcome", "done"))]
-    assert told["placewise_gateway_catalog_up"][()] == 1
+    text = read(server.client.get("/metrics").text)
+    assert text["placewise_extractor_jobs_total"][(("kind", "index"), ("outcome", "succeeded"))] > 0
+    assert text["placewise_search_searches_total"][(("outcome", "answered"),)] > 0
+    assert text["placewise_search_rows"][()] > 0
+    assert text["placewise_steward_duties_total"][(("duty", "free_leases"), ("outcome", "done"))]
+    assert text["placewise_gateway_catalog_up"][()] == 1
 
 
 def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(

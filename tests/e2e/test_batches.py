@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import placewise
-from shared.client import Client
+from placewise.client import Client
 from shared.errors import InvalidRequest
 from shared.storage.s3 import S3Store
 from tests.e2e.test_separate_services import Deployment, until
@@ -66,19 +66,22 @@ def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
         paths.append(tmp_path / name)
         paths[-1].write_bytes(data)
     started = client.upload_files(paths, [{"filename": "121.jpg", "place": "hall"}])
-    assert client.wait_for(started["job_id"])["state"] == "succeeded"
-    one, two = client.batch_items(started["job_id"])
-    assert client.photo(one["file_id"])["place"] is None
-    assert client.photo(two["file_id"])["place"] == "hall"
+    client.wait(started)
+    one, two = client.batch_items(started)
+    assert one.file_id is not None
+    assert two.file_id is not None
+    assert client.photo(one.file_id).place is None
+    assert client.photo(two.file_id).place == "hall"
 
     imports = server.home / "objects" / "imports"
     imports.mkdir()
     (imports / "a.jpg").write_bytes(photo_bytes(122))
     started = client.import_objects([{"key": "imports/a.jpg"}, {"key": "imports/b.jpg"}])
-    job = client.wait_for(started["job_id"])
-    assert job["progress"] == {"done": 1, "total": 2, "failed": 1}
-    [failed] = client.batch_items(started["job_id"], "failed")
-    assert failed["error"]["code"] == "object_not_found"
+    job = client.wait(started)
+    assert job.progress.as_json() == {"done": 1, "total": 2, "failed": 1}
+    [failed] = client.batch_items(started, "failed")
+    assert failed.error is not None
+    assert failed.error["code"] == "object_not_found"
     with pytest.raises(InvalidRequest, match="IMPORT_PREFIX"):
         client.import_objects([{"key": "originals/a.jpg"}])
 

@@ -7,6 +7,7 @@ import io
 import json
 import socket
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -336,6 +337,43 @@ def test_commands_work_without_a_server(tmp_path: Path) -> None:
     assert answer["similar_images"][0]["original_filename"] == "1.jpg"
     assert answer["total_similar"] == 3
     assert not (tmp_path / "home" / "server.json").exists(), "the server ended with the command"
+
+
+def test_a_command_that_describes_no_photo_never_imports_torch(tmp_path: Path) -> None:
+    script = (
+        "import sys\n"
+        "from services.cli.main import run\n"
+        "sys.argv = ['placewise', 'maps', 'list', '--json']\n"
+        "try:\n"
+        "    run()\n"
+        "except SystemExit as ended:\n"
+        "    assert not ended.code\n"
+        "slow = {'torch', 'minio', 'psycopg'} & sys.modules.keys()\n"
+        "assert not slow, slow\n"
+    )
+    env = environment(tmp_path / "home")
+    for start in ("first", "second"):
+        ended = subprocess.run(
+            [sys.executable, "-c", script], env=env, cwd=tmp_path, capture_output=True, text=True
+        )
+        assert ended.returncode == 0, f"{start}: {ended.stderr}"
+        assert [row["name"] for row in json.loads(ended.stdout)] == ["default"]
+
+
+def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path) -> None:
+    photo = tmp_path / "photo.jpg"
+    photo.write_bytes(photo_bytes(0))
+    # Hides the GPUs of this machine. It is read when torch is imported, so no process is forked.
+    env = {**environment(tmp_path / "home", device="cuda"), "CUDA_VISIBLE_DEVICES": ""}
+    listed, indexed, served = (
+        Run(run_command(*arguments, env=env, cwd=tmp_path))
+        for arguments in (("maps", "list"), ("index", tmp_path, "--json"), ("serve",))
+    )
+    assert listed.code == 0, listed.stderr
+    assert "DEVICE=cuda" in indexed.refusal("cuda_missing")
+    assert served.code == 1
+    assert "DEVICE=cuda" in served.stderr
+    assert "Traceback" not in served.stderr
 
 
 def test_bench_prints_figures_and_leaves_the_folder_alone(tmp_path: Path) -> None:

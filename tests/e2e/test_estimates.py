@@ -93,17 +93,17 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
 
     job = evaluate(server, "streets")
     assert job["progress"] == {"done": ENOUGH, "total": ENOUGH, "failed": 0}
-    (kept,) = got(server.client.get("/api/v1/evaluations", params={"map": "streets"}))[
+    (body,) = got(server.client.get("/api/v1/evaluations", params={"map": "streets"}))[
         "evaluations"
     ]
-    assert not kept["automatic"]
-    assert kept["searchable"] == ENOUGH
+    assert not body["automatic"]
+    assert body["searchable"] == ENOUGH
     assert job["result"] == {
-        "evaluation_id": kept["evaluation_id"],
-        "generation_id": kept["generation_id"],
-        **kept["figures"],
+        "evaluation_id": body["evaluation_id"],
+        "generation_id": body["generation_id"],
+        **body["figures"],
     }
-    assert kept["figures"]["leave_one_out"]["without_positive"] == ENOUGH
+    assert body["figures"]["leave_one_out"]["without_positive"] == ENOUGH
 
     copies = [ask(server, "streets", re_encoded(number))["estimate"] for number in streets]
     accepted = [(n, estimate) for n, estimate in enumerate(copies) if estimate["in_map"]]

@@ -36,8 +36,8 @@ def run(server: ServerProcess, folder: Path, *arguments: str | Path, code: int =
 def test_service_finds_what_the_extractor_finds(
     server: ServerProcess, city: Path, tmp_path: Path
 ) -> None:
-    said = json.loads(server_address_file(server.home).read_text())
-    there = ["--server", said["url"], *(["--key", said["key"]] if "key" in said else [])]
+    body = json.loads(server_address_file(server.home).read_text())
+    there = ["--server", body["url"], *(["--key", body["key"]] if "key" in body else [])]
     served = run(server, tmp_path, "--data", city, *there, "--out", tmp_path / "served")
     alone = run(
         server, tmp_path, "--data", city, "--extractor", "test-tiny-avg",

@@ -1,4 +1,4 @@
-"""Two hundred and more files that mean harm, through the real upload of a real server."""
+"""Two hundred and more hostile files, through the real upload of a real server."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 import httpx2
 import psutil
 
-from tests.support.hostile import corpus
-from tests.support.hostile.file import (
+from tests.e2e.hostile_files import (
     MAX_ARCHIVE_BYTES,
     MAX_BYTES,
     MAX_MEMBERS,
     MAX_PIXELS,
-    Hostile,
+    HostileFile,
+    corpus,
 )
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
@@ -41,7 +41,7 @@ def memory_of(server: ServerProcess) -> int:
     return total
 
 
-def put(server: ServerProcess, one: Hostile) -> httpx2.Response:
+def send(server: ServerProcess, one: HostileFile) -> httpx2.Response:
     if one.archive:
         return server.client.post(
             "/api/v1/upload/batch", files={"archive": (one.filename, one.data)}
@@ -51,19 +51,19 @@ def put(server: ServerProcess, one: Hostile) -> httpx2.Response:
     )
 
 
-def what_became(server: ServerProcess, one: Hostile, answer: httpx2.Response) -> set[str]:
+def outcomes_of(server: ServerProcess, one: HostileFile, answer: httpx2.Response) -> set[str]:
     """The codes that it was refused with, and "succeeded"; of an archive, of each item too."""
     body = answer.json()
     if 400 <= answer.status_code < 500:
         assert answer.headers["content-type"] == "application/problem+json"
         return {body["code"]}
-    assert answer.status_code in (200, 202), f"{one.what}: {answer.status_code} {answer.text}"
+    assert answer.status_code in (200, 202), f"{one.name}: {answer.status_code} {answer.text}"
     job: dict[str, Any] = server.finished(body["job_id"], SECONDS)
-    became = {job["error"]["code"] if job["state"] == "failed" else job["state"]}
+    outcomes = {job["error"]["code"] if job["state"] == "failed" else job["state"]}
     if one.archive:
         items = server.client.get(f"/api/v1/jobs/{body['job_id']}/items").json()["items"]
-        became |= {item["error"]["code"] if item["error"] else item["state"] for item in items}
-    return became
+        outcomes |= {item["error"]["code"] if item["error"] else item["state"] for item in items}
+    return outcomes
 
 
 def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
@@ -71,12 +71,12 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
 ) -> None:
     files = corpus()
     assert len(files) >= 200
-    assert len({one.what for one in files}) == len(files)
+    assert len({one.name for one in files}) == len(files)
     around = {path.name for path in server.home.parent.iterdir()}
     before = most = memory_of(server)
     answers = []
     for one in files:
-        answers.append(put(server, one))
+        answers.append(send(server, one))
         most = max(most, memory_of(server))
     deadline = time.monotonic() + SECONDS
     while True:  # everything that was taken comes to an end
@@ -89,9 +89,9 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
         assert time.monotonic() < deadline, open_jobs
         time.sleep(0.1)
     wrong = {
-        one.what: sorted(became - one.may)
+        one.name: sorted(outcomes - one.allowed)
         for one, answer in zip(files, answers, strict=True)
-        if (became := what_became(server, one, answer)) - one.may
+        if (outcomes := outcomes_of(server, one, answer)) - one.allowed
     }
     assert wrong == {}
 
@@ -102,6 +102,6 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
     assert server.process.poll() is None
     assert server.client.get("/readyz").status_code == 200
     good = server.indexed(photo_bytes(901), "good.jpg")
-    asked = server.ask(photo_bytes(901)).json()
-    assert asked["similar_images"][0]["image_id"] == good
+    body = server.ask(photo_bytes(901)).json()
+    assert body["similar_images"][0]["image_id"] == good
     assert "Traceback" not in server.log_path.read_text(errors="replace")

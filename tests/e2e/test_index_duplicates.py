@@ -59,13 +59,13 @@ def test_a_misspelt_parameter_is_refused_and_not_taken_for_no_filter(
         answer = server.client.get(f"/api/v1{path}", params={"neer": "45,7,1"})
         assert (answer.status_code, answer.json()["code"]) == (422, "invalid_field")
         assert "neer" in answer.json()["detail"]
-    asked = server.ask(photo_bytes(701), neer="45,7,1")
-    assert asked.status_code == 422
+    response = server.ask(photo_bytes(701), neer="45,7,1")
+    assert response.status_code == 422
 
 
 def test_a_blank_where_an_address_had_a_plus_is_read_as_plus(server: ServerProcess) -> None:
-    wanted = "/api/v1/search?captured_after=2026-05-01T12:00:00+02:00"
-    assert server.client.get(wanted).status_code == 200
+    expected = "/api/v1/search?captured_after=2026-05-01T12:00:00+02:00"
+    assert server.client.get(expected).status_code == 200
 
 
 def test_an_outsider_stays_one_however_narrow_the_filter(server: ServerProcess) -> None:

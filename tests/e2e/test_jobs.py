@@ -79,22 +79,22 @@ def test_jobs_are_listed_newest_first_by_state_and_kind(server: ServerProcess) -
     indexed = server.upload(photo_bytes(next(fresh))).json()["job_id"]
     server.finished(indexed)
     broken = failed_job(server)
-    asked = server.client.post(
+    body = server.client.post(
         "/api/v1/similarity", files={"file": ("q.jpg", photo_bytes(next(fresh)))}
     ).json()["job_id"]
-    server.finished(asked)
+    server.finished(body)
 
     everything = [job["job_id"] for job in listed(server)]
-    assert everything[:3] == [asked, broken, indexed]
+    assert everything[:3] == [body, broken, indexed]
     failed = listed(server, state="failed")
     assert broken in [job["job_id"] for job in failed]
     assert {job["state"] for job in failed} == {"failed"}
     queries = listed(server, kind="describe")
-    assert asked in [job["job_id"] for job in queries]
+    assert body in [job["job_id"] for job in queries]
     assert {job["kind"] for job in queries} == {"describe"}
     both = listed(server, state=["failed", "succeeded"], kind="index")
     assert {broken, indexed} <= {job["job_id"] for job in both}
-    assert asked not in {job["job_id"] for job in both}
+    assert body not in {job["job_id"] for job in both}
 
 
 def test_a_list_of_jobs_is_read_page_by_page(server: ServerProcess) -> None:

@@ -19,32 +19,34 @@ def nested(levels: int) -> str:
 def test_deeply_nested_metadata_is_refused_and_spoils_no_answer(
     server: ServerProcess, levels: int
 ) -> None:
-    kept = server.indexed(photo_bytes(1), metadata=nested(32))
+    retained = server.indexed(photo_bytes(1), metadata=nested(32))
     refused = server.upload(photo_bytes(2), metadata=nested(levels))
     assert refused.status_code == 422
     assert "metadata" in refused.json()["detail"]
     patched = server.client.patch(
-        f"/api/v1/uploads/{kept}",
+        f"/api/v1/uploads/{retained}",
         content=f'{{"metadata": {nested(levels)}}}',
         headers={"content-type": "application/json"},
     )
     assert patched.status_code in (400, 422)
     assert patched.json()["code"] in ("malformed_body", "invalid_field")
-    assert server.client.get(f"/api/v1/uploads/{kept}").json()["metadata"] == json.loads(nested(32))
+    assert server.client.get(f"/api/v1/uploads/{retained}").json()["metadata"] == json.loads(
+        nested(32)
+    )
     assert server.client.get("/api/v1/search").status_code == 200
 
 
 def test_a_large_json_body_is_refused_and_the_connection_stays_usable(
     server: ServerProcess,
 ) -> None:
-    kept = server.indexed(photo_bytes(1), metadata=nested(32))
+    retained = server.indexed(photo_bytes(1), metadata=nested(32))
     for size, code in ((2_000_000, "body_too_large"), (500_000, "fields_too_large")):
         answer = server.client.patch(
-            f"/api/v1/uploads/{kept}", json={"metadata": {"a": "x" * size}}
+            f"/api/v1/uploads/{retained}", json={"metadata": {"a": "x" * size}}
         )
         assert answer.status_code == 413
         assert answer.json()["code"] == code
-    small = server.client.patch(f"/api/v1/uploads/{kept}", json={"place": "hall"})
+    small = server.client.patch(f"/api/v1/uploads/{retained}", json={"place": "hall"})
     assert small.json()["place"] == "hall"
 
 

@@ -28,10 +28,10 @@ def got(answer: httpx2.Response, status: int = 200) -> Any:
     return answer.json()
 
 
-def make(server: ServerProcess, **wanted: Any) -> str:
+def make(server: ServerProcess, **params: Any) -> str:
     """A new map; its name."""
     name = next(names)
-    made = got(server.client.post(MAPS, json={"name": name, **wanted}), 201)
+    made = got(server.client.post(MAPS, json={"name": name, **params}), 201)
     assert made["name"] == name
     return name
 
@@ -101,7 +101,7 @@ def test_good_names_may_be_long_and_odd(server: ServerProcess) -> None:
 
 def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProcess) -> None:
     api = got(server.client.get("/openapi.json"))
-    asked = []
+    requests = []
     for path, calls in api["paths"].items():
         for method, call in calls.items():
             if not any(p["name"] == "map" for p in call.get("parameters", ())):
@@ -121,8 +121,8 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
             detail = problem(answer, 404, "map_not_found")["detail"]
             assert "placewise maps create nowhere" in detail
             assert f"POST {MAPS}" in detail
-            asked.append(f"{method} {path}")
-    assert len(asked) >= 22, asked
+            requests.append(f"{method} {path}")
+    assert len(requests) >= 22, requests
     for method in ("GET", "DELETE"):
         problem(server.client.request(method, f"{MAPS}/nowhere"), 404, "map_not_found")
 
@@ -159,8 +159,8 @@ def test_searches_never_cross(server: ServerProcess) -> None:
         assert {found["image_id"] for found in got(by_stored)["similar_images"]} == set(ids[1:])
         listed = got(server.client.get("/api/v1/search", params={"map": name}))
         assert {found["image_id"] for found in listed["images"]} == set(ids)
-        wanted = ",".join([*here, *there])
-        answer = got(server.similar(ids[0], map=name, ids=wanted))
+        expected = ",".join([*here, *there])
+        answer = got(server.similar(ids[0], map=name, ids=expected))
         assert {found["image_id"] for found in answer["similar_images"]} == set(ids[1:])
 
 
@@ -176,8 +176,8 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
         ("GET", f"/uploads/{here}/thumbnail"),
         ("POST", f"/similarity/{here}"),
     ):
-        said = {"place": "x"} if method == "PATCH" else None
-        answer = server.client.request(method, f"/api/v1{path}", params={"map": other}, json=said)
+        fields = {"place": "x"} if method == "PATCH" else None
+        answer = server.client.request(method, f"/api/v1{path}", params={"map": other}, json=fields)
         problem(answer, 404, "photo_not_found")
     for method, path in (
         ("GET", ""),
@@ -229,8 +229,8 @@ def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProce
             got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)
 
     def fit(name: str, seed: int) -> str:
-        wanted = {"clusters": 4, "seed": seed}
-        answer = server.client.post("/api/v1/vocabularies", params={"map": name}, json=wanted)
+        params = {"clusters": 4, "seed": seed}
+        answer = server.client.post("/api/v1/vocabularies", params={"map": name}, json=params)
         job = ended(server, name, got(answer, 202)["job_id"])
         assert job["state"] == "succeeded", job
         generation: str = job["result"]["generation_id"]
@@ -242,10 +242,10 @@ def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProce
     fit(one, 0)
     assert generation(other)["generation_id"] is None
     assert generation(other)["searchable"] == 0
-    kept = fit(other, 0)
+    retained = fit(other, 0)
     for seed in (1, 2):
         fit(one, seed)
-    assert generation(other)["generation_id"] == kept
+    assert generation(other)["generation_id"] == retained
     assert len(got(server.client.get("/api/v1/vocabularies", params={"map": other}))) == 1
     assert len(got(server.client.get("/api/v1/generations", params={"map": one}))) == 3
     assert generation(one)["searchable"] == generation(other)["searchable"] == 3
@@ -327,8 +327,8 @@ def test_maps_are_made_filled_asked_and_deleted_by_command(
     assert figures["leave_one_out"]["without_positive"] == 3
     assert figures["labelled_queries"]["queries"] == 3
     assert figures["labelled_queries"]["R@1"] == 1
-    kept = run_command("maps", "delete", name, env=env, cwd=tmp_path)
-    assert kept.returncode != 0, "nobody said yes"
+    result = run_command("maps", "delete", name, env=env, cwd=tmp_path)
+    assert result.returncode != 0, "nobody said yes"
     assert placewise("maps", "delete", name, "--yes")["deleted_map"] == name
     chosen = ("--extractor", "test-tiny-vlad", "--preprocessing", "demo1024")
     other = placewise("maps", "create", next(names), *chosen)

@@ -41,12 +41,12 @@ def test_a_killed_fetch_goes_on_where_it_was(tmp_path: Path) -> None:
         fetching.wait()
 
         server.stall_after = None
-        server.asked.clear()
+        server.requests.clear()
         result = run_command(*FETCH, env=env, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
         fetched = json.loads(result.stdout)
         assert Path(fetched["path"]).read_bytes() == content
         assert Path(fetched["path"]).is_relative_to(tmp_path / "hf" / "hub")
         # huggingface_hub asks for more than files.
-        asked = [part for path, part in server.asked if path == FILE]
-        assert asked == [f"bytes={BEGUN_BYTES}-"]
+        ranges = [part for path, part in server.requests if path == FILE]
+        assert ranges == [f"bytes={BEGUN_BYTES}-"]

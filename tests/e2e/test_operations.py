@@ -193,19 +193,19 @@ def refused_start(home: Path, **settings: Any) -> str:
 
 
 def test_a_folder_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
-    said = refused_start(server.home)
-    assert said.startswith("home_in_use: ")
-    assert str(server.client.base_url).rstrip("/") in said
-    assert str(server.home) in said
+    reported = refused_start(server.home)
+    assert reported.startswith("home_in_use: ")
+    assert str(server.client.base_url).rstrip("/") in reported
+    assert str(server.home) in reported
     assert got(server.client.get("/readyz")), "the first one goes on"
     assert server_address_file(server.home).exists(), "and can still be found"
 
 
 def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
     port = server.client.base_url.port
-    said = refused_start(tmp_path / "another", port=port)
-    assert said.startswith("address_in_use: ")
-    assert f"127.0.0.1:{port}" in said
+    reported = refused_start(tmp_path / "another", port=port)
+    assert reported.startswith("address_in_use: ")
+    assert f"127.0.0.1:{port}" in reported
 
 
 @pytest.mark.parametrize(
@@ -220,9 +220,9 @@ def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> Non
 def test_settings_that_can_not_work_are_refused_at_the_start(
     tmp_path: Path, settings: dict[str, Any], code: str, named: str
 ) -> None:
-    said = refused_start(tmp_path / "home", **settings)
-    assert said.startswith(f"{code}: ")
-    assert named in said
+    reported = refused_start(tmp_path / "home", **settings)
+    assert reported.startswith(f"{code}: ")
+    assert named in reported
 
 
 # --- its end, and the next start -------------------------------------------------------------

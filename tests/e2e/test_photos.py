@@ -280,8 +280,8 @@ def test_photos_are_found_newest_first_with_all_their_fields(
 ) -> None:
     body = got(server.client.get("/api/v1/search", params={"tags": "street"}))
     only_of_one = ("job_id", "media_type", "sha256", "searchable")
-    wanted = [{k: v for k, v in s.items() if k not in only_of_one} for s in streets]
-    assert body["images"] == wanted[::-1]
+    expected = [{k: v for k, v in s.items() if k not in only_of_one} for s in streets]
+    assert body["images"] == expected[::-1]
 
 
 def test_photos_are_found_by_each_filter(
@@ -317,8 +317,8 @@ def test_a_time_is_meant_with_its_offset(
     second = datetime.fromisoformat(streets[1]["upload_time"])
     elsewhere = second.astimezone(timezone(timedelta(hours=5))).isoformat()
     plain = second.replace(tzinfo=None).isoformat()
-    for said in (elsewhere, plain):
-        assert names(server, upload_before=said) == streets_named(0, 1), said
+    for reported in (elsewhere, plain):
+        assert names(server, upload_before=reported) == streets_named(0, 1), reported
 
 
 def test_found_photos_are_read_page_by_page(

@@ -169,5 +169,7 @@ def assert_shows_the_same(command: Command, real: str) -> None:
 
 def _environment(place: Path) -> dict[str, str]:
     """The README's settings: the default extractor, with the data in the newcomer's folder."""
-    kept = {k: v for k, v in os.environ.items() if k not in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS")}
-    return {**kept, "PLACEWISE_HOME": str(place / "var"), "HOST": "127.0.0.1"}
+    retained = {
+        k: v for k, v in os.environ.items() if k not in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS")
+    }
+    return {**retained, "PLACEWISE_HOME": str(place / "var"), "HOST": "127.0.0.1"}

@@ -42,11 +42,11 @@ def test_new_photo_is_described_and_compared_in_one_call(
 def test_command_shows_both(server: ServerProcess, places: list[str], tmp_path: Path) -> None:
     photo = tmp_path / "again.jpg"
     photo.write_bytes(near_copy(PLACES[2]))
-    asked: list[str | Path] = ["query", photo, "--rerank", "5", "--explain"]
+    requests: list[str | Path] = ["query", photo, "--rerank", "5", "--explain"]
     env = {**environment(server.home), "COLUMNS": "200"}
-    shown = run_command(*asked, env=env, cwd=tmp_path)
+    shown = run_command(*requests, env=env, cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "reranked" in shown.stdout
     assert "8 x 8 patches" in shown.stdout
-    answer = json.loads(run_command(*asked, "--json", env=env, cwd=tmp_path).stdout)
+    answer = json.loads(run_command(*requests, "--json", env=env, cwd=tmp_path).stdout)
     assert answer["similar_images"][0]["image_id"] == places[2]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import urllib3
 
-from shared.client import Client
+from placewise.client import Client
 from shared.storage.s3 import Bucket, S3Store
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
@@ -102,10 +102,11 @@ def test_a_photo_sent_straight_to_the_bucket_is_found(
     photo.write_bytes(photo_bytes(20))
     with Client(str(server.client.base_url)) as client:
         stored = client.upload_direct(photo, latitude=45.5, longitude=7.5, tags=["direct"])
-        assert client.wait_for(stored["job_id"])["state"] == "succeeded"
-        found = client.photo(stored["file_id"])
-    assert (found["original_filename"], found["tags"]) == ("straight.jpg", ["direct"])
-    assert server.ask(photo_bytes(20)).json()["similar_images"][0]["image_id"] == found["image_id"]
+        client.wait(stored)
+        found = client.photo(stored.file_id)
+    assert (found.original_filename, found.tags) == ("straight.jpg", ["direct"])
+    best = server.ask(photo_bytes(20)).json()["similar_images"][0]
+    assert best["image_id"] == str(found.image_id)
     assert keys(bucket, "incoming/") == set()
 
 

@@ -33,9 +33,11 @@ PHOTOS = 4
 @contextlib.contextmanager
 def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Process, str]]:
     """A running `placewise search` and its address."""
-    with log.open("wb") as said:
+    with log.open("wb") as reported:
         env = environment(home, **settings)
-        process = start([PLACEWISE, "search"], env=env, cwd=home.parent, stdout=said, stderr=said)
+        process = start(
+            [PLACEWISE, "search"], env=env, cwd=home.parent, stdout=reported, stderr=reported
+        )
     try:
         deadline = time.monotonic() + START_SECONDS
         while not (match := re.search(r"on (http://\S+)", log.read_text())):

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 import urllib3
 
-from shared.client import Client
+from placewise.client import Client
 from shared.config.embedded_home import server_address_file
 from shared.errors import PlacewiseError
 from tests.support.photos import photo_bytes

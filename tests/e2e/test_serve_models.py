@@ -90,8 +90,8 @@ def test_describe_makes_of_a_file_and_of_an_added_model_what_the_model_itself_ma
         assert specs[-1].pop("backbone") == name
     assert specs[0] == specs[1]
     out = tmp_path / "none.npy"
-    wanted = ("describe", photo, "--extractor", "gsv:nobody", "--out", out)
-    assert "model_missing" in placewise.refused(*wanted)
+    expected = ("describe", photo, "--extractor", "gsv:nobody", "--out", out)
+    assert "model_missing" in placewise.refused(*expected)
     assert not out.exists()
 
 

@@ -167,9 +167,9 @@ def test_min_score_leaves_out_what_is_less_similar(
 ) -> None:
     all_of_them = answered(server.similar(places[0], top_k=100))
     middle = scores(all_of_them)[3]
-    wanted = [score for score in scores(all_of_them) if score >= middle - 1e-9]
+    expected = [score for score in scores(all_of_them) if score >= middle - 1e-9]
     body = answered(server.similar(places[0], top_k=100, min_score=middle - 1e-9))
-    assert scores(body) == pytest.approx(wanted)
+    assert scores(body) == pytest.approx(expected)
     nearly_same = answered(server.ask(re_encoded(2), top_k=100, min_score=0.9))
     assert ids(nearly_same) == [places[1]]
     assert answered(server.ask(photo_bytes(next(fresh)), min_score=1))["similar_images"] == []

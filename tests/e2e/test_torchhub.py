@@ -87,8 +87,8 @@ def test_an_entry_has_no_vocabulary_to_fit(server: ServerProcess, allowed: str) 
 def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
     server: ServerProcess, folder: Path, entry: str
 ) -> None:
-    wanted = {"name": "other", "extractor": f"torchhub:{folder}:{entry}"}
-    answer = server.client.post(MAPS, json=wanted)
+    params = {"name": "other", "extractor": f"torchhub:{folder}:{entry}"}
+    answer = server.client.post(MAPS, json=params)
     field_refused(answer, "extractor")
     assert "TORCHHUB_ALLOWED" in answer.json()["detail"]
 
@@ -96,18 +96,18 @@ def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
 def test_a_repository_that_is_not_pinned_is_refused_with_how_to_pin_it(
     server: ServerProcess,
 ) -> None:
-    wanted = {"name": "other", "extractor": "torchhub:gmberton/MegaLoc:get_trained_model"}
-    answer = server.client.post(MAPS, json=wanted)
+    params = {"name": "other", "extractor": "torchhub:gmberton/MegaLoc:get_trained_model"}
+    answer = server.client.post(MAPS, json=params)
     field_refused(answer, "extractor")
     assert "git ls-remote" in answer.json()["detail"]
-    wanted["extractor"] = f"torchhub:gmberton/MegaLoc@{COMMIT}:get_trained_model"
-    field_refused(server.client.post(MAPS, json=wanted), "extractor")
+    params["extractor"] = f"torchhub:gmberton/MegaLoc@{COMMIT}:get_trained_model"
+    field_refused(server.client.post(MAPS, json=params), "extractor")
 
 
 def test_an_entry_that_is_no_extractor_keeps_photos_waiting_with_the_reason(
     server: ServerProcess, folder: Path
 ) -> None:
     make(server, "unfit", f"torchhub:{folder}:maps")
-    asked = server.ask(photo_bytes(1), map="unfit")
-    assert asked.json()["code"] == "torchhub_unfit", asked.text
-    assert "input.size" in asked.json()["detail"]
+    response = server.ask(photo_bytes(1), map="unfit")
+    assert response.json()["code"] == "torchhub_unfit", response.text
+    assert "input.size" in response.json()["detail"]

@@ -12,8 +12,7 @@ import torch
 from services.trainer import run
 from services.trainer.run_control import NullDisplay, StopRequest
 from tests.support.processes import INHERITED, PLACEWISE, start
-from tests.support.tiny_places import write_tiny_places
-from tests.support.train_runs import assert_same_weights, told, train
+from tests.support.training_runs import assert_same_weights, run_arguments, train, write_tiny_places
 
 LIMIT_SECONDS = 240
 
@@ -23,8 +22,8 @@ def test_an_interrupted_process_leaves_a_run_that_goes_on_exactly(
     number: signal.Signals, tmp_path: Path
 ) -> None:
     places = write_tiny_places(tmp_path / "places")
-    said = told(places, tmp_path, max_epochs=10_000, check_val_every_n_epoch=10_000)
-    words = [f"--{name}={value}" for name, value in said.items()]
+    arguments = run_arguments(places, tmp_path, max_epochs=10_000, check_val_every_n_epoch=10_000)
+    words = [f"--{name}={value}" for name, value in arguments.items()]
     last = tmp_path / "run" / "checkpoints" / "last.ckpt"
     with (tmp_path / "output").open("w+") as output:
         process = start(
@@ -49,6 +48,6 @@ def test_an_interrupted_process_leaves_a_run_that_goes_on_exactly(
     torch.set_num_threads(1)
     most = stopped + 2
     resumed = run.resume(tmp_path / "run", {"max_steps": most}, NullDisplay(), StopRequest())
-    whole = train({**said, "run_name": "whole", "max_steps": most})
+    whole = train({**arguments, "run_name": "whole", "max_steps": most})
     assert [epoch["step"] for epoch in resumed["epochs"]] == [most]
     assert_same_weights(Path(whole["last"]), Path(resumed["last"]))

@@ -91,7 +91,7 @@ def test_a_model_is_trained_evaluated_added_and_answers(
     names = {path.name for path in database}
     assert len({photo["original_filename"] for photo in found} & names) == 3
     # A photo of the map itself, asked anew, is its own best match: what is stored is the model's.
-    asked = database[len(database) // 2]
-    (first,) = placewise("query", asked, "--map", MAP, "--top-k", "1")["similar_images"]
-    assert first["original_filename"] == asked.name
+    searched = database[len(database) // 2]
+    (first,) = placewise("query", searched, "--map", MAP, "--top-k", "1")["similar_images"]
+    assert first["original_filename"] == searched.name
     assert first["similarity_score"] > 1 - 1e-5

@@ -226,13 +226,13 @@ def test_exif_fills_what_the_form_leaves_out(server: ServerProcess) -> None:
 
 
 def test_form_fields_win_over_exif(server: ServerProcess) -> None:
-    said: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "latitude": 1.5,
         "longitude": 2.5,
         "heading": 360,
         "captured_at": "2026-05-01T12:30:00+02:00",
     }
-    found = photo(server, server.indexed(with_gps(8), **said))
+    found = photo(server, server.indexed(with_gps(8), **fields))
     assert (found["latitude"], found["longitude"], found["heading"]) == (1.5, 2.5, 0)
     assert datetime.fromisoformat(found["captured_at"]) == datetime.fromisoformat(
         "2026-05-01T10:30:00+00:00"

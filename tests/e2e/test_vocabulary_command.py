@@ -61,9 +61,9 @@ def test_a_folders_vocabulary_is_written_with_its_provenance(folder: Folder, fit
     assert (fitted["file"], fitted["clusters"], fitted["dimension"]) == ("city.npz", 5, WIDTH)
     assert found.centres.array.shape == (5, WIDTH)
     assert found.provenance == fitted["provenance"]
-    said = found.provenance
-    assert (said["photos"], said["patches"], said["seed"]) == (PHOTOS, PHOTOS * 64, 3)
-    assert (said["backbone"], said["sha256"]) == ("test-tiny", found.centres.sha256)
+    reported = found.provenance
+    assert (reported["photos"], reported["patches"], reported["seed"]) == (PHOTOS, PHOTOS * 64, 3)
+    assert (reported["backbone"], reported["sha256"]) == ("test-tiny", found.centres.sha256)
     (refused,) = fitted["refused"]
     assert refused["path"] == "photos/broken.jpg"
     assert "decoded" in refused["reason"]
@@ -127,9 +127,9 @@ def test_a_map_is_reduced_by_one_command_and_whole_again_by_another(folder: Fold
         assert ended.returncode == 0, ended.stderr + ended.stdout
         return " ".join(ended.stdout.split())
 
-    said = run("pca", "fit", "--dimension", "3")
-    assert "7 photos, 3 of 128 dimensions with" in said
-    assert "of the variance of 7 rows, 0 failed" in said
+    reported = run("pca", "fit", "--dimension", "3")
+    assert "7 photos, 3 of 128 dimensions with" in reported
+    assert "of the variance of 7 rows, 0 failed" in reported
     assert "3 (PCA" in run("maps", "list")
     assert "PCA: 3 of" in run("vocabulary", "list")
     assert "7 photos, 128 dimensions, 0 failed" in run("pca", "undo")
@@ -151,7 +151,7 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (("fit", "photos"), "bad_out", "--out FILE.npz"),
         (("fit", "photos", "--out", "city.npy"), "bad_out", ".npz"),
@@ -165,9 +165,9 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
     ],
 )
 def test_a_fit_that_can_not_be_is_refused_before_it_begins(
-    folder: Folder, arguments: tuple[str, ...], code: str, said: str
+    folder: Folder, arguments: tuple[str, ...], code: str, message: str
 ) -> None:
     problem = folder.json(*arguments, code=1)
     assert problem["code"] == code
-    assert said in problem["detail"]
+    assert message in problem["detail"]
     assert not (folder.path / "a.npz").exists()

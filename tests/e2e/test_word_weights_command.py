@@ -34,13 +34,13 @@ def test_a_small_map_is_told_in_numbers_why_it_gets_no_weights(
     assert shown.returncode == 0, shown.stderr
     assert "Word weights: not enough pairs." in shown.stdout
     assert "each half needs 50 pairs of each kind" in " ".join(shown.stdout.split())
-    said = json.loads(command(server, "evaluate", "--word-weights", "--json").stdout)
-    assert said["word_weights"]["outcome"] == "not enough pairs"
-    assert said["word_weights"]["near_pairs"] == 0
-    assert said["with_word_weights"] is None
+    body = json.loads(command(server, "evaluate", "--word-weights", "--json").stdout)
+    assert body["word_weights"]["outcome"] == "not enough pairs"
+    assert body["word_weights"]["near_pairs"] == 0
+    assert body["with_word_weights"] is None
 
     photo = tmp_path / "again.jpg"
     photo.write_bytes(photo_bytes(2))
-    asked = command(server, "query", photo, "--no-word-weights")
-    assert asked.returncode == 0, asked.stderr
-    assert "word weights: none" in asked.stdout
+    searched = command(server, "query", photo, "--no-word-weights")
+    assert searched.returncode == 0, searched.stderr
+    assert "word weights: none" in searched.stdout

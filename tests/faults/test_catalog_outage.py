@@ -209,8 +209,8 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     assert house.call("GET", "/readyz").status_code == 200
     assert not house.died.is_set(), "a part ended"
     for part in ("steward", "extractor", "steward's evaluate and word_weights worker"):
-        said = [r.message for r in caplog.records if f"the {part} waits" in r.message]
-        assert len(said) == 1, f"once per outage: {said}"
+        messages = [r.message for r in caplog.records if f"the {part} waits" in r.message]
+        assert len(messages) == 1, f"once per outage: {messages}"
 
 
 def test_silent_catalog_is_given_up_within_seconds(house: House, breakable: PostgresServer) -> None:

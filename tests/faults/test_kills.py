@@ -67,8 +67,10 @@ def test_after_ten_kills_every_acknowledged_photo_is_searchable_exactly_once(
         for kill in range(1, KILLS + 1):
             uploader.may_go_on_to = kill * PHOTOS // (KILLS + 1)
             # Somewhere among this life's uploads, or while their batches are described.
-            wanted = moments.randint((kill - 1) * PHOTOS // (KILLS + 1), uploader.may_go_on_to - 1)
-            while len(uploader.acknowledged) < wanted:
+            reference = moments.randint(
+                (kill - 1) * PHOTOS // (KILLS + 1), uploader.may_go_on_to - 1
+            )
+            while len(uploader.acknowledged) < reference:
                 time.sleep(0.001)
             time.sleep(moments.uniform(0, 0.4))
             server.kill()

@@ -173,9 +173,9 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
     filled.remove_catalog()
     shown = filled.command("storage", "adopt", "--json")
     assert shown.returncode == 0, shown.stderr
-    said = json.loads(shown.stdout)
-    assert said["adopted"] is False
-    assert said["unknown"]["originals/"]["objects"] == len(originals)
+    body = json.loads(shown.stdout)
+    assert body["adopted"] is False
+    assert body["unknown"]["originals/"]["objects"] == len(originals)
     filled.check_refused("serve")
 
     assert filled.command("storage", "adopt", "--confirm").returncode == 0

@@ -33,8 +33,8 @@ def catalog_files(home: Path) -> list[Path]:
 
 
 def said_of(server: ServerProcess, file_id: str) -> dict[str, Any]:
-    said: dict[str, Any] = server.client.get(f"/api/v1/uploads/{file_id}").json()
-    return said | {"job_id": None}
+    body: dict[str, Any] = server.client.get(f"/api/v1/uploads/{file_id}").json()
+    return body | {"job_id": None}
 
 
 def found_by(server: ServerProcess, file_id: str) -> list[str]:
@@ -62,9 +62,9 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         later = server.indexed(photo_bytes(4), "later.jpg", place="later")
         deleted = photos.pop()
         assert server.client.delete(f"/api/v1/uploads/{deleted}").is_success
-        kept = [*photos, later]
-        said = {file_id: said_of(server, file_id) for file_id in kept}
-        found = {file_id: found_by(server, file_id) for file_id in kept}
+        retained = [*photos, later]
+        fields = {file_id: said_of(server, file_id) for file_id in retained}
+        found = {file_id: found_by(server, file_id) for file_id in retained}
         wait_for_journal(home, server)
         server.stop()
         originals = objects(home, "originals/")
@@ -76,8 +76,8 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         taken = run(home, "rebuild-catalog")
         assert (taken["photos"], taken["descriptors"], taken["queued_photos"]) == (3, 3, 0)
         server.start()
-        assert {file_id: said_of(server, file_id) for file_id in kept} == said
-        assert {file_id: found_by(server, file_id) for file_id in kept} == found
+        assert {file_id: said_of(server, file_id) for file_id in retained} == fields
+        assert {file_id: found_by(server, file_id) for file_id in retained} == found
         assert server.client.get(f"/api/v1/uploads/{deleted}").status_code == 404
         assert run(home, "verify", "--originals")["faults"] == []
         server.stop()
@@ -101,8 +101,8 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         assert objects(home, "originals/") == originals
         for job in server.client.get("/api/v1/jobs").json()["jobs"]:
             server.finished(job["job_id"])
-        assert {file_id: said_of(server, file_id) for file_id in kept} == said
-        assert {file_id: sorted(found_by(server, file_id)) for file_id in kept} == {
+        assert {file_id: said_of(server, file_id) for file_id in retained} == fields
+        assert {file_id: sorted(found_by(server, file_id)) for file_id in retained} == {
             file_id: sorted(ids) for file_id, ids in found.items()
         }
         assert run(home, "verify", "--originals")["lag"] is None

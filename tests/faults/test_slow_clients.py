@@ -80,9 +80,9 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
             problem(server.client.get(f"{job['status_url']}/events"), 429, "too_many_event_streams")
         refusals = sorted(body.recv(65536).split()[1] for body in bodies)
         assert refusals == 4 * [b"408"] + 4 * [b"429"], "half of the places, and not for long"
-        told = server.client.get("/metrics").text
-        assert 'connections_closed_total{reason="address_limit"}' in told
-        assert 'connections_closed_total{reason="accept_error"} 0.0' in told
+        text = server.client.get("/metrics").text
+        assert 'connections_closed_total{reason="address_limit"}' in text
+        assert 'connections_closed_total{reason="accept_error"} 0.0' in text
         assert len(idle) == IDLE
         assert server.log_path.stat().st_size - log_bytes < 100_000
         assert "Traceback" not in server.log()

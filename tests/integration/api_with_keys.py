@@ -39,10 +39,10 @@ class Door:
         headers = {"Authorization": f"Bearer {key}", **options.pop("headers", {})}
         return self._client.request(method, f"/api/v1{path}", headers=headers, **options)
 
-    def key(self, *scopes: str, **said: Any) -> dict[str, Any]:
+    def key(self, *scopes: str, **fields: Any) -> dict[str, Any]:
         """A new one, as it was answered."""
-        wanted = {"name": "someone", "scopes": scopes, **said}
-        made = self(ADMIN, "POST", "/keys", json=wanted)
+        params = {"name": "someone", "scopes": scopes, **fields}
+        made = self(ADMIN, "POST", "/keys", json=params)
         assert made.status_code == 201, made.text
         answer: dict[str, Any] = made.json()
         return answer

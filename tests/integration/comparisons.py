@@ -62,7 +62,7 @@ def searches(service: Service) -> int:
         return session.scalar(select(func.count()).select_from(Search)) or 0
 
 
-def kept(service: Service) -> set[str]:
+def feature_keys(service: Service) -> set[str]:
     return {info.key for info in service.store.list("features/")}
 
 
@@ -78,9 +78,9 @@ def release(service: Service, started: dict[str, Any]) -> None:
     service.drain()
 
 
-def fit(service: Service, map_name: str, **wanted: int) -> None:
+def fit(service: Service, map_name: str, **params: int) -> None:
     """A vocabulary for the map, from its start to its end."""
-    started = service.json("POST", "/vocabularies", 202, params={"map": map_name}, json=wanted)
+    started = service.json("POST", "/vocabularies", 202, params={"map": map_name}, json=params)
     for _ in range(ROUNDS):
         service.drain()
         advance_model_changes(service.catalog, InProcessWakeups())

@@ -8,7 +8,6 @@ from pathlib import Path
 from uuid import UUID
 
 import pytest
-import torch
 
 from services.extractor import worker as worker_module
 from services.extractor.decoder_pool import DecoderPool
@@ -41,15 +40,6 @@ class LentDecoders:
 
     def close(self) -> None:
         pass
-
-
-@pytest.fixture(scope="package", autouse=True)
-def _one_torch_thread() -> Iterator[None]:
-    """The tiny extractors are faster without a pool of threads that wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 """A map laid out by hand: each photo's descriptor is a direction in the plane.
 
 The cosine of two photos is that of the angle between them, so that every ranking, and with it
-every figure of an evaluation, can be told with a pencil.
+every figure of an evaluation, can be computed with a pencil.
 """
 
 from __future__ import annotations
@@ -118,11 +118,11 @@ class Watched:
     port: SearchBackend
     at: int
     do: Callable[[], object]
-    asked: int = 0
+    searches: int = 0
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        self.asked += 1
-        if self.asked == self.at:
+        self.searches += 1
+        if self.searches == self.at:
             self.do()
         return self.port.search(request)
 

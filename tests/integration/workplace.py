@@ -17,7 +17,11 @@ from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
-from shared.catalog.generations import Generation, active_generation, building_generation
+from shared.catalog.generations import (
+    Generation,
+    GenerationState,
+    active_generation,
+)
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -27,12 +31,20 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import Pixels, get_preprocessing
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
 from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.storage import FolderStore
 from shared.storage.chunks import Rows
 from shared.storage.keys import TRASH
-from tests.support.catalog_rows import ask, delete, read_job, set_columns, stored_rows, upload
+from tests.support.catalog_rows import (
+    ask,
+    delete,
+    read_job,
+    set_columns,
+    stored_rows,
+    upload,
+)
 from tests.support.photos import photo_bytes
 
 ROUNDS = 60  # of draining and stewarding, before a model change that does not end is a failure
@@ -149,7 +161,12 @@ class Workplace:
 
     def building(self) -> Generation | None:
         with self.catalog.read() as session:
-            return building_generation(session, self.map_id)
+            return session.scalar(
+                select(Generation).where(
+                    Generation.map_id == self.map_id,
+                    Generation.state == GenerationState.BUILDING,
+                )
+            )
 
     def generation(self, generation_id: UUID) -> Generation:
         with self.catalog.read() as session:
@@ -197,3 +214,19 @@ def expected_row(extractor: str, data: bytes, centres: ClusterCentres | None = N
 def same(one: Rows, other: Rows) -> bool:
     """The same descriptor, but for the order in which floats were summed."""
     return bool(np.allclose(one, other, atol=1e-5))
+
+
+def pixels_of(data: bytes) -> Pixels:
+    return decode_photo(data, get_preprocessing("square32"), 10**9).pixels
+
+
+def once(do: Callable[[], None]) -> Callable[..., None]:
+    """Does it at the first call alone, also when the call leads to others."""
+    calls = iter([do])
+
+    def first(*_: Any) -> None:
+        for act in calls:
+            act()
+            return
+
+    return first

@@ -154,8 +154,15 @@ def add_chunk(
     photo_ids: list[UUID],
     slot_rows: int = 1000,
     rows: Rows | None = None,
+    slot: int | None = None,
+    dead: int = 0,
 ) -> UUID:
-    """A published chunk with a row for each photo, `row_of` it unless given; its id."""
+    """Publish a chunk with a row for each photo, `row_of` it by default, and return its id.
+
+    Args:
+        slot: The chunk's slot. By default one with room is allocated.
+        dead: Number of rows at the beginning that no photo refers to, as after a lost lease.
+    """
     chunk_id = new_id()
     written = write_chunk(
         store,
@@ -171,7 +178,9 @@ def add_chunk(
             Chunk(
                 id=chunk_id,
                 generation_id=generation_id,
-                slot=allocate_slot(generation, len(photo_ids), slot_rows),
+                slot=(
+                    allocate_slot(generation, len(photo_ids), slot_rows) if slot is None else slot
+                ),
                 object_key=written.object_key,
                 rows=written.rows,
                 size_bytes=written.size_bytes,
@@ -179,12 +188,11 @@ def add_chunk(
             )
         )
         session.flush()
-        for row, photo_id in enumerate(photo_ids):
-            session.add(
-                Descriptor(
-                    generation_id=generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
-                )
-            )
+        session.add_all(
+            Descriptor(generation_id=generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row)
+            for row, photo_id in enumerate(photo_ids)
+            if row >= dead
+        )
         increment_map_version(session, generation.map_id)
     return chunk_id
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 
@@ -23,7 +23,7 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 def untrained(seed: int = 0, **config: Any) -> VprModel:
     """A cropped ResNet-18 with random weights: 128 dimensions, photos of SIDES."""
-    said: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "backbone_arch": "resnet18",
         "pretrained": False,
         "layers_to_crop": (3, 4),
@@ -33,7 +33,7 @@ def untrained(seed: int = 0, **config: Any) -> VprModel:
     }
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return build_vpr_model(VprModelConfig(**said))
+        return build_vpr_model(VprModelConfig(**fields))
 
 
 def checkpoint_of(model: VprModel, **about: Any) -> bytes:
@@ -70,3 +70,7 @@ def own_output(model: VprModel, photo: bytes) -> Rows:
         batch = normalise_pixels(torch.from_numpy(pixels)[None], MEAN, STD)
         row: Rows = model(batch)[0].numpy()
     return row
+
+
+def none_added(name: str, device: torch.device) -> NoReturn:
+    raise AssertionError(f"nothing in this test names the model {name!r}")

@@ -19,7 +19,7 @@ HUB_COMMIT = "9" * 40
 
 @dataclass
 class FilesServer:
-    """What it has, and what it was asked."""
+    """Its files, its faults, and the requests so far."""
 
     url: str = ""
     files: dict[str, bytes] = field(default_factory=dict)
@@ -29,13 +29,13 @@ class FilesServer:
     break_after: list[int] = field(default_factory=list)
     """Bytes after which the next answers break off, each once."""
     stall_after: int | None = None
-    """Bytes after which an answer stands still until `checkpoint_and_release` is set."""
+    """Bytes after which an answer stands still until `go_on` is set."""
     go_on: threading.Event = field(default_factory=threading.Event)
     ranges: bool = True
     """Whether it has strong ETags and sends parts."""
     refuse: list[int] = field(default_factory=list)
     """Statuses of the next answers."""
-    asked: list[tuple[str, str | None]] = field(default_factory=list)
+    requests: list[tuple[str, str | None]] = field(default_factory=list)
     """Path and `Range` of each GET."""
 
     def etag(self, path: str) -> str:
@@ -57,9 +57,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, send: bool) -> None:
         shown: FilesServer = self.server.shown
-        wanted = self.headers.get("Range")
+        byte_range = self.headers.get("Range")
         if send:
-            shown.asked.append((self.path, wanted))
+            shown.requests.append((self.path, byte_range))
             if shown.refuse:
                 self.send_error(shown.refuse.pop(0))
                 return
@@ -69,8 +69,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         etag = f'"{shown.etag(self.path)}"'
         begin, status = 0, 200
-        if send and shown.ranges and wanted and self.headers.get("If-Range") in (None, etag):
-            begin, status = int(wanted.removeprefix("bytes=").rstrip("-")), 206
+        if send and shown.ranges and byte_range and self.headers.get("If-Range") in (None, etag):
+            begin, status = int(byte_range.removeprefix("bytes=").rstrip("-")), 206
         if status == 206 and begin >= len(data):
             self.send_response(416)
             self.send_header("Content-Range", f"bytes */{len(data)}")
@@ -98,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.flush()
             begin += shown.stall_after
             shown.go_on.wait()
-        # Whoever asked may be dead by now.
+        # The client may be dead by now.
         with contextlib.suppress(ConnectionError):
             self.wfile.write(data[begin:])
 

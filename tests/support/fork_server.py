@@ -40,7 +40,10 @@ MODULES = (
     "shared.storage.open_store",
     "shared.descriptors.extractor",
     "shared.descriptors.vocabulary_file",
-    # What libraries import at their first use.
+    # What is imported at its first use.
+    "alembic.command",
+    "shared.catalog.postgres",
+    "shared.storage.s3",
     "PIL.JpegImagePlugin",
     "anyio._backends._asyncio",
     "httpcore2",
@@ -84,7 +87,7 @@ def serve(control: socket.socket) -> dict[str, Any] | None:
 
 
 def run(request: dict[str, Any]) -> None:
-    """Be the process that was asked for. What the program raises is for the interpreter."""
+    """Run the command in this process. The interpreter handles what the program raises."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(request["cwd"])
     os.environ.clear()

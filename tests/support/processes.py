@@ -32,13 +32,13 @@ LOOK_SECONDS = 0.01
 
 
 def _inherited() -> dict[str, str]:
-    kept = {name: value for name, value in os.environ.items() if name not in READ_AT_START}
+    retained = {name: value for name, value in os.environ.items() if name not in READ_AT_START}
     # Where no bytecode is written beside the sources, each start would compile torch anew.
-    if kept.get("PYTHONDONTWRITEBYTECODE"):
+    if retained.get("PYTHONDONTWRITEBYTECODE"):
         folder = tempfile.TemporaryDirectory(prefix="pw-bytecode-", ignore_cleanup_errors=True)
         atexit.register(folder.cleanup)
-        kept |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder.name}
-    return kept
+        retained |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder.name}
+    return retained
 
 
 # The environment of the tests without the developer's settings, as it was before they changed it:
@@ -90,7 +90,7 @@ def start(
 
 
 class ForkedProcess:
-    """A child of the fork server, which keeps its pid until the exit code is asked for."""
+    """A child of the fork server, which keeps its pid until its exit code is read."""
 
     def __init__(self, server: ForkServer, pid: int, command: list[str]) -> None:
         self.pid = pid
@@ -114,7 +114,9 @@ class ForkedProcess:
 
     def send_signal(self, sig: int) -> None:
         if self.poll() is None:
-            with contextlib.suppress(ProcessLookupError):  # another thread has asked meanwhile
+            with contextlib.suppress(
+                ProcessLookupError
+            ):  # another thread has read the exit code meanwhile
                 os.kill(self.pid, sig)
 
     def terminate(self) -> None:
@@ -167,8 +169,8 @@ class ForkServer:
             message = json.dumps({**request, "number": self._asked}).encode()
             try:
                 socket.send_fds(self._control, [message], descriptors or [])
-                while said := self._control.recv(ANSWER_BYTES):
-                    number, answer = json.loads(said)
+                while reported := self._control.recv(ANSWER_BYTES):
+                    number, answer = json.loads(reported)
                     if number == self._asked:  # others are of questions that were cut short
                         return answer
             except OSError:

@@ -106,12 +106,14 @@ class ServerProcess:
         while time.monotonic() < deadline:
             if self._process.poll() is not None:
                 raise AssertionError(f"the server ended: {self.log()}")
-            said = self._announced()
-            if said is not None:
+            reported = self._announced()
+            if reported is not None:
                 self.client.close()
                 self.client = httpx2.Client(
-                    base_url=said["url"],
-                    headers={"Authorization": f"Bearer {said['key']}"} if "key" in said else None,
+                    base_url=reported["url"],
+                    headers={"Authorization": f"Bearer {reported['key']}"}
+                    if "key" in reported
+                    else None,
                     timeout=90,
                     event_hooks={"response": [self._check_discreet]},
                 )
@@ -133,10 +135,10 @@ class ServerProcess:
 
     def _announced(self) -> dict[str, str] | None:
         try:
-            said: dict[str, str] = json.loads(server_address_file(self.home).read_text())
+            body: dict[str, str] = json.loads(server_address_file(self.home).read_text())
         except (FileNotFoundError, ValueError):
             return None
-        return said
+        return body
 
     def kill(self) -> None:
         """SIGKILL: nothing can be tidied up."""

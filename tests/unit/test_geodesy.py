@@ -17,7 +17,7 @@ from shared.geodesy import (
     latitude_bounds,
     weighted_centroid,
 )
-from tests.support.photo_filters import HALF_EARTH_M, metres, points
+from tests.unit.search.photo_filters import HALF_EARTH_M, metres, points
 
 DEGREE_M = HALF_EARTH_M / 180
 Point = tuple[float, float]

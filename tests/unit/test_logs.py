@@ -101,22 +101,22 @@ def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
     set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str, control: str
 ) -> None:
     forged = "2026-11-21 12:00:00,000 INFO services.request_log: DELETE /api/v1/maps/a: 200"
-    said = f"/a{control}{forged}"
+    reported = f"/a{control}{forged}"
     set_up(LOG_FORMAT=log_format)
     log = logging.getLogger("services.request_log")
-    log.info("GET %s: 404", said, extra={"file": said})
+    log.info("GET %s: 404", reported, extra={"file": reported})
     try:
-        raise ValueError(said)
+        raise ValueError(reported)
     except ValueError:
-        log.exception("it failed with %s", said)
+        log.exception("it failed with %s", reported)
     text = capsys.readouterr().err
     assert all(0x20 <= ord(one) < 0x7F for one in text.replace("\n", ""))
     lines = text.split("\n")
     assert not [line for line in lines if line.startswith(forged)]
     if log_format == "json":
         called, failed, end = lines
-        assert (json.loads(called)["file"], end) == (said, "")
-        assert said in json.loads(failed)["error"]
+        assert (json.loads(called)["file"], end) == (reported, "")
+        assert reported in json.loads(failed)["error"]
     else:
         assert lines[0].count("INFO services.request_log") == 3, "in one line"
         assert "  Traceback (most recent call last):" in lines

@@ -20,7 +20,7 @@ from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.evaluation.baselines import BASELINE_DESCRIPTORS
 from shared.evaluation.place_evidence import PhotoLocation
 from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
-from shared.synthetic_city.plan import CityPlan, PlannedPhoto
+from shared.synthetic_city.plan import CityPlan, positions_m
 from shared.word_weights.training_pairs import sample_pairs
 from shared.word_weights.weights import PairStatistics, apply_word_weights, empty_pair_statistics
 
@@ -79,15 +79,14 @@ def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[di
         (`recall`), over those that look the same way as database photos (`recall_in_map`) and over
         those that look the other way (`recall_other_way`); None without such queries.
     """
-    database = [photo for photo in plan.photos if photo.role == "database"]
-    queries = [p for p in plan.photos if p.role == "query" and p.kind != "out_of_map"]
+    database, queries = plan.evaluation_photos()
     if not queries:
         return []
-    positives = positives_within(_positions(queries), _positions(database))
+    positives = positives_within(positions_m(queries), positions_m(database))
     other_way = np.array([photo.kind == "other_way" for photo in queries])
     results = []
     described = _describe_photos(
-        [out / p.folder / p.name for p in database + queries], len(database), progress
+        [photo.path(out) for photo in database + queries], len(database), progress
     )
     for name, query_rows, database_rows in _add_word_weighted(
         *described, [photo.name for photo in database]
@@ -158,10 +157,6 @@ def _add_word_weighted(
                 (f"{name}, word weights", fit_and_apply_word_weights(queries, weights), database)
             )
     return entries
-
-
-def _positions(photos: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
-    return np.array([(photo.camera.x, photo.camera.y) for photo in photos])
 
 
 def _recall_shares(

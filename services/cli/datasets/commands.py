@@ -26,6 +26,7 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_result,
     printable_path,
     progress_bar,
     report_errors,
@@ -243,15 +244,13 @@ def ground_truth(
         "positives": sum(counts),
         "queries_without_positives": counts.count(0),
     }
-    if as_json:
-        print_json(figures)
-        return
-    console.print(
+    print_result(
+        figures,
+        as_json,
         f"Wrote {printable_path(out)} and {printable_path(sidecar_path(out))}: "
         f"{sum(counts)} positives ({criterion}) "
         f"for {len(query_photos)} queries among {len(database_photos)} database photos; "
         f"{counts.count(0)} queries have none.",
-        soft_wrap=True,
     )
 
 

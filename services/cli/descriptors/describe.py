@@ -22,8 +22,7 @@ from services.cli.extractor_options import (
 )
 from services.cli.output import (
     JsonOption,
-    console,
-    print_json,
+    print_result,
     printable_path,
     progress_bar,
     report_errors,
@@ -133,14 +132,11 @@ def describe(
                 lambda n: progress.advance(bar, n),
                 names=names,
             )
-    if as_json:
-        print_json(result.as_json())
-        return
-    console.print(
+    print_result(
+        result.as_json(),
+        as_json,
         f"Wrote {result.rows} rows of {result.spec['dimension']} dimensions to "
         f"{printable_path(out)} ({recipe.name}, {result.seconds['total']:.1f} s).",
-        soft_wrap=True,
-        markup=False,
     )
 
 

@@ -42,6 +42,7 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_result,
     progress_bar,
     report_errors,
 )
@@ -100,17 +101,14 @@ def add(
                 note=note,
                 on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
             )
-            job = wait_for_job(client, started["job_id"], progress, "checking")
-        if as_json:
-            print_json(job)
-            return
-        model = job["result"]
-        console.print(
+            job = wait_for_job(client, started, progress, "checking")
+        model = job.result or {}
+        print_result(
+            job,
+            as_json,
             f"{model['extractor']}: {model['dimension']} dimensions, "
             f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
             f"{'; already stored' if model['already_there'] else ''}.",
-            soft_wrap=True,
-            markup=False,
         )
 
 
@@ -128,14 +126,14 @@ def list_added(
         table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
         for model in models:
             table.add_row(
-                escape(model["extractor"]),
-                f"{model['config']['backbone_arch']} {model['config']['agg_arch']}",
-                "{}x{}".format(*model["image_size"]),
-                str(model["dimension"]),
-                f"{model['size_bytes'] / 1e6:.1f} MB",
-                escape(model["licence"]),
-                escape(", ".join(model["maps"])),
-                escape(model["note"] or ""),
+                escape(model.extractor),
+                f"{model.config['backbone_arch']} {model.config['agg_arch']}",
+                "{}x{}".format(*model.image_size),
+                str(model.dimension),
+                f"{model.size_bytes / 1e6:.1f} MB",
+                escape(model.licence),
+                escape(", ".join(model.maps)),
+                escape(model.note or ""),
             )
         console.print(table)
 
@@ -150,10 +148,7 @@ def remove(
     with report_errors(as_json):
         with connect(server, None, key) as client:
             removed = client.remove_model(name)
-        if as_json:
-            print_json(removed)
-            return
-        console.print(removed["message"], soft_wrap=True, markup=False)
+        print_result(removed, as_json, removed.message)
 
 
 app = typer.Typer(help="Manage extractor weights and trained models.")

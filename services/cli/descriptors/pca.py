@@ -7,19 +7,19 @@ from typing import Annotated
 
 import typer
 
-from services.cli.client import connect, wait_for_job
+from placewise.answers import Job
+from services.cli.client import active_generation, connect, wait_for_job
 from services.cli.output import (
+    Json,
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
-    console,
     print_failures,
-    print_json,
+    print_result,
     progress_bar,
     report_errors,
 )
-from shared.client import Json
 from shared.errors import Conflict, InvalidRequest
 from shared.extractor_config.configs import MAX_PCA_DIMENSION
 
@@ -73,7 +73,7 @@ def fit(
             )
         with connect(server, map_name, key) as client, progress_bar() as progress:
             started = client.start_generation(pca=dimension)
-            job = wait_for_job(client, started["job_id"], progress, "pca")
+            job = wait_for_job(client, started, progress, "pca")
         _print_generation(job, as_json)
 
 
@@ -87,11 +87,11 @@ def undo(
     """Reindex the map without PCA, with its current vocabulary, and switch to the result."""
     with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            active = next((g for g in client.generations() if g["state"] == "active"), None)
-            if active is None or active["pca_from"] is None:
+            active = active_generation(client)
+            if active is None or active.pca_from is None:
                 raise Conflict("not_reduced", "The map's descriptors are not reduced by PCA.")
-            started = client.start_generation(vocabulary_id=active["vocabulary_id"])
-            job = wait_for_job(client, started["job_id"], progress, "reindexing")
+            started = client.start_generation(vocabulary_id=active.vocabulary_id)
+            job = wait_for_job(client, started, progress, "reindexing")
         _print_generation(job, as_json)
 
 
@@ -115,23 +115,19 @@ def _fit_file(
         fitted = fit_pca_locally(
             source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
         )
-    if as_json:
-        print_json(fitted)
-        return
-    print_failures(fitted, "refused")
-    console.print(f"{fitted['file']}: {_format_pca(fitted)}.", soft_wrap=True, markup=False)
+    if not as_json:
+        print_failures(fitted, "refused")
+    print_result(fitted, as_json, f"{fitted['file']}: {_format_pca(fitted)}.")
 
 
-def _print_generation(job: Json, as_json: bool) -> None:
-    if as_json:
-        print_json(job)
-        return
-    result = job["result"]
+def _print_generation(job: Job, as_json: bool) -> None:
+    result = job.result or {}
     size = _format_pca(result["pca"]) if result["pca"] else f"{result['dimension']} dimensions"
-    console.print(
+    print_result(
+        job,
+        as_json,
         f"Generation {result['generation_id']} is active: {result['photos']} photos, "
         f"{size}, {result['failed']} failed.",
-        soft_wrap=True,
     )
 
 

@@ -11,8 +11,11 @@ import typer
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from services.cli.client import connect, wait_for_job
+from placewise.answers import Generation, Job
+from placewise.client import Client
+from services.cli.client import active_generation, connect, wait_for_job
 from services.cli.output import (
+    Json,
     JsonOption,
     KeyOption,
     MapOption,
@@ -21,11 +24,11 @@ from services.cli.output import (
     console,
     print_failures,
     print_json,
+    print_result,
     printable_path,
     progress_bar,
     report_errors,
 )
-from shared.client import Client, Json
 from shared.errors import InvalidRequest
 from shared.extractor_config.configs import MAX_CLUSTERS
 
@@ -112,7 +115,7 @@ def import_(
             normalised_file = Path(folder, f"{file.stem}{vocabulary.suffix}")
             normalised_file.write_bytes(vocabulary.encode())
             started = client.import_vocabulary(normalised_file)
-            job = wait_for_job(client, started["job_id"], progress, "vocabulary")
+            job = wait_for_job(client, started, progress, "vocabulary")
         _print_generation(job, as_json)
 
 
@@ -142,12 +145,11 @@ def export(
             )
         with atomic_write(out) as file:
             file.write(data)
-        if as_json:
-            print_json(
-                {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)}
-            )
-            return
-        console.print(f"{printable_path(out)}: {len(data)} bytes.", soft_wrap=True, markup=False)
+        print_result(
+            {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)},
+            as_json,
+            f"{printable_path(out)}: {len(data)} bytes.",
+        )
 
 
 @app.command("list")
@@ -161,26 +163,27 @@ def list_(
     with report_errors(as_json):
         with connect(server, map_name, key) as client:
             vocabularies = client.vocabularies()
-            active_generations = {
-                g["vocabulary_id"]: g for g in client.generations() if g["state"] == "active"
-            }
-        active = active_generations.keys()
+            active = active_generation(client)
+        active_id = active and active.vocabulary_id
         if as_json:
-            print_json([{**v, "active": v["vocabulary_id"] in active} for v in vocabularies])
+            print_json(
+                [{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies]
+            )
             return
         # IDs are folded, not truncated, so that they can be copied.
         name = Column("vocabulary", overflow="fold", min_width=36)
         table = Table("", name, "origin", "clusters", "dimension", "photos", "created")
         for v in vocabularies:
+            is_active = v.vocabulary_id == active_id
             table.add_row(
-                "*" if v["vocabulary_id"] in active else "",
-                f"{v['vocabulary_id']}\n{_format_provenance(v['provenance'])}\nsha256 "
-                f"{v['sha256'][:12]}" + _format_pca(active_generations.get(v["vocabulary_id"])),
-                v["origin"],
-                str(v["clusters"]),
-                str(v["dimension"]),
-                str(v["provenance"].get("photos", "")),
-                v["created_at"],
+                "*" if is_active else "",
+                f"{v.vocabulary_id}\n{_format_provenance(v.provenance)}\nsha256 {v.sha256[:12]}"
+                + _format_pca(active if is_active else None),
+                v.origin,
+                str(v.clusters),
+                str(v.dimension),
+                str(v.provenance.get("photos", "")),
+                f"{v.created_at:%Y-%m-%d %H:%M:%S}",
             )
         console.print(table)
 
@@ -209,10 +212,10 @@ def _format_provenance(provenance: Json) -> str:
     return " ".join(str(part) for part in parts if part is not None)
 
 
-def _format_pca(generation: Json | None) -> str:
-    if generation is None or generation["pca_from"] is None:
+def _format_pca(generation: Generation | None) -> str:
+    if generation is None or generation.pca_from is None:
         return ""
-    return f"\nPCA: {generation['dimension']} of {generation['pca_from']} dimensions"
+    return f"\nPCA: {generation.dimension} of {generation.pca_from} dimensions"
 
 
 def _reject_options(source: str, options: dict[str, object]) -> None:
@@ -244,33 +247,27 @@ def _fit_folder(
             seed=seed,
             progress=progress,
         )
-    if as_json:
-        print_json(fitted)
-        return
-    print_failures(fitted, "refused")
+    if not as_json:
+        print_failures(fitted, "refused")
     provenance = fitted["provenance"]
-    console.print(
+    print_result(
+        fitted,
+        as_json,
         f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
         f"{provenance['photos']} photos, mean cosine {provenance['mean_cosine']:.4f}.",
-        soft_wrap=True,
-        markup=False,
     )
 
 
-def fit_and_wait(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
+def fit_and_wait(client: Client, parameters: dict[str, int], progress: Progress) -> Job:
     """Fit a vocabulary on the map's photos and wait until its generation is active."""
-    return wait_for_job(
-        client, client.fit_vocabulary(**parameters)["job_id"], progress, "vocabulary"
-    )
+    return wait_for_job(client, client.fit_vocabulary(**parameters), progress, "vocabulary")
 
 
-def _print_generation(job: Json, as_json: bool) -> None:
-    if as_json:
-        print_json(job)
-        return
-    result = job["result"]
-    console.print(
+def _print_generation(job: Job, as_json: bool) -> None:
+    result = job.result or {}
+    print_result(
+        job,
+        as_json,
         f"Generation {result['generation_id']} is active: {result['photos']} photos, "
         f"{result['clusters']} clusters, {result['failed']} failed.",
-        soft_wrap=True,
     )

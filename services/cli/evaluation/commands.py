@@ -21,6 +21,20 @@ from shared.errors import InvalidRequest
 
 OptionValues = dict[str, object]
 
+ProtocolOption = Annotated[
+    str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
+]
+RuleOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Positive-match criterion: `radius 25`, `heading 25 40`, `frames 5`, `place-label`."
+    ),
+]
+FaissGpuOption = Annotated[
+    bool,
+    typer.Option("--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."),
+]
+
 SIZE_PATTERN = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
 
 
@@ -52,16 +66,8 @@ def evaluate(
         list[str] | None,
         typer.Option("--set", help="Set of --data. Can be repeated. Default: all sets."),
     ] = None,
-    protocol: Annotated[
-        str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
-    ] = None,
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="Positive-match criterion: `radius 25`, `heading 25 40`, `frames 5`, "
-            "`place-label`."
-        ),
-    ] = None,
+    protocol: ProtocolOption = None,
+    rule: RuleOption = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(
@@ -143,12 +149,7 @@ def evaluate(
     only_wrong: Annotated[
         bool, typer.Option("--only-wrong", help="Show only failed queries in the report.")
     ] = False,
-    faiss_gpu: Annotated[
-        bool,
-        typer.Option(
-            "--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."
-        ),
-    ] = False,
+    faiss_gpu: FaissGpuOption = False,
     sample: Annotated[
         int | None,
         typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
@@ -266,23 +267,12 @@ def compare(
     set_name: Annotated[
         str | None, typer.Option("--set", help="Set of DIR. Required if there are several.")
     ] = None,
-    protocol: Annotated[str | None, typer.Option(help="Evaluation protocol.")] = None,
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="Positive-match criterion: `radius 25`, `heading 25 40`, `frames 5`, "
-            "`place-label`."
-        ),
-    ] = None,
+    protocol: ProtocolOption = None,
+    rule: RuleOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
     ] = None,
-    faiss_gpu: Annotated[
-        bool,
-        typer.Option(
-            "--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."
-        ),
-    ] = False,
+    faiss_gpu: FaissGpuOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare recall, speed and size of several extractors on one data set.

@@ -20,13 +20,13 @@ from rich.table import Column, Table
 
 from services.cli.environment import read_settings
 from services.cli.evaluation.data_sets import progress_bars
-from services.cli.evaluation.describers import Describer, checkpoint_describer, extractor_describer
+from services.cli.evaluation.describers import checkpoint_describer, extractor_describer
 from services.cli.output import console, print_json, printable_path, progress_bar
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import choose_device
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
-from shared.descriptors.pca_whitening import PcaProjection, PcaWhitening
+from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.bootstrap import PairedDifference, cluster_queries, paired_differences
 from shared.evaluation.exact_knn import exact_knn
@@ -40,24 +40,13 @@ BLOCK_BYTES = 64_000_000
 SEED = 0
 
 
-@dataclass(frozen=True, slots=True)
-class WhitenedSet:
-    """Descriptors of a data set after PCA whitening."""
-
-    database: Rows
-    queries: Rows
-    whitening: PcaWhitening
-    milliseconds_a_photo: float
-    """Time to project one row."""
-
-
 def whiten_set(
     database: Rows,
     queries: Rows,
     components: int,
     device: torch.device,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
-) -> WhitenedSet:
+) -> tuple[Rows, Rows, float]:
     """Fit a PCA whitening on the database rows and project the rows of a data set.
 
     Args:
@@ -68,7 +57,7 @@ def whiten_set(
         on_progress: Called with stage, done and total.
 
     Returns:
-        (m, components) and (n, components) rows.
+        (m, components) and (n, components) rows, and the milliseconds to project one row.
 
     Raises:
         Unprocessable: `pca_too_few_rows`, `pca_too_many_dimensions`.
@@ -83,9 +72,7 @@ def whiten_set(
     started = time.perf_counter()
     reduced = [_project(rows, projection, block_rows, device) for rows in (database, queries)]
     seconds = time.perf_counter() - started
-    return WhitenedSet(
-        reduced[0], reduced[1], whitening, 1000 * seconds / max(1, len(database) + len(queries))
-    )
+    return reduced[0], reduced[1], 1000 * seconds / max(1, len(database) + len(queries))
 
 
 def _project(rows: Rows, projection: PcaProjection, block_rows: int, device: torch.device) -> Rows:
@@ -177,22 +164,19 @@ def compare_extractors(
     _validate_entries(entries, settings, out)
     evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
     clusters = cluster_queries(evaluation_set.queries)
-    results: list[tuple[ComparedExtractor, RetrievalMetrics]] = []
+    compared: list[ComparedExtractor] = []
     with progress_bar() as progress:
         for entry in entries:
             properties, measured = _evaluate_entry(
                 entry, evaluation_set, settings, faiss_gpu, progress
             )
-            first = results[0][1] if results else None
             difference: PairedDifference | None = None
-            if first is not None:
+            if compared:
+                first = compared[0].measured
                 (difference,) = paired_differences(
                     measured.within[:, :1], first.within[:, :1], clusters.labels
                 )
-            results.append(
-                (ComparedExtractor(entry.spec_text, measured, difference, **properties), measured)
-            )
-    compared = [result for result, _ in results]
+            compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
     report = _comparison_as_json(evaluation_set, compared)
     if out is not None:
         _write_report(out, report, render_comparison(evaluation_set, compared))
@@ -240,7 +224,13 @@ def _evaluate_entry(
     faiss_gpu: bool,
     progress: Progress,
 ) -> tuple[dict[str, Any], RetrievalMetrics]:
-    describer = _make_describer(entry, evaluation_set, settings, progress)
+    describer = (
+        checkpoint_describer(Path(entry.name), "same", settings)
+        if entry.name.endswith(".ckpt")
+        else extractor_describer(
+            entry.name, None, evaluation_set, settings, progress, fit=entry.fit
+        )
+    )
     on_progress = progress_bars(progress, entry.spec_text)
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
@@ -251,12 +241,11 @@ def _evaluate_entry(
     ):
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            whitened = whiten_set(
+            database, queries, projection_ms = whiten_set(
                 database, queries, entry.pca, choose_device(settings.device), on_progress
             )
-            database, queries = whitened.database, whitened.queries
             if milliseconds is not None:
-                milliseconds += whitened.milliseconds_a_photo
+                milliseconds += projection_ms
         ranked = exact_knn(
             queries,
             database,
@@ -278,16 +267,6 @@ def _evaluate_entry(
         "fingerprint": describer.fingerprint,
         "device": str(describer.about.get("device", "")),
     }, measured
-
-
-def _make_describer(
-    entry: ComparisonEntry, evaluation_set: EvaluationSet, settings: Settings, progress: Progress
-) -> Describer:
-    if entry.name.endswith(".ckpt"):
-        return checkpoint_describer(Path(entry.name), "same", settings)
-    recipe = get_extractor_config(entry.name, allow_test_extractors=settings.allow_test_extractors)
-    database = [photo.path for photo in evaluation_set.database]
-    return extractor_describer(recipe, None, database, settings, progress, fit=entry.fit)
 
 
 def _comparison_as_json(
@@ -329,7 +308,7 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         table.add_row(
             result.name,
             *(f"{100 * share:.1f}" for share in result.measured.recalls.recall_all.values()),
-            f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-",
+            interval[0].as_percent() if interval else "-",
             "-" if result.milliseconds_a_photo is None else f"{result.milliseconds_a_photo:.1f}",
             f"{result.bytes_a_photo:,}",
             result.against_first(),

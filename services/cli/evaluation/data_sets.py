@@ -13,11 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+from uuid import UUID
 
 import numpy as np
 from rich.progress import Progress
 
-from services.cli.client import connect
+from placewise.answers import Similar, Uploaded
+from placewise.client import Client
+from services.cli.client import active_generation, connect
 from services.cli.environment import read_settings
 from services.cli.evaluation.commands import ReportOptions
 from services.cli.evaluation.describers import Describer, checkpoint_describer, extractor_describer
@@ -28,7 +31,6 @@ from services.cli.ingest.upload import (
     fit_vocabulary_if_needed,
 )
 from services.cli.output import progress_bar
-from shared.client import Client, Json
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import Conflict, InvalidRequest, NotFound, Unavailable, Unprocessable
@@ -40,7 +42,6 @@ from shared.evaluation.ranking import (
     refused_photos_error,
 )
 from shared.evaluation.results import EvaluationResult, EvaluationRun
-from shared.extractor_config.configs import get_extractor_config
 
 Result = TypeVar("Result")
 
@@ -79,25 +80,24 @@ def evaluate_server(
         map_name or f"evaluate-{re.sub(r'[^a-z0-9]+', '-', evaluation_set.name.lower()).strip('-')}"
     )
     with connect(server, None, key) as client:
-        if name not in {map_["name"] for map_ in client.maps()}:
+        if name not in {map_.name for map_ in client.maps()}:
             client.create_map(name)
     with connect(server, name, key) as client:
-        retrying_client = client.patient(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
+        retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
         indices_by_file = _upload_database(retrying_client, evaluation_set, name, progress)
         bar = progress.add_task(
             f"{evaluation_set.name}: querying", total=len(evaluation_set.queries)
         )
 
-        def query(photo: Path) -> tuple[Json, float]:
+        def query(photo: Path) -> tuple[Similar, float]:
             started = time.perf_counter()
-            response = retrying_client.similar_to_file(
-                photo, top_k=min(depth, len(indices_by_file))
-            )
+            response = retrying_client.similar(photo, top_k=min(depth, len(indices_by_file)))
             progress.advance(bar)
             return response, time.perf_counter() - started
 
         responses = _map_concurrently(query, [photo.path for photo in evaluation_set.queries])
-        generation = next((g for g in client.generations() if g["state"] == "active"), {})
+        active = active_generation(client)
+    generation = active.as_json() if active else {}
     k = min(depth, len(evaluation_set.database))
     ranked = Rankings(
         np.empty((len(responses), k), np.int64), np.empty((len(responses), k), np.float32)
@@ -126,41 +126,41 @@ def evaluate_server(
 
 def _upload_database(
     client: Client, evaluation_set: EvaluationSet, name: str, progress: Progress
-) -> dict[str, list[int]]:
+) -> dict[UUID, list[int]]:
     """Upload the database photos; returns the database indices by file ID.
 
     Photos with equal bytes share a file ID.
     """
     bar = progress.add_task(f"{evaluation_set.name}: uploading", total=len(evaluation_set.database))
 
-    def upload(index: int) -> Json:
+    def upload(index: int) -> Uploaded:
         photo = evaluation_set.database[index]
         response = client.upload(photo.path, filename=Path(photo.name).name)
         progress.advance(bar)
         return response
 
     uploaded = _map_concurrently(upload, range(len(evaluation_set.database)))
-    indices_by_file: dict[str, list[int]] = {}
+    indices_by_file: dict[UUID, list[int]] = {}
     for index, response in enumerate(uploaded):
-        indices_by_file.setdefault(response["file_id"], []).append(index)
+        indices_by_file.setdefault(response.file_id, []).append(index)
     stats, _ = fit_vocabulary_if_needed(client, client.stats(), progress)
-    if stats["total_images"] != len(indices_by_file):
+    if stats.total_images != len(indices_by_file):
         raise Conflict(
             "map_holds_others",
-            f"Map {name} contains {stats['total_images']} photos instead of the "
+            f"Map {name} contains {stats.total_images} photos instead of the "
             f"{len(indices_by_file)} of {evaluation_set.name}. Other photos would change the "
             "results. Use another --map, or delete this one.",
         )
     bar = progress.add_task(f"{evaluation_set.name}: describing", total=len(indices_by_file))
     failed = []
     for index, response in enumerate(uploaded):
-        if response.get("job_id") is None or indices_by_file[response["file_id"]][0] != index:
+        if response.job_id is None or indices_by_file[response.file_id][0] != index:
             continue
-        job = client.wait_for(response["job_id"])
+        try:
+            client.wait(response)
+        except Unprocessable as error:
+            failed.append((evaluation_set.database[index].path, error))
         progress.advance(bar)
-        if job["state"] != "succeeded":
-            reason = Unprocessable("not_described", str((job["error"] or {}).get("detail")))
-            failed.append((evaluation_set.database[index].path, reason))
     if failed:
         raise refused_photos_error(failed, len(evaluation_set.database))
     return indices_by_file
@@ -173,13 +173,13 @@ def _map_concurrently(function: Callable[[Any], Result], items: Sequence[Any]) -
 
 
 def _fill_ranking(
-    ranked: Rankings, row: int, response: Json, indices_by_file: dict[str, list[int]], name: str
+    ranked: Rankings, row: int, response: Similar, indices_by_file: dict[UUID, list[int]], name: str
 ) -> None:
     k = ranked.indices.shape[1]
     matches = [
-        (index, image["similarity_score"])
-        for image in response["similar_images"]
-        for index in indices_by_file[image["image_id"]]
+        (index, image.similarity_score)
+        for image in response.similar_images
+        for index in indices_by_file[image.image_id]
     ][:k]
     if len(matches) < k:
         raise Unavailable(
@@ -258,7 +258,17 @@ def evaluate_sets(
     with progress_bar() as progress:
         for evaluation_set in evaluation_sets:
             if target.checkpoint is None and target.extractor is None:
-                result, run = _evaluate_on_server(evaluation_set, target, options, progress)
+                ranked, run, figures = evaluate_server(
+                    evaluation_set,
+                    target.server,
+                    target.map_name,
+                    target.key,
+                    options.depth,
+                    progress,
+                )
+                result = evaluate_rankings(
+                    evaluation_set, ranked, options, has_scores=True, about=figures
+                )
             else:
                 describer = _make_describer(evaluation_set, target, settings, progress)
                 result = _evaluate_describer(evaluation_set, describer, options, progress)
@@ -274,13 +284,10 @@ def _make_describer(
     if target.checkpoint is not None:
         return checkpoint_describer(target.checkpoint, target.image_size, settings)
     assert target.extractor is not None
-    recipe = get_extractor_config(
-        target.extractor, allow_test_extractors=settings.allow_test_extractors
-    )
     return extractor_describer(
-        recipe,
+        target.extractor,
         target.vocabulary,
-        [photo.path for photo in evaluation_set.database],
+        evaluation_set,
         settings,
         progress,
         fit=target.fit_vocabulary,
@@ -307,18 +314,6 @@ def _evaluate_describer(
         "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
     }
     return evaluate_rankings(evaluation_set, result.ranked, options, has_scores=True, about=figures)
-
-
-def _evaluate_on_server(
-    evaluation_set: EvaluationSet,
-    target: EvaluationTarget,
-    options: ReportOptions,
-    progress: Progress,
-) -> tuple[EvaluationResult, EvaluationRun]:
-    ranked, run, figures = evaluate_server(
-        evaluation_set, target.server, target.map_name, target.key, options.depth, progress
-    )
-    return evaluate_rankings(evaluation_set, ranked, options, has_scores=True, about=figures), run
 
 
 def progress_bars(progress: Progress, name: str) -> ProgressCallback:

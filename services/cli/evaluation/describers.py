@@ -20,6 +20,7 @@ from services.cli.descriptors.local_extractor import (
 )
 from services.trainer.model_describer import ModelDescriber
 from shared.config.settings import Settings
+from shared.datasets.dataset import EvaluationSet
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.descriptors.patches import fit_vocabulary, sample_photos
@@ -28,7 +29,7 @@ from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.errors import PlacewiseError
 from shared.evaluation.descriptor_cache import CachedDescriber, TimedDescriber
 from shared.evaluation.ranking import Rows, refused_photos_error
-from shared.extractor_config.configs import ExtractorConfig
+from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import DECODER
 
 CACHE_FOLDER = "descriptors"
@@ -134,9 +135,9 @@ def checkpoint_describer(
 
 
 def extractor_describer(
-    recipe: ExtractorConfig,
+    name: str,
     vocabulary: Path | None,
-    database: Sequence[Path],
+    evaluation_set: EvaluationSet,
     settings: Settings,
     progress: Progress,
     *,
@@ -145,17 +146,19 @@ def extractor_describer(
     """Create a describer from an extractor.
 
     Args:
-        recipe: The extractor.
+        name: The extractor's name, with options.
         vocabulary: VLAD vocabulary file, or None.
-        database: Database photos of the set.
+        evaluation_set: The set whose photos are described.
         settings: Device, batch size and cache.
         progress: Shows a vocabulary fit.
         fit: Fit the vocabulary on the database photos, never on queries. This is also done if no
             vocabulary is given or shipped.
     """
     about: dict[str, Any] = {}
+    recipe = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
     extractor = load_extractor(recipe, settings)
     if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
+        database = [photo.path for photo in evaluation_set.database]
         centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
         about["vocabulary"] = "fitted on the database photos"
     else:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import islice
+from uuid import UUID
+
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from services.cli.client import connect, wait_for_job
-from services.cli.output import console, print_json, progress_bar
-from shared.client import Client, Json
+from placewise.answers import Evaluation
+from placewise.client import Client
+from services.cli.client import active_generation, connect, wait_for_job
+from services.cli.output import Json, console, print_json, progress_bar
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
 MAX_EVALUATIONS_SHOWN = 6  # the current evaluation and earlier ones
-EVALUATIONS_FETCHED = 100
 
 
 def evaluate_map(
@@ -31,16 +34,15 @@ def evaluate_map(
     with connect(server, map_name, key) as client, progress_bar() as progress:
         if word_weights:
             fitted_weights = _fit_word_weights(client, parameters, progress)
-        job = wait_for_job(client, client.evaluate(**parameters)["job_id"], progress, "evaluating")
-        requested = [e for e in client.evaluations(EVALUATIONS_FETCHED) if not e["automatic"]][
-            :MAX_EVALUATIONS_SHOWN
-        ]
+        job = wait_for_job(client, client.evaluate(**parameters), progress, "evaluating")
+        requested = (e for e in client.evaluations() if not e.automatic)
+        shown = list(islice(requested, MAX_EVALUATIONS_SHOWN))
         vocabularies = _vocabulary_origins(client)
     if as_json:
-        result = job["result"]
+        result = job.result or {}
         print_json({**result, "word_weights": fitted_weights} if fitted_weights else result)
         return
-    _print_evaluations(requested, vocabularies)
+    _print_evaluations(shown, vocabularies)
     if fitted_weights:
         console.print(
             f"Word weights: {fitted_weights['outcome']}. {fitted_weights['reason']}",
@@ -51,26 +53,23 @@ def evaluate_map(
 
 def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
     """Fit word weights of the active generation; returns the job's result."""
-    active = [g["generation_id"] for g in client.generations() if g["state"] == "active"]
-    if not active:
+    active = active_generation(client)
+    if active is None:
         raise Conflict(
             "nothing_to_evaluate",
             "The map has no photos with descriptors yet. Upload photos: placewise index.",
         )
-    started = client.learn_word_weights(active[0], **parameters)
-    result: Json = wait_for_job(client, started["job_id"], progress, "word weights")["result"]
-    return result
+    started = client.learn_word_weights(active.generation_id, **parameters)
+    return wait_for_job(client, started, progress, "word weights").result or {}
 
 
-def _vocabulary_origins(client: Client) -> dict[str, str]:
+def _vocabulary_origins(client: Client) -> dict[UUID, str]:
     """Origin of the vocabulary by generation ID."""
-    origins = {v["vocabulary_id"]: v["origin"] for v in client.vocabularies()}
-    return {
-        g["generation_id"]: origins.get(g["vocabulary_id"], "none") for g in client.generations()
-    }
+    origins: dict[UUID | None, str] = {v.vocabulary_id: v.origin for v in client.vocabularies()}
+    return {g.generation_id: origins.get(g.vocabulary_id, "none") for g in client.generations()}
 
 
-def _print_evaluations(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
+def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, str]) -> None:
     table = Table(
         Column("evaluated", no_wrap=True),
         "vocabulary",
@@ -79,21 +78,21 @@ def _print_evaluations(evaluations: list[Json], vocabularies: dict[str, str]) ->
         *(Column(f"R@{k}", justify="right", no_wrap=True) for k in (1, 5, 10)),
     )
     for evaluation in evaluations:
-        figures = evaluation["figures"]
+        figures = evaluation.figures
         rows = _recall_rows(figures)
         # Evaluations of earlier releases have no `with_word_weights`.
         if weighted := figures.get("with_word_weights"):
             rows += [(f"{kind}, word weights", recall) for kind, recall in _recall_rows(weighted)]
         for kind, recall in rows:
             table.add_row(
-                evaluation["evaluated_at"][5:19].replace("T", " "),
-                vocabularies.get(evaluation["generation_id"], ""),
-                str(evaluation["searchable"]),
+                f"{evaluation.evaluated_at:%m-%d %H:%M:%S}",
+                vocabularies.get(evaluation.generation_id, ""),
+                str(evaluation.searchable),
                 f"{recall['queries']} {kind}",
                 *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     console.print(table)
-    figures = evaluations[0]["figures"]
+    figures = evaluations[0].figures
     # Evaluations of earlier releases have no `places`.
     if places := (figures.get("with_word_weights") or figures).get("places"):
         console.print(_answers_table(places))

@@ -179,13 +179,10 @@ def _print_result(result: EvaluationResult) -> None:
     )
     if result.against is not None:
         for k, difference in result.against.differences.items():
-            bounds = (
-                f" ({100 * difference.low:+.1f} to {100 * difference.high:+.1f})"
-                if difference.low is not None and difference.high is not None
-                else ""
-            )
+            bounds = difference.interval_in_points()
             console.print(
-                f"R@{k} {100 * difference.mean:+.1f} points{bounds} compared with "
+                f"R@{k} {100 * difference.mean:+.1f} points{f' ({bounds})' if bounds else ''} "
+                f"compared with "
                 f"{result.against.other}: {difference.won} queries gained, "
                 f"{difference.lost} lost.",
                 soft_wrap=True,
@@ -200,10 +197,7 @@ def _format_share(
         return "-"
     if intervals is None:
         return f"{100 * share:.1f} %"
-    return (
-        f"{100 * share:.1f} % ({100 * intervals[position].low:.1f} to "
-        f"{100 * intervals[position].high:.1f})"
-    )
+    return f"{100 * share:.1f} % ({intervals[position].as_percent()})"
 
 
 def _unwritable_error(path: Path | None, error: OSError) -> Misconfigured:

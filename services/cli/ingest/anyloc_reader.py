@@ -27,8 +27,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.output import printable_path
-from shared.client import Json
+from services.cli.output import Json, printable_path
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 

@@ -13,6 +13,7 @@ from services.cli.client import connect
 from services.cli.ingest.anyloc_reader import AnylocFolder, read_anyloc_folder
 from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
 from services.cli.output import (
+    Json,
     JsonOption,
     KeyOption,
     MapOption,
@@ -23,7 +24,6 @@ from services.cli.output import (
     progress_bar,
     report_errors,
 )
-from shared.client import Json
 
 DESCRIPTORS_NOTE = (
     "Descriptors are computed again: those in features/ use another vocabulary and another "

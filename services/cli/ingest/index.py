@@ -14,19 +14,18 @@ import typer
 
 from services.cli.client import connect
 from services.cli.environment import read_settings
-from services.cli.ingest.geotags import LocalPhoto, find_photos, read_photo_manifest
-from services.cli.ingest.upload import (
-    FitOption,
-    UpdateOption,
-    UploadJournal,
+from services.cli.ingest.batches import (
     check_archive,
     import_keys,
     import_prefix,
     manifest_has_keys,
     upload_archive,
-    upload_photos,
 )
+from services.cli.ingest.geotags import LocalPhoto, find_photos, read_photo_manifest
+from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
+from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
+    Json,
     JsonOption,
     KeyOption,
     MapOption,
@@ -39,8 +38,7 @@ from services.cli.output import (
     progress_bar,
     report_errors,
 )
-from shared.catalog.photos import PhotoRole
-from shared.client import Json
+from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest
 
 

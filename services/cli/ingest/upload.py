@@ -1,144 +1,24 @@
-"""Bulk uploads into a map: parallel uploads of local photos, archives and server-side imports.
-
-Each function waits until the photos are described and fits a vocabulary if the map has none of its
-own. `UploadJournal` (`placewise index --journal FILE`) records acknowledged uploads, so that an
-interrupted run can be resumed.
-"""
+"""Bulk uploads of local photos: in parallel, with a vocabulary fit if the map needs one."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
+from placewise.answers import FINISHED, Job, Stats, Uploaded
+from placewise.client import Client
 from services.cli.descriptors.vocabulary import fit_and_wait
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.output import err_console, printable_path
-from shared.client import FINISHED, Client, Json
-from shared.errors import (
-    Conflict,
-    InvalidRequest,
-    Misconfigured,
-    NotFound,
-    PlacewiseError,
-    Unprocessable,
-)
-from shared.imaging.file_formats import (
-    ACCEPTED_ARCHIVES,
-    ARCHIVE_SIGNATURE_BYTES,
-    detect_archive_format,
-)
-from shared.ingest.photo_metadata import KEY_FIELD
-
-JOURNAL_FORMAT = 1
-
-
-@dataclass(frozen=True, slots=True)
-class JournalEntry:
-    """A photo whose upload the server has acknowledged."""
-
-    file_id: str
-    job_id: str | None
-
-
-class UploadJournal:
-    """A JSONL file with one line per photo, appended when the server acknowledges the upload.
-
-    A photo counts as uploaded while its file's size and modification time and its metadata are
-    unchanged. An incomplete last line, left by a killed process, is ignored. A journal belongs to
-    one server and one map.
-
-    Raises:
-        InvalidRequest: `bad_journal` if the file is not a journal of this server and map.
-        Misconfigured: `out_unwritable` if the file can't be read or written.
-    """
-
-    def __init__(self, path: Path, url: str, map_name: str | None) -> None:
-        self._path = path
-        self._done: dict[str, dict[str, Any]] = {}
-        header = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
-        try:
-            text = path.read_text() if path.exists() else ""
-            self._read(text, header)
-            self._file = path.open("a")
-            if not text:
-                self._write(header)
-            elif not text.endswith("\n"):
-                self._file.write("\n")  # ends an incomplete last line
-        except (OSError, UnicodeDecodeError) as error:
-            raise Misconfigured(
-                "out_unwritable", f"Can't use the journal {printable_path(path)}: {error}."
-            ) from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def done(self, photo: LocalPhoto) -> JournalEntry | None:
-        """The recorded upload of the photo, or None if it is new or has changed."""
-        line = self._done.get(printable_path(photo.path))
-        if line is None or line["state"] != _file_state(photo):
-            return None  # a missing file is reported by the upload itself
-        return JournalEntry(line["file_id"], line["job_id"])
-
-    def add(self, photo: LocalPhoto, entry: JournalEntry) -> None:
-        """Record an acknowledged upload."""
-        self._write(
-            {
-                "path": printable_path(photo.path),
-                "state": _file_state(photo),
-                "file_id": entry.file_id,
-                "job_id": entry.job_id,
-            }
-        )
-
-    def _write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
-
-    def _read(self, text: str, header: dict[str, Any]) -> None:
-        lines = []
-        for line in text.splitlines():
-            try:
-                lines.append(json.loads(line))
-            except ValueError:
-                continue  # incomplete: the process was killed while writing it
-        if not text:
-            return
-        if not lines or lines[0] != header:
-            raise InvalidRequest(
-                "bad_journal",
-                f"{printable_path(self._path)} is not a journal of this server and map. Use "
-                "another file.",
-            )
-        self._done = {line["path"]: line for line in lines[1:]}
-
-
-def _file_state(photo: LocalPhoto) -> list[Any]:
-    """The file attributes and metadata whose change requires a new upload, as JSON."""
-    try:
-        stat = photo.path.stat()
-    except OSError:
-        return []
-    return [stat.st_size, stat.st_mtime_ns, photo.name, dict(sorted(photo.fields.items()))]
-
+from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
+from services.cli.output import Json, err_console, printable_path
+from shared.errors import Conflict, NotFound, PlacewiseError
 
 MIN_PHOTOS_TO_FIT = 50
 UPLOAD_CONCURRENCY = 4
@@ -205,7 +85,7 @@ def upload_photos(
             err_console.print(f"Retrying: {escape(error.detail)}", soft_wrap=True)
 
     reported_codes: set[str] = set()
-    retrying_client = client.patient(RETRY_PERIOD_SECONDS, show_wait)
+    retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, show_wait)
     remaining = photos
     if journal is not None:
         remaining, recorded_jobs = _split_by_journal(photos, journal)
@@ -217,11 +97,12 @@ def upload_photos(
         if isinstance(outcome, PlacewiseError):
             refused.append(_photo_failure(photo, outcome.detail))
             continue
-        counts["already_there" if outcome["already_there"] else "uploaded"] += 1
+        counts["already_there" if outcome.already_there else "uploaded"] += 1
+        job_id = None if outcome.job_id is None else str(outcome.job_id)
         if journal is not None:
-            journal.add(photo, JournalEntry(outcome["file_id"], outcome["job_id"]))
-        if outcome["status"] not in FINISHED:
-            pending.append((photo, outcome["job_id"]))
+            journal.add(photo, JournalEntry(str(outcome.file_id), job_id))
+        if job_id is not None and outcome.status not in FINISHED:
+            pending.append((photo, job_id))
     describing = progress.add_task("describing", total=len(pending))
     pending = _wait_for_jobs(client, pending, failed, progress, describing)
 
@@ -233,10 +114,10 @@ def upload_photos(
         "photos": len(photos),
         "uploaded": counts["uploaded"],
         "already_there": counts["already_there"],
-        "searchable": stats["searchable_images"],
+        "searchable": stats.searchable_images,
         "refused": refused,
         "failed": failed,
-        "vocabulary": stats["vocabulary"],
+        "vocabulary": stats.vocabulary,
         "fitted": vocabulary,
     }
 
@@ -257,8 +138,8 @@ def _split_by_journal(
 
 
 def fit_vocabulary_if_needed(
-    client: Client, stats: Json, progress: Progress
-) -> tuple[Json, Json | None]:
+    client: Client, stats: Stats, progress: Progress
+) -> tuple[Stats, Job | None]:
     """Fit a vocabulary if the map has none of its own and enough photos.
 
     Args:
@@ -269,7 +150,7 @@ def fit_vocabulary_if_needed(
     Returns:
         The map's statistics afterwards, and the job of the fit or None.
     """
-    if stats["vocabulary"] not in ("foreign", None) or stats["total_images"] < MIN_PHOTOS_TO_FIT:
+    if stats.vocabulary not in ("foreign", None) or stats.total_images < MIN_PHOTOS_TO_FIT:
         return stats, None
     vocabulary = fit_and_wait(client, {}, progress)
     return client.stats(), vocabulary
@@ -277,11 +158,11 @@ def fit_vocabulary_if_needed(
 
 def _upload_concurrently(
     client: Client, photos: list[LocalPhoto], update: bool
-) -> Iterator[tuple[LocalPhoto, Json | PlacewiseError]]:
-    def upload(photo: LocalPhoto) -> Json | PlacewiseError:
+) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
+    def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
         fields: dict[str, Any] = dict(photo.fields)
 
-        def send() -> Json:
+        def send() -> Uploaded:
             return client.upload(photo.path, filename=photo.name, **fields)
 
         try:
@@ -318,142 +199,22 @@ def _wait_for_jobs(
     """Wait until jobs end; returns those that can't end before the map has a vocabulary."""
     waiting: PendingJobs = []
     for photo, job_id in pending:
-        wait_seconds = 0.0
-        while True:
-            try:
-                job = client.job(job_id, wait_seconds)
-            except NotFound:  # recorded in the journal and deleted since
-                progress.advance(bar)
-                break
-            wait_seconds = POLL_SECONDS
-            if job["state"] in FINISHED:
-                progress.advance(bar)
-                if job["state"] != "succeeded":
-                    error: Json = job["error"] or {}
-                    failed.append(_photo_failure(photo, str(error.get("detail", job["state"]))))
-                break
-            if job["waiting_for"]:
-                waiting.append((photo, job_id))
-                break
+        try:
+            for job in client.watch(job_id, poll_seconds=POLL_SECONDS):
+                if job.waiting_for:
+                    break
+        except NotFound:  # recorded in the journal and deleted since
+            progress.advance(bar)
+            continue
+        if not job.finished:
+            waiting.append((photo, job_id))
+            continue
+        progress.advance(bar)
+        if job.state != "succeeded":
+            failed.append(_photo_failure(photo, job.failure))
     return waiting
 
 
 def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
     filename = {"filename": photo.name} if photo.name else {}
     return {"path": printable_path(photo.path), **filename, "reason": reason}
-
-
-BLOCKED_POLL_SECONDS = 2.0
-
-
-def check_archive(path: Path) -> None:
-    """Check the signature of an archive before it is uploaded.
-
-    Raises:
-        InvalidRequest: `not_an_archive`, `unreadable_file`.
-    """
-    try:
-        with path.open("rb") as file:
-            signature = file.read(ARCHIVE_SIGNATURE_BYTES)
-    except OSError as error:
-        raise InvalidRequest("unreadable_file", f"Can't read {path}: {error.strerror}") from error
-    if detect_archive_format(signature) is None:
-        raise InvalidRequest(
-            "not_an_archive",
-            f"{path} is neither a folder nor {ACCEPTED_ARCHIVES}.",
-        )
-
-
-def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress) -> Json:
-    """Upload an archive as a batch, wait until it ends, and fit a vocabulary if needed.
-
-    Returns:
-        The same report as `upload_photos`, with `ignored`: the number of other archive members.
-
-    Raises:
-        Unprocessable: The batch as a whole failed or was cancelled.
-    """
-    client.stats()  # fails before gigabytes are sent if the URL, key or map is wrong
-    sending = progress.add_task("uploading (bytes)", total=archive.stat().st_size)
-    started = client.upload_archive(
-        archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
-    )
-    return _wait_and_report(client, started, fit, progress)
-
-
-def import_prefix(client: Client, prefix: str, fit: bool, progress: Progress) -> Json:
-    """Import every photo of the server's store below a prefix; see `upload_archive`."""
-    return _wait_and_report(client, client.import_prefix(prefix), fit, progress)
-
-
-def manifest_has_keys(manifest: bytes) -> bool:
-    """Whether the first line of a JSONL manifest refers to an object key instead of a file."""
-    first = next((line for line in manifest.splitlines() if line.strip()), b"")
-    try:
-        return KEY_FIELD in json.loads(first)
-    except (ValueError, TypeError, RecursionError):
-        return False  # the parser of the whole manifest reports the error
-
-
-def import_keys(client: Client, manifest: bytes, fit: bool, progress: Progress) -> Json:
-    """Import the objects listed by `key` in a JSONL manifest; see `upload_archive`."""
-    return _wait_and_report(client, client.import_manifest(manifest), fit, progress)
-
-
-def _wait_and_report(client: Client, started: Json, fit: bool, progress: Progress) -> Json:
-    describing = progress.add_task("describing", total=None)
-    job = _wait_until_finished(client, started["job_id"], progress, describing)
-    stats, fitted = client.stats(), None
-    if fit:
-        stats, fitted = fit_vocabulary_if_needed(client, stats, progress)
-    if job["state"] not in FINISHED and stats["vocabulary"] is not None:
-        job = _wait_until_finished(client, started["job_id"], progress, describing)
-    if job["state"] in ("failed", "cancelled"):
-        error: Json = job["error"] or {}
-        raise Unprocessable(
-            error.get("code", "job_ended"), error.get("detail", f"The batch was {job['state']}.")
-        )
-    failed_items = list(client.batch_items(started["job_id"], "failed", "cancelled"))
-    counts: Json = job["result"] or {}
-    already_stored = counts.get("already_there", 0)
-    return {
-        "photos": job["progress"]["total"],
-        "uploaded": job["progress"]["total"]
-        - already_stored
-        - sum(not item["file_id"] for item in failed_items),
-        "already_there": already_stored,
-        "searchable": client.stats()["searchable_images"],
-        "refused": [_item_failure(item) for item in failed_items if not item["file_id"]],
-        "failed": [_item_failure(item) for item in failed_items if item["file_id"]],
-        "vocabulary": stats["vocabulary"],
-        "fitted": fitted,
-        "ignored": counts.get("ignored", 0),
-    }
-
-
-def _wait_until_finished(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
-    """Poll a job until it ends or waits for a vocabulary."""
-    wait_seconds, reported = 0.0, False
-    while True:
-        job = client.job(job_id, wait_seconds)
-        wait_seconds = POLL_SECONDS
-        counts: Json = job["progress"]
-        progress.update(
-            bar, completed=counts["done"] + counts["failed"], total=counts["total"] or None
-        )
-        if job["state"] in FINISHED or job["waiting_for"] == "vocabulary":
-            return job
-        if job["waiting_for"]:
-            if not reported:
-                reason = job["waiting_for"].replace("_", " ")
-                err_console.print(
-                    f"The batch is waiting for {reason} on the server; it continues automatically."
-                )
-            reported = True
-            # Long polls return at once for a job that waits for something.
-            time.sleep(BLOCKED_POLL_SECONDS)
-
-
-def _item_failure(item: Json) -> Json:
-    error: Json = item["error"] or {}
-    return {"path": item["name"], "reason": str(error.get("detail", item["state"]))}

@@ -24,6 +24,7 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_result,
     progress_bar,
     report_errors,
 )
@@ -31,9 +32,8 @@ from shared.backup.create import create_backup
 from shared.backup.folder import BackupProgress, open_backup
 from shared.backup.restore import restore_backup
 from shared.catalog.database_errors import to_unavailable
-from shared.catalog.file_checks import opening
 from shared.catalog.installation import get_or_create_installation, open_installation_store
-from shared.catalog.schema import check_schema, migrate
+from shared.catalog.schema import check_schema, migrate, opening
 from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import lock_home
@@ -151,13 +151,11 @@ def restore(
             progress,
             store_owner=read_owner(open_store(settings, exclusive=False)),
         )
-    if as_json:
-        print_json(asdict(restored))
-        return
-    console.print(
+    print_result(
+        asdict(restored),
+        as_json,
         f"Restored {restored.rows} rows and {restored.objects} objects as of {manifest.made_at}"
         + (f"; cancelled {restored.cancelled_jobs} jobs" if restored.cancelled_jobs else ""),
-        soft_wrap=True,
     )
 
 

@@ -24,6 +24,7 @@ from rich.markup import escape
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
+from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.operations.deployment_checks import (
     check_gateway,
@@ -37,11 +38,9 @@ from services.cli.operations.deployment_checks import (
 from services.cli.operations.store_checks import collection_check, permissions_check
 from services.cli.output import JsonOption, KeyOption, ServerOption, console, print_json
 from shared.catalog.database_errors import to_unavailable
-from shared.catalog.file_checks import check_pages
 from shared.catalog.photos import Photo
-from shared.catalog.schema import check_schema
+from shared.catalog.schema import check_pages, check_schema
 from shared.catalog.tables import open_catalog
-from shared.client import Client
 from shared.config.embedded_home import find_running_server
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured, PlacewiseError
@@ -165,7 +164,7 @@ def _check_dinov2(recipe: ExtractorConfig, weights: Path | None) -> str:
 
 
 def _default_recipe(settings: Settings) -> ExtractorConfig:
-    return settings.recipe(settings.new_map_extractor)
+    return settings.extractor_config(settings.new_map_extractor)
 
 
 MIN_FREE_DISK_BYTES = 1_000_000_000
@@ -319,16 +318,16 @@ def _check_vocabulary(settings: Settings) -> str:
         return "checked only while a server runs"
     with Client(running.url, key=running.key) as client:
         maps = client.maps()
-    waiting = [m for m in maps if m["photos"] and m["generation_id"] is None]
+    waiting = [m for m in maps if m.photos and m.generation_id is None]
     if waiting:
-        names = ", ".join(f"{m['name']} ({m['photos']} photos)" for m in waiting)
+        names = ", ".join(f"{m.name} ({m.photos} photos)" for m in waiting)
         raise Misconfigured(
             "vocabulary_missing",
             f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
             "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
             "photos were uploaded just now.",
         )
-    foreign = [m["name"] for m in maps if m["vocabulary"] == "foreign"]
+    foreign = [m.name for m in maps if m.vocabulary == "foreign"]
     if foreign:
         return (
             f"foreign vocabulary in {', '.join(foreign)}: fit one with `placewise vocabulary fit`"
@@ -342,9 +341,9 @@ def _check_server(settings: Settings) -> str:
         check_gateway(running.url, running.key)
         with Client(running.url, key=running.key) as client:
             maps = client.maps()
-        searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)
-        names = ", ".join(m["name"] for m in maps)
-        return f"running on {running.url}: {searchable} of {photos} photos searchable ({names})"
+        searchable, stored = sum(m.searchable for m in maps), sum(m.photos for m in maps)
+        names = ", ".join(m.name for m in maps)
+        return f"running on {running.url}: {searchable} of {stored} photos searchable ({names})"
     if not (settings.placewise_home / "catalog.sqlite").exists():
         return "not running, nothing is stored yet (start it with make run)"
     catalog = open_catalog(settings, "doctor")

@@ -8,13 +8,15 @@ implies full control. This is how the first admin key is created.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import Annotated
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 from uuid import UUID
 
 import typer
 from rich.table import Table
 
+from placewise.answers import CreatedKey, Key
+from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
@@ -22,33 +24,20 @@ from services.cli.output import (
     ServerOption,
     console,
     print_json,
+    print_result,
     report_errors,
 )
-from shared.catalog.api_keys import ApiKey, KeyLimits, create_api_key, list_api_keys, revoke_api_key
-from shared.catalog.schema import wait_for_schema
-from shared.catalog.session import Catalog
-from shared.catalog.tables import open_catalog
-from shared.client import Client, Json
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
 from shared.telemetry.logs import configure_logging
 
+if TYPE_CHECKING:
+    from shared.catalog.api_keys import ApiKey
+    from shared.catalog.session import Catalog
+
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
 SECONDS_PER_DAY = 86_400.0
-KEY_FIELDS = (
-    "id",
-    "name",
-    "prefix",
-    "scopes",
-    "requests_per_minute",
-    "upload_bytes_per_day",
-    "max_photos",
-    "created_at",
-    "expires_at",
-    "last_used_at",
-    "revoked_at",
-)
 
 
 @app.command("create")
@@ -78,30 +67,19 @@ def create(
 
     Limits that are not given default to the server's settings.
     """
-    limits = KeyLimits(requests_per_minute, upload_bytes_per_day, max_photos)
+    limits = {
+        "requests_per_minute": requests_per_minute,
+        "upload_bytes_per_day": upload_bytes_per_day,
+        "max_photos": max_photos,
+    }
     with report_errors(as_json):
-        if server:
-            with Client(server, key=key) as client:
-                created = client.create_key(
-                    name,
-                    list(scope),
-                    days=days,
-                    requests_per_minute=requests_per_minute,
-                    upload_bytes_per_day=upload_bytes_per_day,
-                    max_photos=max_photos,
-                )
-        else:
-            life_seconds = None if days is None else days * SECONDS_PER_DAY
-            with _open_catalog() as catalog, catalog.write() as session:
-                row, new_key = create_api_key(
-                    session, name, set(scope), life_seconds=life_seconds, limits=limits
-                )
-                created = {**_key_as_json(row), "key": new_key}
+        with _open_keys(server, key) as keys:
+            created = keys.create_key(name, list(scope), days=days, **limits)
         if as_json:
             print_json(created)
             return
         # The key alone goes to stdout, so that it can be redirected to a file.
-        typer.echo(created["key"])
+        typer.echo(created.key)
         typer.echo("This key is shown only once. Use it as PLACEWISE_KEY.", err=True)
 
 
@@ -109,23 +87,19 @@ def create(
 def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
     """List all keys, including revoked and expired ones, without their secrets."""
     with report_errors(as_json):
-        if server:
-            with Client(server, key=key) as client:
-                keys = client.keys()
-        else:
-            with _open_catalog() as catalog, catalog.read() as session:
-                keys = [_key_as_json(row) for row in list_api_keys(session)]
+        with _open_keys(server, key) as keys:
+            listed = keys.keys()
         if as_json:
-            print_json(keys)
+            print_json(listed)
             return
         table = Table("key", "name", "scopes", "created", "last used", "state")
-        for item in keys:
+        for item in listed:
             table.add_row(
-                f"{item['prefix']}...",
-                item["name"],
-                ", ".join(item["scopes"]),
-                item["created_at"][:10],
-                (item["last_used_at"] or "never")[:16],
+                f"{item.prefix}...",
+                item.name,
+                ", ".join(item.scopes),
+                f"{item.created_at:%Y-%m-%d}",
+                f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
                 _key_status(item),
             )
         console.print(table)
@@ -140,52 +114,81 @@ def revoke(
 ) -> None:
     """Revoke a key with immediate effect."""
     with report_errors(as_json):
-        if server:
-            with Client(server, key=key) as client:
-                revoked = client.revoke_key(_resolve_key_id(which, client.keys()))
-        else:
-            with _open_catalog() as catalog, catalog.write() as session:
-                keys = [_key_as_json(row) for row in list_api_keys(session)]
-                revoked = _key_as_json(revoke_api_key(session, UUID(_resolve_key_id(which, keys))))
-        if as_json:
-            print_json(revoked)
-            return
-        console.print(f"Revoked key {revoked['prefix']}... ({revoked['name']}).")
+        with _open_keys(server, key) as keys:
+            revoked = keys.revoke_key(_resolve_key_id(which, keys.keys()))
+        print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
+
+
+class _CatalogKeys:
+    """The calls of the client about keys, on the catalog itself."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+
+    def create_key(
+        self, name: str, scopes: Sequence[Scope], days: float | None, **limits: int | None
+    ) -> CreatedKey:
+        from shared.catalog.api_keys import KeyLimits, create_api_key
+
+        life_seconds = None if days is None else days * SECONDS_PER_DAY
+        with self._catalog.write() as session:
+            row, secret = create_api_key(
+                session, name, set(scopes), life_seconds=life_seconds, limits=KeyLimits(**limits)
+            )
+            return CreatedKey(**_key_fields(row), key=secret)
+
+    def keys(self) -> list[Key]:
+        from shared.catalog.api_keys import list_api_keys
+
+        with self._catalog.read() as session:
+            return [Key(**_key_fields(row)) for row in list_api_keys(session)]
+
+    def revoke_key(self, key_id: UUID) -> Key:
+        from shared.catalog.api_keys import revoke_api_key
+
+        with self._catalog.write() as session:
+            return Key(**_key_fields(revoke_api_key(session, key_id)))
 
 
 @contextlib.contextmanager
-def _open_catalog() -> Iterator[Catalog]:
+def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _CatalogKeys]:
+    """Connect to a server, or open the catalog if none is given."""
+    if server:
+        with Client(server, key=key) as client:
+            yield client
+        return
+    # Imported here: the clients of a server need no database.
+    from shared.catalog.schema import wait_for_schema
+    from shared.catalog.tables import open_catalog
+
     settings = read_settings()
     configure_logging(settings, "keys")
     catalog = open_catalog(settings, "keys")
     try:
         wait_for_schema(catalog, 0)
-        yield catalog
+        yield _CatalogKeys(catalog)
     finally:
         catalog.close()
 
 
-def _resolve_key_id(id_or_prefix: str, keys: list[Json]) -> str:
+def _resolve_key_id(id_or_prefix: str, keys: list[Key]) -> UUID:
     """Resolve an ID or prefix to an ID; NotFound (`key_not_found`), Conflict (`key_ambiguous`)."""
     prefix = id_or_prefix.removesuffix("...")
-    found = [item["id"] for item in keys if prefix in (item["id"], item["prefix"])]
+    found = [item.id for item in keys if prefix in (str(item.id), item.prefix)]
     if not found:
         raise NotFound(
             "key_not_found", f"Key {id_or_prefix!r} does not exist. List keys: placewise keys list."
         )
     if len(found) > 1:
         raise Conflict("key_ambiguous", f"Several keys begin with {prefix}. Use the ID instead.")
-    return str(found[0])
+    return found[0]
 
 
-def _key_as_json(row: ApiKey) -> Json:
-    """The key in the API's JSON format."""
-    fields = {name: getattr(row, name) for name in KEY_FIELDS}
-    times = {name: value and value.isoformat() for name, value in fields.items() if "_at" in name}
-    return {**fields, "id": str(row.id), **times}
+def _key_fields(row: ApiKey) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in Key.model_fields}
 
 
-def _key_status(key: Json) -> str:
-    if key["revoked_at"]:
-        return f"revoked {key['revoked_at'][:10]}"
-    return f"until {key['expires_at'][:10]}" if key["expires_at"] else "active"
+def _key_status(key: Key) -> str:
+    if key.revoked_at:
+        return f"revoked {key.revoked_at:%Y-%m-%d}"
+    return f"until {key.expires_at:%Y-%m-%d}" if key.expires_at else "active"

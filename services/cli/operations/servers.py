@@ -48,7 +48,7 @@ def serve() -> None:
     """
     with report_errors(as_json=False):
         settings = read_settings()
-        from services.standalone import run_standalone  # imports torch, which takes seconds
+        from services.standalone import run_standalone
 
         configure_logging(settings, "embedded")
         with configure_tracing(settings, "embedded"), run_standalone(settings) as running:

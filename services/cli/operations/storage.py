@@ -17,7 +17,14 @@ from rich.markup import escape
 
 from services.cli.environment import read_settings
 from services.cli.operations.backup import open_storage, print_taken_in, progress_reporter
-from services.cli.output import JsonOption, console, err_console, print_json, report_errors
+from services.cli.output import (
+    JsonOption,
+    console,
+    err_console,
+    print_json,
+    print_result,
+    report_errors,
+)
 from shared.backup.folder import BackupProgress
 from shared.catalog.installation import adopt_store, get_or_create_installation
 from shared.catalog.schema import check_schema, migrate
@@ -199,11 +206,12 @@ def create_bucket_command(as_json: JsonOption = False) -> None:
 
         bucket = Bucket.from_settings(read_settings())
         created = create_bucket(bucket)
-    if as_json:
-        print_json({"bucket": bucket.name, "endpoint": bucket.endpoint, "made": created})
-        return
     state = "was created" if created else "already exists"
-    console.print(f"Bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)
+    print_result(
+        {"bucket": bucket.name, "endpoint": bucket.endpoint, "made": created},
+        as_json,
+        f"Bucket {bucket.name} at {bucket.endpoint} {state}.",
+    )
 
 
 @app.command("adopt")

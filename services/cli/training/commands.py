@@ -27,7 +27,7 @@ from rich.table import Column, Table
 from services.cli.environment import require_packages
 from services.cli.output import JsonOption, console, err_console, print_json, report_errors
 from services.cli.training.options import given_options, with_training_options
-from services.trainer.arguments import build_arguments, load_yaml, resolve_keys
+from services.trainer.arguments import build_arguments, load_yaml
 from shared.errors import InvalidRequest
 
 Json = dict[str, Any]
@@ -125,19 +125,14 @@ def print_summary(report: Json) -> None:
 
 
 def _summary_rows(report: Json) -> list[tuple[str, str, Json]]:
+    from services.trainer.leaderboard import best_epoch
+
     rows = []
     if report.get("epochs"):
-        monitor = report["monitor"]
-        best_epoch = max(
-            report["epochs"],
-            key=lambda epoch: (
-                epoch["figures"].get(monitor, 0.0)
-                * (1 if report["arguments"]["mode"] == "max" else -1)
-            ),
-        )
+        best = best_epoch(report)
         for name in report["arguments"]["val_set_names"]:
-            recall = {k: best_epoch["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
-            rows.append((name, f"validation, epoch {best_epoch['number'] + 1}", recall))
+            recall = {k: best["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
+            rows.append((name, f"validation, epoch {best['number'] + 1}", recall))
     rows += [(name, "test", result["recall"]) for name, result in report["test"].items()]
     return rows
 
@@ -167,9 +162,7 @@ def train(
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
-        report = _run_training(
-            config, resume, resolve_keys(given_options(arguments), "the command line")
-        )
+        report = _run_training(config, resume, given_options(arguments))
     if as_json:
         print_json(report)
     else:
@@ -214,8 +207,7 @@ def grid(
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
-        overrides = resolve_keys(given_options(arguments), "the command line")
-        failed = _run_grid_command(file, out, dry_run, as_json, overrides)
+        failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
     if failed:
         raise typer.Exit(1)
 
@@ -223,9 +215,7 @@ def grid(
 def _run_grid_command(
     file: Path, out: Path, dry_run: bool, as_json: bool, overrides: dict[str, Any]
 ) -> int:
-    from services.trainer import run
     from services.trainer.grid import (
-        RunFunctions,
         RunOutcome,
         RunState,
         load_grid_plan,
@@ -248,8 +238,7 @@ def _run_grid_command(
 
     with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
-            trainer = RunFunctions(run.run, run.resume)
-            outcomes = run_grid(plan, out, trainer, display, stop, write)
+            outcomes = run_grid(plan, out, display, stop, write)
         except RunStopped as stopped:
             err_console.print(
                 "Stopped. Run the same command again to continue the grid.", soft_wrap=True

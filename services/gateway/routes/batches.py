@@ -19,9 +19,22 @@ from services.gateway.admission import (
     get_photo_limit,
 )
 from services.gateway.authentication import READ, WRITE, Caller, get_caller
-from services.gateway.dependencies import DEFAULT_MAP, GatewayContext, GatewayDep, JobId, MapName
+from services.gateway.dependencies import (
+    GatewayContext,
+    GatewayDep,
+    JobId,
+    MapQuery,
+    PageParams,
+    invalid_cursor_error,
+)
 from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel, job_url, to_job_accepted
+from services.gateway.schemas import (
+    JobAcceptedResponse,
+    ResponseModel,
+    accepted_headers,
+    job_url,
+    to_job_accepted,
+)
 from services.gateway.uploads.batch import (
     ARCHIVE_FIELD,
     FILES_FIELD,
@@ -34,13 +47,7 @@ from services.gateway.uploads.batch import (
     parse_batch_upload,
     too_many_photos_error,
 )
-from shared.catalog.batch_items import (
-    BatchItem,
-    BatchSource,
-    add_batch_items,
-    create_batch,
-    list_batch_items,
-)
+from shared.catalog.batch_items import BatchSource, add_batch_items, create_batch, list_batch_items
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import get_map
 from shared.config.settings import Settings
@@ -107,24 +114,13 @@ class BatchItemResponse(ResponseModel):
     number: int = Field(description="from 1, in upload order")
     name: str
     state: JobState = Field(description="`succeeded`: searchable")
-    file_id: UUID | None
-    job_id: UUID | None = Field(description="the job that describes the photo")
+    file_id: UUID | None = Field(validation_alias="photo_id")
+    job_id: UUID | None = Field(
+        validation_alias="photo_job_id", description="the job that describes the photo"
+    )
     already_there: bool = Field(description="the map already had these bytes; nothing was stored")
     line: int | None = Field(description="line of the photo in the manifest, if any")
     error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
-
-    @classmethod
-    def of(cls, item: BatchItem) -> BatchItemResponse:
-        return cls(
-            number=item.number,
-            name=item.name,
-            state=JobState(item.state),
-            file_id=item.photo_id,
-            job_id=item.photo_job_id,
-            already_there=item.already_there,
-            line=item.line,
-            error=item.error,
-        )
 
 
 class BatchItemsResponse(ResponseModel):
@@ -132,11 +128,15 @@ class BatchItemsResponse(ResponseModel):
     next_cursor: str | None
 
 
+class BatchItemsParams(PageParams):
+    limit: int = Field(100, ge=1, le=1000)
+    state: list[JobState] | None = None
+
+
 @router.post(
     BATCH_UPLOAD_PATH,
     operation_id="upload_batch",
     status_code=202,
-    response_model=BatchAcceptedResponse,
     openapi_extra=REQUEST_BODY,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
@@ -146,7 +146,7 @@ async def upload_batch(
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> BatchAcceptedResponse:
     """Upload many photos: files of a form, one archive, or objects in the store.
 
@@ -158,38 +158,27 @@ async def upload_batch(
         received = await parse_batch_upload(request, gateway.store, gateway.settings)
     caller_params = _caller_params(get_caller(request), gateway.settings)
     accepted = await run_in_threadpool(
-        _queue_batch, gateway, map_name, received, caller_params, idempotent
+        _queue_batch, gateway, query.map, received, caller_params, idempotent
     )
-    response.headers["Location"] = accepted.status_url
-    response.headers["Retry-After"] = "1"
+    response.headers.update(accepted_headers(accepted.status_url))
     return accepted
 
 
-@router.get(
-    "/jobs/{job_id}/items",
-    operation_id="list_batch_items",
-    response_model=BatchItemsResponse,
-    dependencies=[READ],
-)
+@router.get("/jobs/{job_id}/items", operation_id="list_batch_items", dependencies=[READ])
 def read_batch_items(
-    gateway: GatewayDep,
-    job_id: JobId,
-    state: Annotated[list[JobState] | None, Query()] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
-    cursor: Annotated[str | None, Query()] = None,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, job_id: JobId, query: Annotated[BatchItemsParams, Query()]
 ) -> BatchItemsResponse:
     """List the photos of a batch, in upload order; of an archive, after it has been listed."""
-    after = _parse_item_cursor(cursor)
+    after = _parse_item_cursor(query.cursor)
     with gateway.catalog.read() as session:
-        job = get_job(session, get_map(session, map_name).id, job_id)
+        job = get_job(session, get_map(session, query.map).id, job_id)
         if job.kind != JobKind.BATCH:
             raise Conflict("no_items", f"The job {job.id} ({job.kind}) is not a batch.")
-        items = list_batch_items(session, job.id, state or [], limit + 1, after)
-    page = items[:limit]
+        items = list_batch_items(session, job.id, query.state or [], query.limit + 1, after)
+    page = items[: query.limit]
     return BatchItemsResponse(
-        items=[BatchItemResponse.of(item) for item in page],
-        next_cursor=str(page[-1].number) if len(items) > limit else None,
+        items=[BatchItemResponse.model_validate(item) for item in page],
+        next_cursor=str(page[-1].number) if len(items) > query.limit else None,
     )
 
 
@@ -197,7 +186,7 @@ def _parse_item_cursor(cursor: str | None) -> int:
     if cursor is None:
         return 0
     if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 10):
-        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned")
+        raise invalid_cursor_error()
     return int(cursor)
 
 
@@ -217,12 +206,10 @@ def _queue_batch(
             # The steward lists the items of archives and prefixes.
             if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):
                 add_batch_items(session, job, rows)
-            session.flush()
-            session.refresh(job)
-            job_accepted = to_job_accepted(job, map_name)
             items_url = job_url(job.id, map_name, "/items")
+            job_accepted = to_job_accepted(job, map_name)
             accepted = BatchAcceptedResponse(**job_accepted.model_dump(), items_url=items_url)
-            headers = {"Location": accepted.status_url, "Retry-After": "1"}
+            headers = accepted_headers(accepted.status_url)
             idempotent.store_response(session, 202, accepted, headers)
             return accepted
     except (PlacewiseError, IdempotentReplay):
@@ -262,12 +249,7 @@ def _plan_items(
     if len(entries) > gateway.settings.max_batch_photos:
         raise too_many_photos_error(gateway.settings.max_batch_photos)
     rows = [
-        {
-            "name": entry.name,
-            "object_key": entry.name,
-            "fields": entry.fields,
-            "line": entry.line,
-        }
+        {"name": entry.name, "object_key": entry.name, "fields": entry.fields, "line": entry.line}
         for entry in entries
     ]
     return rows, BatchSource.KEYS, {}

@@ -10,25 +10,18 @@ from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter
 from fastapi import Path as PathParameter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import (
-    DEFAULT_MAP,
-    GatewayDep,
-    GenerationId,
-    MapName,
-    parse_cursor,
-)
-from services.gateway.idempotency import IdempotentDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery, PageQuery
+from services.gateway.idempotency import IdempotentDep
+from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
 from shared.catalog.chunks import has_geotagged
 from shared.catalog.generations import (
-    Evaluation,
     Generation,
     GenerationState,
     active_generation,
@@ -46,10 +39,8 @@ from shared.word_weights.record import HeldOut, Outcome, WordWeights, parse_word
 router = APIRouter(tags=["evaluations"])
 
 
-class EvaluationRequest(BaseModel):
+class EvaluationRequest(RequestModel):
     """Options of an evaluation; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
         1000, ge=1, le=1_000_000, description="maximum number of photos of the map to query with"
@@ -58,7 +49,7 @@ class EvaluationRequest(BaseModel):
 
 
 class EvaluationResponse(ResponseModel):
-    evaluation_id: UUID
+    evaluation_id: UUID = Field(validation_alias="id")
     generation_id: UUID
     automatic: bool = Field(description="started automatically after a change of the map")
     searchable: int = Field(description="number of searchable photos at that time")
@@ -70,17 +61,6 @@ class EvaluationResponse(ResponseModel):
     )
     evaluated_at: datetime
 
-    @classmethod
-    def of(cls, evaluation: Evaluation) -> EvaluationResponse:
-        return cls(
-            evaluation_id=evaluation.id,
-            generation_id=evaluation.generation_id,
-            automatic=evaluation.automatic,
-            searchable=evaluation.searchable,
-            figures=evaluation.figures,
-            evaluated_at=evaluation.evaluated_at,
-        )
-
 
 class EvaluationsResponse(ResponseModel):
     evaluations: list[EvaluationResponse]
@@ -88,18 +68,13 @@ class EvaluationsResponse(ResponseModel):
 
 
 @router.post(
-    "/evaluations",
-    operation_id="evaluate",
-    status_code=202,
-    response_model=JobAcceptedResponse,
-    dependencies=[WRITE, ADMIT_JOB],
+    "/evaluations", operation_id="evaluate", status_code=202, dependencies=[WRITE, ADMIT_JOB]
 )
 def start_evaluation(
     gateway: GatewayDep,
-    response: Response,
     idempotent: IdempotentDep,
+    query: MapQuery,
     options: EvaluationRequest | None = None,
-    map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
     """Evaluate the recall of the active generation.
 
@@ -108,51 +83,35 @@ def start_evaluation(
     """
     params = (options or EvaluationRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
-        map_ = get_map(session, map_name)
+        map_ = get_map(session, query.map)
         generation = active_generation(session, map_.id)
-        job = queue_evaluation_job(
-            session,
-            idempotent,
-            map_.id,
-            generation,
-            JobKind.EVALUATE,
-            {**params, "automatic": False},
-        )
-    return accept_job(response, job, map_name)
+        params["automatic"] = False
+        job = _new_evaluation_job(session, map_.id, generation, JobKind.EVALUATE, params)
+        return idempotent.accept_job(session, job)
 
 
-@router.get(
-    "/evaluations",
-    operation_id="list_evaluations",
-    response_model=EvaluationsResponse,
-    dependencies=[READ],
-)
-def read_evaluations(
-    gateway: GatewayDep,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
-    cursor: Annotated[str | None, Query()] = None,
-    map_name: MapName = DEFAULT_MAP,
-) -> EvaluationsResponse:
+@router.get("/evaluations", operation_id="list_evaluations", dependencies=[READ])
+def read_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsResponse:
     """List evaluations, newest first, including automatic ones."""
-    before = parse_cursor(cursor)
+    before = query.before
     with gateway.catalog.read() as session:
-        evaluations = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
-    page = evaluations[:limit]
+        map_id = get_map(session, query.map).id
+        rows = list_evaluations(session, map_id, query.limit + 1, before)
+    page, next_cursor = query.split(rows)
     return EvaluationsResponse(
-        evaluations=[EvaluationResponse.of(evaluation) for evaluation in page],
-        next_cursor=str(page[-1].id) if len(evaluations) > limit else None,
+        evaluations=[EvaluationResponse.model_validate(row) for row in page],
+        next_cursor=next_cursor,
     )
 
 
-def queue_evaluation_job(
+def _new_evaluation_job(
     session: Session,
-    idempotent: IdempotentRequest,
     map_id: UUID,
     generation: Generation | None,
     kind: JobKind,
     params: dict[str, Any],
 ) -> Job:
-    """Queues a job that queries the generation with the map's own photos.
+    """Creates a job that queries the generation with the map's own photos.
 
     Raises:
         Conflict: `nothing_to_evaluate`, if no described photo has a place.
@@ -163,17 +122,11 @@ def queue_evaluation_job(
             "The map has no described photo with coordinates or a place. Upload photos with "
             "coordinates or places, and wait for their jobs.",
         )
-    job = Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
-    session.add(job)
-    session.flush()
-    idempotent.store_job_response(session, job)
-    return job
+    return Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
 
 
-class WordWeightsRequest(BaseModel):
+class WordWeightsRequest(RequestModel):
     """Options of the fit; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
         1000, ge=1, le=1_000_000, description="maximum number of photos to validate on"
@@ -214,16 +167,14 @@ GenerationIdPath = Annotated[GenerationId, PathParameter(description="a generati
     "/generations/{generation_id}/word-weights",
     operation_id="learn_word_weights",
     status_code=202,
-    response_model=JobAcceptedResponse,
     dependencies=[WRITE, ADMIT_JOB],
 )
 def start_word_weights_fit(
     gateway: GatewayDep,
-    response: Response,
     idempotent: IdempotentDep,
     generation_id: GenerationIdPath,
+    query: MapQuery,
     options: WordWeightsRequest | None = None,
-    map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
     """Fit word weights on the map's own places.
 
@@ -231,7 +182,7 @@ def start_word_weights_fit(
     """
     params = (options or WordWeightsRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
-        map_ = get_map(session, map_name)
+        map_ = get_map(session, query.map)
         generation = get_generation(session, map_.id, generation_id)
         if generation.state != GenerationState.ACTIVE:
             raise Conflict(
@@ -244,24 +195,21 @@ def start_word_weights_fit(
                 "no_word_weights", f"Word weights can't be fitted for this generation: {reason}."
             )
         params["generation_id"] = str(generation.id)
-        job = queue_evaluation_job(
-            session, idempotent, map_.id, generation, JobKind.WORD_WEIGHTS, params
-        )
-    return accept_job(response, job, map_name)
+        job = _new_evaluation_job(session, map_.id, generation, JobKind.WORD_WEIGHTS, params)
+        return idempotent.accept_job(session, job)
 
 
 @router.get(
     "/generations/{generation_id}/word-weights",
     operation_id="read_word_weights",
-    response_model=WordWeightsResponse,
     dependencies=[READ],
 )
 def read_word_weights(
-    gateway: GatewayDep, generation_id: GenerationIdPath, map_name: MapName = DEFAULT_MAP
+    gateway: GatewayDep, generation_id: GenerationIdPath, query: MapQuery
 ) -> WordWeightsResponse:
     """Get the fitted word weights; 404 if none were fitted."""
     with gateway.catalog.read() as session:
-        generation = get_generation(session, get_map(session, map_name).id, generation_id)
+        generation = get_generation(session, get_map(session, query.map).id, generation_id)
     record = parse_word_weights(generation.word_weights)
     if record is None:
         raise NotFound(

@@ -22,7 +22,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ
-from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, GenerationId, MapName
+from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery
 from shared.catalog.chunks import Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
@@ -70,9 +70,7 @@ class _ChunkRows:
     responses=TAR_RESPONSE,
 )
 def export_descriptors(
-    gateway: GatewayDep,
-    generation_id: GenerationId,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, generation_id: GenerationId, query: MapQuery
 ) -> StreamingResponse:
     """Download the descriptors of all live photos as a tar archive.
 
@@ -80,7 +78,7 @@ def export_descriptors(
     rows; `photos.csv` and `names.txt` are in the same order.
     """
     with contextlib.ExitStack() as files, gateway.catalog.read() as session:
-        generation = get_generation(session, get_map(session, map_name).id, generation_id)
+        generation = get_generation(session, get_map(session, query.map).id, generation_id)
         table = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         chunks = _write_tables(session, generation, table, names)

@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
-from services.gateway.dependencies import GatewayContext, GatewayDep
+from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
 from shared.catalog.database_errors import to_unavailable
 from shared.catalog.maps import Map
@@ -20,7 +20,7 @@ from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull
 
 probe_router = APIRouter(tags=["operations"])
-router = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
 
 STATUSES_WORST_FIRST = ("unhealthy", "degraded", "healthy")
 
@@ -94,14 +94,14 @@ def service_info() -> ServiceResponse:
 
 
 @probe_router.head("/livez", include_in_schema=False)
-@probe_router.get("/livez", operation_id="livez", response_model=ProbeResponse)
+@probe_router.get("/livez", operation_id="livez")
 def livez() -> ProbeResponse:
     """Liveness probe: 200 while the process responds. It checks nothing else."""
     return ProbeResponse(status="alive")
 
 
 @probe_router.head("/readyz", include_in_schema=False)
-@probe_router.get("/readyz", operation_id="readyz", response_model=ProbeResponse)
+@probe_router.get("/readyz", operation_id="readyz")
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
     """Readiness probe: 503 while a component that every request needs is unavailable.
 
@@ -115,7 +115,7 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 
 
 @router.head("/health", include_in_schema=False, dependencies=[READ])
-@router.get("/health", operation_id="health", response_model=HealthResponse, dependencies=[READ])
+@router.get("/health", operation_id="health", dependencies=[READ])
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 

@@ -9,6 +9,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import StreamingResponse
+from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
@@ -16,12 +17,12 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.admission import ADMIT_JOB, AdmissionDep
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import (
-    DEFAULT_MAP,
     GatewayContext,
     GatewayDep,
     JobId,
-    MapName,
-    parse_cursor,
+    MapParams,
+    MapQuery,
+    PageParams,
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentDep
@@ -40,42 +41,40 @@ CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachabl
 HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
-@router.get("/jobs", operation_id="list_jobs", response_model=JobsResponse, dependencies=[READ])
-def read_jobs(
-    gateway: GatewayDep,
-    state: Annotated[list[JobState] | None, Query()] = None,
-    kind: Annotated[list[JobKind] | None, Query()] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
-    cursor: Annotated[str | None, Query()] = None,
-    map_name: MapName = DEFAULT_MAP,
-) -> JobsResponse:
+class JobsParams(PageParams):
+    state: list[JobState] | None = None
+    kind: list[JobKind] | None = None
+
+
+@router.get("/jobs", operation_id="list_jobs", dependencies=[READ])
+def read_jobs(gateway: GatewayDep, query: Annotated[JobsParams, Query()]) -> JobsResponse:
     """List jobs, newest first. `reindex` jobs of a running model change need `kind=reindex`."""
-    before = parse_cursor(cursor)
+    before = query.before
     with gateway.catalog.read() as session:
-        map_id = get_map(session, map_name).id
-        jobs = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
-    page = jobs[:limit]
+        map_id = get_map(session, query.map).id
+        jobs = list_jobs(
+            session, map_id, query.state or [], query.kind or [], query.limit + 1, before
+        )
+    page, next_cursor = query.split(jobs)
     return JobsResponse(
-        jobs=[JobResponse.of(job, map_name) for job in page],
-        next_cursor=str(page[-1].id) if len(jobs) > limit else None,
+        jobs=[JobResponse.of(job, query.map) for job in page], next_cursor=next_cursor
     )
 
 
-@router.get(
-    "/jobs/{job_id}", operation_id="get_job", response_model=JobResponse, dependencies=[READ]
-)
+class JobStatusParams(MapParams):
+    wait: float = Field(0.0, ge=0, description="seconds to wait for the end of the job")
+
+
+@router.get("/jobs/{job_id}", operation_id="get_job", dependencies=[READ])
 async def read_job_status(
-    gateway: GatewayDep,
-    job_id: JobId,
-    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end of the job")] = 0.0,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, job_id: JobId, query: Annotated[JobStatusParams, Query()]
 ) -> JobResponse:
     """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
-    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
-    if wait and job.state in UNFINISHED_STATES:
-        seconds = min(wait, gateway.settings.max_wait_seconds)
+    job = await run_in_threadpool(_load_job_of_map, gateway, query.map, job_id)
+    if query.wait and job.state in UNFINISHED_STATES:
+        seconds = min(query.wait, gateway.settings.max_wait_seconds)
         job = await wait_for_job(gateway, job_id, seconds) or job
-    return JobResponse.of(job, map_name)
+    return JobResponse.of(job, query.map)
 
 
 async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
@@ -92,35 +91,28 @@ async def _hold_event_stream(request: Request, admission: AdmissionDep) -> Async
     dependencies=[READ, Depends(_hold_event_stream, scope="request")],
 )
 async def stream_job_events(
-    gateway: GatewayDep,
-    job_id: JobId,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, job_id: JobId, query: MapQuery
 ) -> StreamingResponse:
     """Stream server-sent events: a `progress` event with the job at every change, until it ends.
 
     If too many streams are open (429, `too_many_event_streams`), poll the job instead.
     """
-    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
+    job = await run_in_threadpool(_load_job_of_map, gateway, query.map, job_id)
     return StreamingResponse(
-        _events(gateway, job_id, JobResponse.of(job, map_name), map_name),
+        _events(gateway, job_id, JobResponse.of(job, query.map), query.map),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-@router.post(
-    "/jobs/{job_id}/cancel",
-    operation_id="cancel_job",
-    response_model=JobResponse,
-    dependencies=[WRITE],
-)
+@router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", dependencies=[WRITE])
 def cancel_job_by_id(
-    gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
+    gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, query: MapQuery
 ) -> JobResponse:
     """Cancel a job immediately. Results that a worker is still computing are discarded."""
 
     def cancel(session: Session) -> JobResponse:
-        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        job = get_job(session, get_map(session, query.map).id, job_id, lock=True)
         if job.kind in MODEL_CHANGE_JOBS:
             cancel_model_change(session, job)
         elif job.kind == JobKind.BATCH:
@@ -129,32 +121,27 @@ def cancel_job_by_id(
             cancel_job(job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, map_name)
+        response = JobResponse.of(job, query.map)
         idempotent.store_response(session, 200, response)
         return response
 
     return gateway.catalog.run(cancel)
 
 
-@router.post(
-    "/jobs/{job_id}/retry",
-    operation_id="retry_job",
-    response_model=JobResponse,
-    dependencies=[WRITE, ADMIT_JOB],
-)
+@router.post("/jobs/{job_id}/retry", operation_id="retry_job", dependencies=[WRITE, ADMIT_JOB])
 def retry_job_by_id(
-    gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
+    gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, query: MapQuery
 ) -> JobResponse:
     """Queue a failed or cancelled job again; for a batch, only its failed items."""
     with gateway.catalog.write() as session:
-        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        job = get_job(session, get_map(session, query.map).id, job_id, lock=True)
         if job.kind == JobKind.BATCH:
             retry_batch(session, job)
         else:
             retry_job(session, job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, map_name)
+        response = JobResponse.of(job, query.map)
         idempotent.store_response(session, 200, response)
     gateway.hints.send(queue_for_priority(job.priority))
     return response

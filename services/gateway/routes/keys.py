@@ -7,15 +7,15 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from services.gateway.authentication import ADMIN
-from services.gateway.dependencies import NO_NUL_PATTERN, GatewayDep, KeyId
-from services.gateway.schemas import ResponseModel
-from shared.catalog.api_keys import ApiKey, KeyLimits, create_api_key, list_api_keys, revoke_api_key
+from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
+from services.gateway.schemas import RequestModel, ResponseModel
+from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.security.api_keys import Scope
 
-router = APIRouter(tags=["administration"])
+router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
 
 DAY_SECONDS = 86_400
 MAX_KEY_DAYS = 36_500
@@ -23,10 +23,8 @@ MAX_KEY_DAYS = 36_500
 KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 
-class CreateKeyRequest(BaseModel):
+class CreateKeyRequest(RequestModel):
     """The key to create. Omitted limits are those of the server's settings."""
-
-    model_config = ConfigDict(extra="forbid")
 
     name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
     scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))
@@ -55,34 +53,19 @@ class KeyResponse(ResponseModel):
     last_used_at: datetime | None = Field(description="accurate to a minute")
     revoked_at: datetime | None
 
-    @classmethod
-    def fields_of(cls, key: ApiKey) -> dict[str, object]:
-        """Returns the values of the fields for `key`, for the constructors of subclasses."""
-        return {name: getattr(key, name) for name in KeyResponse.model_fields}
-
 
 class CreatedKeyResponse(KeyResponse):
     key: str = Field(description="the secret key; it is shown only once")
 
 
-@router.get(
-    "/keys", operation_id="list_keys", response_model=list[KeyResponse], dependencies=[ADMIN]
-)
+@router.get("/keys", operation_id="list_keys", dependencies=[ADMIN])
 def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
     """List all keys, newest first, including revoked ones. The secrets are not stored."""
     with gateway.catalog.read() as session:
-        return [
-            KeyResponse.model_validate(KeyResponse.fields_of(key)) for key in list_api_keys(session)
-        ]
+        return [KeyResponse.model_validate(key) for key in list_api_keys(session)]
 
 
-@router.post(
-    "/keys",
-    operation_id="create_key",
-    status_code=201,
-    response_model=CreatedKeyResponse,
-    dependencies=[ADMIN],
-)
+@router.post("/keys", operation_id="create_key", status_code=201, dependencies=[ADMIN])
 def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
     """Create a key. The secret is shown only in this response and is not stored.
 
@@ -95,13 +78,12 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
         api_key, secret = create_api_key(
             session, body.name, set(body.scopes), life_seconds=life_seconds, limits=limits
         )
-        return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(api_key), "key": secret})
+        fields = KeyResponse.model_validate(api_key).model_dump()
+        return CreatedKeyResponse(**fields, key=secret)
 
 
-@router.delete(
-    "/keys/{key_id}", operation_id="revoke_key", response_model=KeyResponse, dependencies=[ADMIN]
-)
+@router.delete("/keys/{key_id}", operation_id="revoke_key", dependencies=[ADMIN])
 def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
     """Revoke a key. All gateways refuse it at once; it stays in the list."""
     with gateway.catalog.write() as session:
-        return KeyResponse.model_validate(KeyResponse.fields_of(revoke_api_key(session, key_id)))
+        return KeyResponse.model_validate(revoke_api_key(session, key_id))

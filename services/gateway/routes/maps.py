@@ -8,15 +8,16 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Path
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import DEFAULT_MAP, NO_NUL_PATTERN, GatewayDep
+from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import ResponseModel
+from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import (
+    DEFAULT_MAP,
     MAP_NAME_PATTERN,
     Map,
     create_map,
@@ -33,16 +34,14 @@ from shared.errors import Misconfigured, invalid_field_error
 from shared.jobs import Job
 from shared.jobs.transitions import cancel_jobs
 
-router = APIRouter(tags=["maps"])
+router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
 
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
 
 
-class CreateMapRequest(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class CreateMapRequest(RequestModel):
     name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
     extractor: str | None = Field(
         None,
@@ -67,9 +66,7 @@ class CreateMapRequest(BaseModel):
         return name
 
 
-class UpdateMapRequest(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class UpdateMapRequest(RequestModel):
     place_labels_are_paths: bool
 
 
@@ -101,29 +98,21 @@ class DeletedMapResponse(ResponseModel):
     deleted_map: str
 
 
-@router.get(
-    "/maps", operation_id="list_maps", response_model=list[MapResponse], dependencies=[READ]
-)
+@router.get("/maps", operation_id="list_maps", dependencies=[READ])
 def read_maps(gateway: GatewayDep) -> list[MapResponse]:
     """List all maps by name."""
     with gateway.catalog.read() as session:
         return [_map_response(session, map_) for map_ in list_maps(session)]
 
 
-@router.post(
-    "/maps",
-    operation_id="create_map",
-    status_code=201,
-    response_model=MapResponse,
-    dependencies=[WRITE],
-)
+@router.post("/maps", operation_id="create_map", status_code=201, dependencies=[WRITE])
 def create_new_map(
     gateway: GatewayDep, body: CreateMapRequest, idempotent: IdempotentDep
 ) -> MapResponse:
     """Create an empty map; 409 if the name exists already."""
     settings = gateway.settings
     try:
-        config = settings.recipe(body.extractor or settings.new_map_extractor)
+        config = settings.extractor_config(body.extractor or settings.new_map_extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
     with gateway.catalog.write() as session:
@@ -139,19 +128,14 @@ def create_new_map(
     return response
 
 
-@router.get("/maps/{name}", operation_id="get_map", response_model=MapResponse, dependencies=[READ])
+@router.get("/maps/{name}", operation_id="get_map", dependencies=[READ])
 def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     """Get one map."""
     with gateway.catalog.read() as session:
         return _map_response(session, get_map(session, name))
 
 
-@router.patch(
-    "/maps/{name}",
-    operation_id="update_map",
-    response_model=MapResponse,
-    dependencies=[WRITE],
-)
+@router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
     """Change whether the map's place labels are paths.
 
@@ -167,12 +151,7 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
     return gateway.catalog.run(update)
 
 
-@router.delete(
-    "/maps/{name}",
-    operation_id="delete_map",
-    response_model=DeletedMapResponse,
-    dependencies=[WRITE],
-)
+@router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE])
 def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
     """Delete a map with all its photos. An empty map `default` is created again.
 

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import (
-    DEFAULT_MAP,
-    NO_NUL_PATTERN,
-    GatewayContext,
-    GatewayDep,
-    MapName,
-)
-from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
+from services.gateway.dependencies import NO_NUL_PATTERN, GatewayDep, MapQuery
+from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, delete_if_refused
 from services.gateway.schemas import (
     GenerationResponse,
     JobAcceptedResponse,
+    RequestModel,
     VocabularyResponse,
-    accept_job,
 )
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.chunks import estimate_described
@@ -34,7 +28,7 @@ from shared.catalog.models import check_model_registered
 from shared.catalog.photos import PhotoRole, has_live_photo
 from shared.catalog.vocabularies import get_pca_source_generation, get_vocabulary, list_vocabularies
 from shared.config.settings import Settings
-from shared.errors import Conflict, Misconfigured, PlacewiseError, invalid_field_error
+from shared.errors import Conflict, Misconfigured, invalid_field_error
 from shared.extractor_config.configs import MAX_CLUSTERS, MAX_PCA_DIMENSION, ExtractorConfig
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
@@ -44,10 +38,8 @@ from shared.storage.vocabulary_npz import encode_vocabulary_file
 router = APIRouter(tags=["model changes"])
 
 
-class FitVocabularyRequest(BaseModel):
+class FitVocabularyRequest(RequestModel):
     """Options of the fit; the defaults suit most maps."""
-
-    model_config = ConfigDict(extra="forbid")
 
     clusters: int | None = Field(
         None,
@@ -60,10 +52,8 @@ class FitVocabularyRequest(BaseModel):
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
-class StartGenerationRequest(BaseModel):
+class StartGenerationRequest(RequestModel):
     """Extractor, vocabulary or PCA dimension of the new generation."""
-
-    model_config = ConfigDict(extra="forbid")
 
     extractor: str | None = Field(
         None,
@@ -87,18 +77,13 @@ class StartGenerationRequest(BaseModel):
 
 
 @router.post(
-    "/vocabularies",
-    operation_id="fit_vocabulary",
-    status_code=202,
-    response_model=JobAcceptedResponse,
-    dependencies=[WRITE, ADMIT_JOB],
+    "/vocabularies", operation_id="fit_vocabulary", status_code=202, dependencies=[WRITE, ADMIT_JOB]
 )
 def start_vocabulary_fit(
     gateway: GatewayDep,
-    response: Response,
     idempotent: IdempotentDep,
+    query: MapQuery,
     options: FitVocabularyRequest | None = None,
-    map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
     """Fit a vocabulary on the map's own photos and switch to it.
 
@@ -107,19 +92,19 @@ def start_vocabulary_fit(
     """
     params = (options or FitVocabularyRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
-        map_id = get_map(session, map_name).id
+        map_id = get_map(session, query.map).id
         if not has_live_photo(session, map_id, PhotoRole.DATABASE):
             raise Conflict("no_photos", "The map has no photos to fit on. Upload photos first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
-        idempotent.store_job_response(session, job)
-    return _model_change_response(gateway, response, job, map_name)
+        accepted = idempotent.accept_job(session, job)
+    gateway.hints.send()
+    return accepted
 
 
 @router.post(
     "/vocabularies/import",
     operation_id="import_vocabulary",
     status_code=202,
-    response_model=JobAcceptedResponse,
     openapi_extra=multipart_schema(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
         "(clusters, dimension) floats"
@@ -128,11 +113,10 @@ def start_vocabulary_fit(
 )
 async def start_vocabulary_import(
     request: Request,
-    response: Response,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> JobAcceptedResponse:
     """Import a vocabulary from a `.npz` or `.npy` file and switch to it.
 
@@ -141,30 +125,28 @@ async def start_vocabulary_import(
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await store_form_file(
-            request,
-            gateway.store,
-            new_vocabulary_key(),
-            gateway.settings.max_vocabulary_bytes,
+            request, gateway.store, new_vocabulary_key(), gateway.settings.max_vocabulary_bytes
         )
     await idempotent.claim_form(gateway.store, received)
-    params = {"object_key": received.key, "filename": received.filename}
-    job = await run_in_threadpool(_queue_import, gateway, map_name, params, idempotent)
-    return _model_change_response(gateway, response, job, map_name)
+
+    def queue_job() -> JobAcceptedResponse:
+        params = {"object_key": received.key, "filename": received.filename}
+        with delete_if_refused(gateway.store, received.key), gateway.catalog.write() as session:
+            map_id = get_map(session, query.map).id
+            job = start_model_change(session, map_id, JobKind.IMPORT, params)
+            return idempotent.accept_job(session, job)
+
+    accepted = await run_in_threadpool(queue_job)
+    gateway.hints.send()
+    return accepted
 
 
-@router.get(
-    "/vocabularies",
-    operation_id="list_vocabularies",
-    response_model=list[VocabularyResponse],
-    dependencies=[READ],
-)
-def read_vocabularies(
-    gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
-) -> list[VocabularyResponse]:
+@router.get("/vocabularies", operation_id="list_vocabularies", dependencies=[READ])
+def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyResponse]:
     """List the vocabularies of a map, newest first, with their provenance."""
     with gateway.catalog.read() as session:
-        vocabularies = list_vocabularies(session, get_map(session, map_name).id)
-    return [VocabularyResponse.of(vocabulary) for vocabulary in vocabularies]
+        vocabularies = list_vocabularies(session, get_map(session, query.map).id)
+    return [VocabularyResponse.model_validate(vocabulary) for vocabulary in vocabularies]
 
 
 @router.get(
@@ -181,18 +163,14 @@ def read_vocabularies(
     },
     dependencies=[READ],
 )
-def read_vocabulary_file(
-    gateway: GatewayDep,
-    vocabulary_id: UUID,
-    map_name: MapName = DEFAULT_MAP,
-) -> Response:
+def read_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuery) -> Response:
     """Download a vocabulary as a file for `POST /vocabularies/import`.
 
     It is a `.npz` with its provenance, or a `.npy` (`application/octet-stream`) if the provenance
     is unknown.
     """
     with gateway.catalog.read() as session:
-        vocabulary = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
+        vocabulary = get_vocabulary(session, get_map(session, query.map).id, vocabulary_id)
     data, suffix = encode_vocabulary_file(
         gateway.store.get(vocabulary.object_key), vocabulary.sha256, vocabulary.provenance
     )
@@ -203,20 +181,13 @@ def read_vocabulary_file(
     )
 
 
-@router.get(
-    "/generations",
-    operation_id="list_generations",
-    response_model=list[GenerationResponse],
-    dependencies=[READ],
-)
-def read_generations(
-    gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
-) -> list[GenerationResponse]:
+@router.get("/generations", operation_id="list_generations", dependencies=[READ])
+def read_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationResponse]:
     """List the generations of a map, newest first."""
     with gateway.catalog.read() as session:
         return [
             GenerationResponse.of(generation, estimate_described(session, generation.id))
-            for generation in list_generations(session, get_map(session, map_name).id)
+            for generation in list_generations(session, get_map(session, query.map).id)
         ]
 
 
@@ -224,15 +195,10 @@ def read_generations(
     "/generations",
     operation_id="start_generation",
     status_code=202,
-    response_model=JobAcceptedResponse,
     dependencies=[WRITE, ADMIT_JOB],
 )
 def start_generation(
-    gateway: GatewayDep,
-    response: Response,
-    idempotent: IdempotentDep,
-    body: Annotated[StartGenerationRequest, Field()],
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, idempotent: IdempotentDep, body: StartGenerationRequest, query: MapQuery
 ) -> JobAcceptedResponse:
     """Create a generation with another vocabulary, extractor or dimension, and switch to it.
 
@@ -241,13 +207,14 @@ def start_generation(
     """
     config = _validate_new_extractor(gateway.settings, body)
     with gateway.catalog.write() as session:
-        map_id = get_map(session, map_name).id
+        map_id = get_map(session, query.map).id
         if body.pca is not None:
             job = _queue_pca(session, map_id, body.pca, body.vocabulary_id)
         else:
             job = _queue_switch(session, map_id, config, body.vocabulary_id)
-        idempotent.store_job_response(session, job)
-    return _model_change_response(gateway, response, job, map_name)
+        accepted = idempotent.accept_job(session, job)
+    gateway.hints.send()
+    return accepted
 
 
 def _validate_new_extractor(
@@ -261,7 +228,7 @@ def _validate_new_extractor(
             "pca", "is fitted on existing descriptors: switch to the extractor first"
         )
     try:
-        config = settings.recipe(body.extractor)
+        config = settings.extractor_config(body.extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
     if config.needs_vocabulary:
@@ -301,24 +268,3 @@ def _queue_pca(session: Session, map_id: UUID, pca: int, vocabulary_id: UUID | N
             "pca", f"{pca} is more than the {source.dimension} dimensions of the map's descriptors"
         )
     return start_model_change(session, map_id, JobKind.PCA, {"pca": pca})
-
-
-def _queue_import(
-    gateway: GatewayContext, map_name: str, params: dict[str, Any], idempotent: IdempotentRequest
-) -> Job:
-    try:
-        with gateway.catalog.write() as session:
-            map_id = get_map(session, map_name).id
-            job = start_model_change(session, map_id, JobKind.IMPORT, params)
-            idempotent.store_job_response(session, job)
-            return job
-    except PlacewiseError:
-        gateway.store.delete(params["object_key"])
-        raise
-
-
-def _model_change_response(
-    gateway: GatewayContext, response: Response, job: Job, map_name: str
-) -> JobAcceptedResponse:
-    gateway.hints.send()
-    return accept_job(response, job, map_name)

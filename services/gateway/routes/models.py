@@ -10,22 +10,16 @@ import re
 from datetime import datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Request
 from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import ADMIN, READ
-from services.gateway.dependencies import (
-    DEFAULT_MAP,
-    NO_NUL_PATTERN,
-    GatewayContext,
-    GatewayDep,
-    MapName,
-)
-from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, MapQuery
+from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.maps import get_map
 from shared.catalog.models import (
@@ -115,21 +109,17 @@ class RemovedModelResponse(ResponseModel):
     "/models",
     operation_id="add_model",
     status_code=202,
-    response_model=JobAcceptedResponse,
     openapi_extra=multipart_schema(
-        "a checkpoint (`.ckpt`) of `placewise train`",
-        ["name"],
-        **MODEL_FORM_FIELDS,
+        "a checkpoint (`.ckpt`) of `placewise train`", ["name"], **MODEL_FORM_FIELDS
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )
 async def upload_model(
     request: Request,
-    response: Response,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> JobAcceptedResponse:
     """Add a trained model: upload its checkpoint with a `name`.
 
@@ -145,26 +135,31 @@ async def upload_model(
             gateway.settings.max_model_bytes,
             too_large=_checkpoint_too_large_error,
         )
-    try:
-        fields = _parse_model_fields(received.fields)
-    except PlacewiseError:
-        await run_in_threadpool(gateway.store.delete, received.key)
-        raise
     await idempotent.claim_form(gateway.store, received)
-    params = {
-        "object_key": received.key,
-        "filename": received.filename,
-        "checkpoint_sha256": received.sha256,
-        **fields,
-    }
-    job = await run_in_threadpool(_queue_add_model, gateway, map_name, params, idempotent)
+
+    def queue_job() -> JobAcceptedResponse:
+        with delete_if_refused(gateway.store, received.key), gateway.catalog.write() as session:
+            params = {
+                "object_key": received.key,
+                "filename": received.filename,
+                "checkpoint_sha256": received.sha256,
+                **_parse_model_fields(received.fields),
+            }
+            job = Job(
+                id=new_id(),
+                map_id=get_map(session, query.map).id,
+                kind=JobKind.ADD_MODEL,
+                priority=Priority.MODEL_CHANGE,
+                params=params,
+            )
+            return idempotent.accept_job(session, job)
+
+    accepted = await run_in_threadpool(queue_job)
     gateway.hints.send()
-    return accept_job(response, job, map_name)
+    return accepted
 
 
-@router.get(
-    "/models", operation_id="list_models", response_model=ModelsResponse, dependencies=[READ]
-)
+@router.get("/models", operation_id="list_models", dependencies=[READ, NO_PARAMETERS])
 def read_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
@@ -172,21 +167,14 @@ def read_models(gateway: GatewayDep) -> ModelsResponse:
     return ModelsResponse(models=models)
 
 
-@router.get(
-    "/models/{name}", operation_id="get_model", response_model=ModelResponse, dependencies=[READ]
-)
+@router.get("/models/{name}", operation_id="get_model", dependencies=[READ, NO_PARAMETERS])
 def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:
         return ModelResponse.of(session, get_registered_model(session, name))
 
 
-@router.delete(
-    "/models/{name}",
-    operation_id="remove_model",
-    response_model=RemovedModelResponse,
-    dependencies=[ADMIN],
-)
+@router.delete("/models/{name}", operation_id="remove_model", dependencies=[ADMIN, NO_PARAMETERS])
 def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelResponse:
     """Remove a model; 409 (`model_in_use`) while a map uses it.
 
@@ -220,27 +208,6 @@ def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
         "licence": fields.get("licence") or None,
         "note": fields.get("note") or None,
     }
-
-
-def _queue_add_model(
-    gateway: GatewayContext, map_name: str, params: dict[str, Any], idempotent: IdempotentRequest
-) -> Job:
-    try:
-        with gateway.catalog.write() as session:
-            job = Job(
-                id=new_id(),
-                map_id=get_map(session, map_name).id,
-                kind=JobKind.ADD_MODEL,
-                priority=Priority.MODEL_CHANGE,
-                params=params,
-            )
-            session.add(job)
-            session.flush()
-            idempotent.store_job_response(session, job)
-            return job
-    except PlacewiseError:
-        gateway.store.delete(params["object_key"])
-        raise
 
 
 def _checkpoint_too_large_error(max_bytes: int) -> PlacewiseError:

@@ -13,18 +13,30 @@ from uuid import UUID
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import DEFAULT_MAP, NO_NUL_PATTERN, FileId, GatewayDep, MapName
+from services.gateway.dependencies import (
+    NO_NUL_PATTERN,
+    FileId,
+    GatewayDep,
+    MapQuery,
+    PageParams,
+    invalid_cursor_error,
+)
 from services.gateway.schemas import (
     DeletedPhotoResponse,
     MetadataSearchResponse,
     PhotoDetailResponse,
     PhotoResponse,
+    RequestModel,
 )
-from services.gateway.similarity.search_params import FilterDep, check_place_filter
+from services.gateway.similarity.search_params import (
+    FilterParams,
+    check_place_filter,
+    parse_optional_time,
+)
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map
@@ -49,25 +61,16 @@ IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get(
-    "/uploads/{file_id}",
-    operation_id="get_photo",
-    response_model=PhotoDetailResponse,
-    dependencies=[READ],
-)
-def read_photo(
-    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
-) -> PhotoDetailResponse:
+@router.get("/uploads/{file_id}", operation_id="get_photo", dependencies=[READ])
+def read_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> PhotoDetailResponse:
     """Get the metadata of a photo and the state of its job."""
     with gateway.catalog.read() as session:
-        photo = get_photo(session, get_map(session, map_name).id, file_id)
-        return _photo_detail_response(session, photo, map_name)
+        photo = get_photo(session, get_map(session, query.map).id, file_id)
+        return _photo_detail_response(session, photo, query.map)
 
 
-class PhotoUpdate(BaseModel):
+class PhotoUpdate(RequestModel):
     """Fields to update: omitted fields are unchanged, null clears a field."""
-
-    model_config = ConfigDict(extra="forbid")
 
     latitude: Annotated[float | None, Field(ge=-90, le=90, allow_inf_nan=False)] = None
     longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None
@@ -97,44 +100,29 @@ class PhotoUpdate(BaseModel):
         return columns
 
 
-@router.patch(
-    "/uploads/{file_id}",
-    operation_id="patch_photo",
-    response_model=PhotoDetailResponse,
-    dependencies=[WRITE],
-)
+@router.patch("/uploads/{file_id}", operation_id="patch_photo", dependencies=[WRITE])
 def patch_photo(
-    gateway: GatewayDep,
-    file_id: FileId,
-    patch: PhotoUpdate,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, file_id: FileId, patch: PhotoUpdate, query: MapQuery
 ) -> PhotoDetailResponse:
     """Update the metadata of a photo. Its descriptor is unchanged."""
     columns = patch.to_columns()
     with gateway.catalog.write() as session:
-        map_ = lock_map(session, get_map(session, map_name).id)
+        map_ = lock_map(session, get_map(session, query.map).id)
         photo = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
             setattr(photo, name, value)
         check_coordinate_pair(photo.latitude, photo.longitude)
         photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
-        return _photo_detail_response(session, photo, map_name)
+        return _photo_detail_response(session, photo, query.map)
 
 
-@router.delete(
-    "/uploads/{file_id}",
-    operation_id="delete_photo",
-    response_model=DeletedPhotoResponse,
-    dependencies=[WRITE],
-)
-def delete_photo(
-    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
-) -> DeletedPhotoResponse:
+@router.delete("/uploads/{file_id}", operation_id="delete_photo", dependencies=[WRITE])
+def delete_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> DeletedPhotoResponse:
     """Delete a photo. No search returns it any more; its bytes are deleted within seconds."""
 
     def remove(session: Session) -> str:
-        map_ = lock_map(session, get_map(session, map_name).id)
+        map_ = lock_map(session, get_map(session, query.map).id)
         photo = get_photo(session, map_.id, file_id)
         mark_photo_deleted(session, photo, increment_map_version(session, map_.id))
         cancel_jobs(session, Job.photo_id == photo.id)
@@ -153,15 +141,10 @@ def delete_photo(
     responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def read_image(
-    request: Request,
-    gateway: GatewayDep,
-    file_id: FileId,
-    map_name: MapName = DEFAULT_MAP,
-) -> Response:
+def read_image(request: Request, gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
     """Get the original bytes of a photo."""
     with gateway.catalog.read() as session:
-        photo = get_photo(session, get_map(session, map_name).id, file_id)
+        photo = get_photo(session, get_map(session, query.map).id, file_id)
     etag = f'"{photo.sha256}"'
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers={"ETag": etag})
@@ -184,12 +167,10 @@ def read_image(
     responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def read_thumbnail(
-    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
-) -> Response:
+def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
     """Get a small JPEG without metadata; it exists once the photo has been described."""
     with gateway.catalog.read() as session:
-        photo = get_photo(session, get_map(session, map_name).id, file_id)
+        photo = get_photo(session, get_map(session, query.map).id, file_id)
     try:
         data = gateway.store.get(thumbnail_key(photo.id))
     except NotFound:
@@ -200,53 +181,51 @@ def read_thumbnail(
     return Response(data, media_type="image/jpeg")
 
 
-@router.get(
-    "/search",
-    operation_id="search_metadata",
-    response_model=MetadataSearchResponse,
-    dependencies=[READ],
-)
+class MetadataSearchParams(FilterParams, PageParams):
+    filename: str | None = Field(
+        None, max_length=255, description="part of the file name, case-insensitive"
+    )
+    upload_after: str | None = Field(None, description="ISO 8601; no offset means UTC")
+    upload_before: str | None = Field(None, description="ISO 8601; no offset means UTC")
+    min_file_size: int | None = Field(None, ge=0, le=2**62)
+    max_file_size: int | None = Field(None, ge=0, le=2**62)
+    role: PhotoRole | None = Field(None, description="photos with this role; omitted: all")
+    limit: int = Field(100, ge=1, le=1000)
+
+    def metadata_filter(self) -> MetadataFilter:
+        """Parses the conditions; 422 (`invalid_field`) names the invalid parameter."""
+        if self.filename is not None and "\0" in self.filename:
+            raise invalid_field_error("filename", "contains a NUL character")
+        return MetadataFilter(
+            filename=self.filename,
+            upload_after=parse_optional_time("upload_after", self.upload_after),
+            upload_before=parse_optional_time("upload_before", self.upload_before),
+            min_file_size=self.min_file_size,
+            max_file_size=self.max_file_size,
+            photos=self.photo_filter(),
+            role=self.role,
+        )
+
+
+@router.get("/search", operation_id="search_metadata", dependencies=[READ])
 def search_photos_by_metadata(
-    gateway: GatewayDep,
-    photos: FilterDep,
-    filename: Annotated[
-        str | None, Query(max_length=255, description="part of the file name, case-insensitive")
-    ] = None,
-    upload_after: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
-    upload_before: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
-    min_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
-    max_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
-    role: Annotated[
-        PhotoRole | None, Query(description="photos with this role; omitted: all")
-    ] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page")] = None,
-    map_name: MapName = DEFAULT_MAP,
+    gateway: GatewayDep, query: Annotated[MetadataSearchParams, Query()]
 ) -> MetadataSearchResponse:
     """Search photos by their metadata, newest first, with a cursor."""
     started = time.perf_counter()
-    if filename is not None and "\0" in filename:
-        raise invalid_field_error("filename", "contains a NUL character")
-    metadata_filter = MetadataFilter(
-        filename=filename,
-        upload_after=parse_time("upload_after", upload_after) if upload_after else None,
-        upload_before=parse_time("upload_before", upload_before) if upload_before else None,
-        min_file_size=min_file_size,
-        max_file_size=max_file_size,
-        photos=photos,
-        role=role,
-    )
-    after = _decode_cursor(cursor) if cursor else None
+    metadata_filter = query.metadata_filter()
+    after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
-        check_place_filter(photos, get_map(session, map_name).place_labels_are_paths)
-        map_id = get_map(session, map_name).id
-        matches, total = search_photos(session, map_id, metadata_filter, limit + 1, after)
-    page = matches[:limit]
+        map_ = get_map(session, query.map)
+        check_place_filter(metadata_filter.photos, map_)
+        map_id = map_.id
+        matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
+    page = matches[: query.limit]
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
-        images=[PhotoResponse(**PhotoResponse.fields_of(item, map_name)) for item in page],
-        next_cursor=_encode_cursor(page[-1]) if len(matches) > limit else None,
+        images=[PhotoResponse(**PhotoResponse.fields_of(item, query.map)) for item in page],
+        next_cursor=_encode_cursor(page[-1]) if len(matches) > query.limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
@@ -278,4 +257,4 @@ def _decode_cursor(cursor: str) -> tuple[datetime, UUID]:
         uploaded_at, photo_id = base64.urlsafe_b64decode(cursor.encode()).decode().split(" ")
         return parse_time("cursor", uploaded_at), UUID(photo_id)
     except (ValueError, binascii.Error):
-        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned") from None
+        raise invalid_cursor_error() from None

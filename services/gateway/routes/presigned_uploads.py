@@ -12,7 +12,6 @@ copy is validated, described and acknowledged.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from contextlib import AbstractContextManager
 from datetime import datetime
@@ -34,24 +33,22 @@ from services.gateway.admission import (
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
-    DEFAULT_MAP,
     NO_NUL_PATTERN,
     GatewayContext,
     GatewayDep,
-    MapName,
+    MapQuery,
     UploadId,
 )
-from services.gateway.idempotency import IdempotentDep, IdempotentReplay
+from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import UPLOAD_RESPONSES, UploadOutcome, respond_to_upload
-from services.gateway.schemas import ResponseModel, UploadResponse, url_in_map
+from services.gateway.schemas import ResponseModel, UploadResponse, accepted_headers, url_in_map
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
-from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
+from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
-from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
 from shared.ingest.store_photo import StoreResult, store_photo
@@ -64,11 +61,9 @@ from shared.ingest.validation import (
 )
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
-from shared.storage.s3 import S3Store
 
 router = APIRouter(tags=["photos"])
 
-HASH_READ_BYTES = 256 * 1024
 FILE_FIELDS = ("filename", "file_size", "sha256")
 
 
@@ -99,7 +94,6 @@ class PresignResponse(ResponseModel):
     "/uploads/presign",
     operation_id="presign_upload",
     status_code=201,
-    response_model=PresignResponse,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
 def create_presigned_upload(
@@ -107,7 +101,7 @@ def create_presigned_upload(
     gateway: GatewayDep,
     body: PresignRequest,
     idempotent: IdempotentDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> PresignResponse:
     """Create a presigned URL for uploading a photo directly to the bucket.
 
@@ -132,11 +126,11 @@ def create_presigned_upload(
     with gateway.catalog.write() as session:
         upload = PresignedUpload(
             id=upload_id,
-            map_id=get_map(session, map_name).id,
+            map_id=get_map(session, query.map).id,
             filename=base_name(body.filename),
             size_bytes=body.file_size,
             sha256=body.sha256,
-            said=fields,
+            photo_fields=fields,
             expires_at=db_now_plus(seconds),
         )
         session.add(upload)
@@ -146,7 +140,7 @@ def create_presigned_upload(
             method="PUT",
             url=put.url,
             headers=put.headers,
-            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
+            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", query.map),
             expires_at=upload.expires_at,
         )
         idempotent.store_response(session, 201, response)
@@ -157,7 +151,6 @@ def create_presigned_upload(
     "/uploads/presign/{upload_id}/complete",
     operation_id="complete_upload",
     status_code=202,
-    response_model=UploadResponse,
     responses=UPLOAD_RESPONSES,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
@@ -169,7 +162,7 @@ async def complete_presigned_upload(
     upload_id: Annotated[
         UploadId, PathParameter(description="from the response of `POST /uploads/presign`")
     ],
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> UploadResponse:
     """Complete a presigned upload: validate the sent file and store the photo.
 
@@ -180,17 +173,17 @@ async def complete_presigned_upload(
         key_id = get_caller(request).key_id
         quota = reserve_photo_quota(request, gateway.settings)
         stored = await run_in_threadpool(
-            _complete_upload, gateway, map_name, upload_id, key, key_id, quota
+            _complete_upload, gateway, query.map, upload_id, key, key_id, quota
         )
 
     def replace_response(outcome: UploadOutcome) -> None:
         with gateway.catalog.write() as session:
             upload = session.get(PresignedUpload, upload_id)
             if upload is not None:  # its map may have been deleted during the wait
-                upload.status, upload.answer = outcome.status, outcome.body.model_dump_json()
+                upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
 
     return await respond_to_upload(
-        request, response, gateway, map_name, stored, key, replace_response
+        request, response, gateway, query.map, stored, key, replace_response
     )
 
 
@@ -221,23 +214,20 @@ def _complete_upload(
         locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
         _replay_if_completed(locked)
         outcome = UploadOutcome.of(stored, stored.job, key, map_name)
-        locked.status, locked.answer = outcome.status, outcome.body.model_dump_json()
+        locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
         return stored
 
-    try:
+    with delete_if_refused(store, key):
         _check_object_size(store.head(key), upload)
         received = _verify_copied_object(store, key, upload)
         media_type = check_photo_signature(received.first_bytes)
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = ValidatedPhoto(
-            received, media_type, header, _parse_photo_fields(upload.said), key_id
+            received, media_type, header, _parse_photo_fields(upload.photo_fields), key_id
         )
         with quota:
             stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
-    except (PlacewiseError, IdempotentReplay):
-        store.delete(key)
-        raise
     if stored.photo.object_key != key:
         store.delete(key)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
@@ -250,20 +240,14 @@ def _verify_copied_object(
     store: PresigningStore, key: str, upload: PresignedUpload
 ) -> StoredUpload:
     """Reads and hashes the copied object; Unprocessable (`sha256_differs`) for another file."""
-    digest, begin, size = hashlib.sha256(), b"", 0
-    with store.open(key) as file:
-        while block := file.read(HASH_READ_BYTES):
-            if not size:
-                begin = block[:PHOTO_SIGNATURE_BYTES]
-            digest.update(block)
-            size += len(block)
-    if digest.hexdigest() != upload.sha256:
+    received = StoredUpload.read(store, key, upload.filename)
+    if received.sha256 != upload.sha256:
         raise Unprocessable(
             "sha256_differs",
-            f"The file that was sent has the SHA-256 {digest.hexdigest()}, not {upload.sha256}. "
+            f"The file that was sent has the SHA-256 {received.sha256}, not {upload.sha256}. "
             "Send the announced file again to the same URL, or start a new upload.",
         )
-    return StoredUpload(key, upload.filename, size, upload.sha256, begin)
+    return received
 
 
 def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:
@@ -286,13 +270,12 @@ def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
 
 
 def _replay_if_completed(upload: PresignedUpload) -> None:
-    if upload.answer is None:
+    if upload.response_body is None:
         return
     assert upload.status is not None
-    headers = {"Location": json.loads(upload.answer)["status_url"]}
-    if upload.status == 202:
-        headers["Retry-After"] = "1"
-    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.answer))
+    status_url = json.loads(upload.response_body)["status_url"]
+    headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
+    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.response_body))
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
@@ -305,7 +288,7 @@ def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
 
 
 def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:
-    if isinstance(gateway.store, S3Store):
+    if isinstance(gateway.store, PresigningStore):
         return gateway.store
     raise Conflict(
         "no_direct_uploads",

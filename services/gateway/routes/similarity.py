@@ -6,7 +6,7 @@ import time
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
@@ -14,17 +14,21 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.admission import ADMIT_QUERY, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
 from services.gateway.dependencies import (
-    DEFAULT_MAP,
     FileId,
     GatewayContext,
     GatewayDep,
     JobId,
-    MapName,
+    MapQuery,
     parse_prefer_wait,
     wait_for_job,
 )
-from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse, accept_job
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest, delete_if_refused
+from services.gateway.schemas import (
+    JobAcceptedResponse,
+    SimilarityResponse,
+    accepted_headers,
+    to_job_accepted,
+)
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
 from services.gateway.similarity.rerank import (
     check_comparison_supported,
@@ -34,20 +38,13 @@ from services.gateway.similarity.rerank import (
 )
 from services.gateway.similarity.search_params import (
     SearchParams,
-    SearchParamsDep,
+    SimilarityParams,
     check_place_filter,
 )
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
-from shared.errors import (
-    Conflict,
-    Gone,
-    NotFound,
-    PlacewiseError,
-    Unprocessable,
-    invalid_field_error,
-)
+from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.validation import StoredUpload, check_photo_signature
@@ -58,7 +55,7 @@ from shared.storage.keys import query_key
 
 router = APIRouter(tags=["similarity"])
 
-COMPARISON_PENDING: dict[int | str, dict[str, Any]] = {
+JOB_PENDING: dict[int | str, dict[str, Any]] = {
     202: {
         "model": JobAcceptedResponse,
         "description": "The job is queued. Poll it, then get its result.",
@@ -72,7 +69,7 @@ ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
     "/similarity/{file_id}",
     operation_id="similar_to_stored",
     response_model=SimilarityResponse,
-    responses=COMPARISON_PENDING,
+    responses=JOB_PENDING,
     dependencies=[READ],
 )
 async def search_by_stored_photo(
@@ -82,8 +79,7 @@ async def search_by_stored_photo(
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
-    search_params: SearchParamsDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: Annotated[SimilarityParams, Query()],
 ) -> Any:
     """Find the photos most similar to a stored photo, without that photo.
 
@@ -91,18 +87,19 @@ async def search_by_stored_photo(
     COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`, the response is 202 with a job:
     poll `status_url`, then GET `result_url`.
     """
+    search_params = query.search_params()
 
     def search() -> SimilarityResponse | Job:
-        _check_filter(gateway, map_name, search_params)
+        _check_filter(gateway, query.map, search_params)
         if not search_params.needs_comparison:
             return find_similar(
-                gateway, query_from_photo(gateway, map_name, file_id), search_params
+                gateway, query_from_photo(gateway, query.map, file_id), search_params
             )
-        check_comparison_supported(gateway, map_name, search_params)
+        check_comparison_supported(gateway, query.map, search_params)
         admission.admit_query()
         idempotent.claim_key(None, gateway.settings.query_ttl_seconds)
         return start_comparison_of_stored_photo(
-            gateway, query_from_photo(gateway, map_name, file_id), search_params, idempotent
+            gateway, query_from_photo(gateway, query.map, file_id), search_params, idempotent
         )
 
     result = await run_in_threadpool(search)
@@ -110,19 +107,14 @@ async def search_by_stored_photo(
         return result
     settings = gateway.settings
     wait = parse_prefer_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
-    return await _wait_for_result(gateway, response, result, map_name, wait)
+    return await _wait_for_result(gateway, response, result, query.map, wait)
 
 
 @router.post(
     "/similarity",
     operation_id="similar_to_upload",
     response_model=SimilarityResponse,
-    responses={
-        202: {
-            "model": JobAcceptedResponse,
-            "description": "The job is queued. Poll it, then get its result.",
-        }
-    },
+    responses=JOB_PENDING,
     openapi_extra=multipart_schema("the query photo"),
     dependencies=[READ, ADMIT_QUERY],
 )
@@ -132,8 +124,7 @@ async def search_by_uploaded_photo(
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
-    search_params: SearchParamsDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: Annotated[SimilarityParams, Query()],
 ) -> Any:
     """Find the photos most similar to an uploaded photo that is not stored.
 
@@ -141,8 +132,9 @@ async def search_by_uploaded_photo(
     it is 200 with the result if that takes at most N seconds. A request repeated with its
     `Idempotency-Key` gets the 202 of the first one.
     """
-    await run_in_threadpool(check_comparison_supported, gateway, map_name, search_params)
-    await run_in_threadpool(_check_filter, gateway, map_name, search_params)
+    search_params = query.search_params()
+    await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
+    await run_in_threadpool(_check_filter, gateway, query.map, search_params)
     job_id = new_id()
     key = query_key(job_id)
     with admission.admit_upload(UploadKind.QUERY, request):
@@ -154,23 +146,23 @@ async def search_by_uploaded_photo(
     )
     params = {"filename": received.filename, "wanted": search_params.model_dump(mode="json")}
     job = await run_in_threadpool(
-        _queue_query, gateway, map_name, job_id, received, params, idempotent
+        _queue_query, gateway, query.map, job_id, received, params, idempotent
     )
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
-    return await _wait_for_result(gateway, response, job, map_name, wait)
+    return await _wait_for_result(gateway, response, job, query.map, wait)
 
 
 @router.get(
     "/jobs/{job_id}/result",
     operation_id="similarity_result",
     response_model=SimilarityResponse,
-    responses=COMPARISON_PENDING,
+    responses=JOB_PENDING,
     dependencies=[READ],
 )
 async def read_similarity_result(
-    response: Response, gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP
+    response: Response, gateway: GatewayDep, job_id: JobId, query: MapQuery
 ) -> Any:
     """Get the result of a succeeded query job; 409 while it is unfinished.
 
@@ -180,7 +172,7 @@ async def read_similarity_result(
 
     def load() -> Job:
         with gateway.catalog.read() as session:
-            return get_job(session, get_map(session, map_name).id, job_id)
+            return get_job(session, get_map(session, query.map).id, job_id)
 
     job = await run_in_threadpool(load)
     if job.kind not in QUERY_JOBS:
@@ -193,7 +185,7 @@ async def read_similarity_result(
             state=job.state,
         )
     wait = gateway.settings.compare_wait_seconds
-    return await _wait_for_result(gateway, response, job, map_name, wait)
+    return await _wait_for_result(gateway, response, job, query.map, wait)
 
 
 async def _wait_for_result(
@@ -209,9 +201,10 @@ async def _wait_for_result(
                 raise query_expired_error()
             job = current
         if job.state in UNFINISHED_STATES:
-            accepted = accept_job(response, job, map_name)
+            accepted = to_job_accepted(job, map_name)
+            headers = {**response.headers, **accepted_headers(accepted.status_url)}
             # An explicit response, because the response model of the route is that of the 200.
-            return JSONResponse(accepted.model_dump(mode="json"), 202, dict(response.headers))
+            return JSONResponse(accepted.model_dump(mode="json"), 202, headers)
         result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
         if isinstance(result, SimilarityResponse):
             return result
@@ -221,8 +214,7 @@ async def _wait_for_result(
 def _check_filter(gateway: GatewayContext, map_name: str, search_params: SearchParams) -> None:
     if search_params.photos.place_under is not None:
         with gateway.catalog.read() as session:
-            labels_are_paths = get_map(session, map_name).place_labels_are_paths
-        check_place_filter(search_params.photos, labels_are_paths)
+            check_place_filter(search_params.photos, get_map(session, map_name))
 
 
 def _queue_query(
@@ -233,7 +225,7 @@ def _queue_query(
     params: dict[str, Any],
     idempotent: IdempotentRequest,
 ) -> Job:
-    try:
+    with delete_if_refused(gateway.store, received.key):
         check_photo_signature(received.first_bytes)
         for name in received.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
@@ -247,12 +239,7 @@ def _queue_query(
                 priority=Priority.QUERY,
                 params=params,
             )
-            session.add(job)
-            session.flush()
             idempotent.store_job_response(session, job)
-    except PlacewiseError:
-        gateway.store.delete(received.key)
-        raise
     gateway.hints.send(WakeupQueue.QUERY)
     return job
 

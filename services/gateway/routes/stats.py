@@ -3,50 +3,36 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from pydantic import Field
 from sqlalchemy import func, select
 
 from services.gateway.authentication import READ
-from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName, parse_cursor
+from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import active_generation
-from shared.catalog.maps import Search, get_map, get_map_statistics, list_searches
+from shared.catalog.maps import get_map, get_map_statistics, list_searches
 from shared.catalog.vocabularies import vocabulary_standing
 
 router = APIRouter(tags=["operations"])
 
 
 class SearchHistoryEntry(ResponseModel):
-    search_id: UUID
-    query_file_id: UUID | None = Field(description="null when the query photo is not stored")
+    search_id: UUID = Field(validation_alias="id")
+    query_file_id: UUID | None = Field(
+        validation_alias="query_photo_id", description="null when the query photo is not stored"
+    )
     query_filename: str
     generation_id: UUID
     top_k: int
     results: int
     best_score: float | None
     in_map: bool | None = Field(description="`estimate.in_map` of the response")
-    processing_time_ms: float
+    processing_time_ms: float = Field(validation_alias="processing_ms")
     searched_at: datetime
-
-    @classmethod
-    def of(cls, search: Search) -> SearchHistoryEntry:
-        return cls(
-            search_id=search.id,
-            query_file_id=search.query_photo_id,
-            query_filename=search.query_filename,
-            generation_id=search.generation_id,
-            top_k=search.top_k,
-            results=search.results,
-            best_score=search.best_score,
-            in_map=search.in_map,
-            processing_time_ms=search.processing_ms,
-            searched_at=search.searched_at,
-        )
 
 
 class SearchHistoryResponse(ResponseModel):
@@ -54,26 +40,16 @@ class SearchHistoryResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get(
-    "/searches",
-    operation_id="list_searches",
-    response_model=SearchHistoryResponse,
-    dependencies=[READ],
-)
-def read_searches(
-    gateway: GatewayDep,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
-    cursor: Annotated[str | None, Query()] = None,
-    map_name: MapName = DEFAULT_MAP,
-) -> SearchHistoryResponse:
+@router.get("/searches", operation_id="list_searches", dependencies=[READ])
+def read_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryResponse:
     """List similarity searches, newest first. They are kept for SEARCH_HISTORY_DAYS."""
     with gateway.catalog.read() as session:
-        map_id = get_map(session, map_name).id
-        searches = list_searches(session, map_id, limit + 1, parse_cursor(cursor))
-    page = searches[:limit]
+        map_id = get_map(session, query.map).id
+        searches = list_searches(session, map_id, query.limit + 1, query.before)
+    page, next_cursor = query.split(searches)
     return SearchHistoryResponse(
-        searches=[SearchHistoryEntry.of(search) for search in page],
-        next_cursor=str(page[-1].id) if len(searches) > limit else None,
+        searches=[SearchHistoryEntry.model_validate(search) for search in page],
+        next_cursor=next_cursor,
     )
 
 
@@ -98,20 +74,15 @@ class StatsResponse(ResponseModel):
     counted_at: datetime = Field(description="when the statistics were computed")
 
 
-@router.get(
-    "/database/stats",
-    operation_id="database_stats",
-    response_model=StatsResponse,
-    dependencies=[READ],
-)
-def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsResponse:
+@router.get("/database/stats", operation_id="database_stats", dependencies=[READ])
+def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
     """Get statistics of a map. Search times cover the last seven days.
 
     For maps with more than 10,000 photos, jobs or searches, the statistics are cached; `counted_at`
     shows their age.
     """
     with gateway.catalog.read() as session:
-        map_ = get_map(session, map_name)
+        map_ = get_map(session, query.map)
         generation = active_generation(session, map_.id)
         statistics, counted_at = get_map_statistics(session, map_.id)
         chunks, chunk_bytes = 0, 0

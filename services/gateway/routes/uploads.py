@@ -21,19 +21,17 @@ from services.gateway.admission import (
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
-    DEFAULT_MAP,
     GatewayContext,
     GatewayDep,
-    MapName,
+    MapQuery,
     parse_prefer_wait,
     wait_for_job,
 )
-from services.gateway.idempotency import IdempotentFormDep
-from services.gateway.schemas import UploadResponse, url_in_map
+from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
+from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
-from shared.errors import PlacewiseError
 from shared.imaging.file_formats import ACCEPTED_PHOTOS
 from shared.ingest.store_photo import BeforeCommit, StoreResult, store_photo
 from shared.ingest.validation import StoredUpload, check_photo_signature, validate_photo
@@ -69,7 +67,6 @@ UPLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
     "/upload",
     operation_id="upload",
     status_code=202,
-    response_model=UploadResponse,
     responses=UPLOAD_RESPONSES,
     openapi_extra=UPLOAD_FORM,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
@@ -80,7 +77,7 @@ async def upload_photo(
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
-    map_name: MapName = DEFAULT_MAP,
+    query: MapQuery,
 ) -> UploadResponse:
     """Store a photo and queue the job that describes it.
 
@@ -99,21 +96,21 @@ async def upload_photo(
     await idempotent.claim_form(gateway.store, received)
 
     def store_response(session: Session, stored: StoreResult) -> StoreResult:
-        outcome = UploadOutcome.of(stored, stored.job, received.key, map_name)
+        outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
         idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
         return stored
 
     key_id = get_caller(request).key_id
     quota = reserve_photo_quota(request, gateway.settings)
     stored = await run_in_threadpool(
-        _store_upload, gateway, map_name, received, key_id, quota, store_response
+        _store_upload, gateway, query.map, received, key_id, quota, store_response
     )
 
     def replace_response(outcome: UploadOutcome) -> None:
         idempotent.replace_response(outcome.status, outcome.body, outcome.headers)
 
     return await respond_to_upload(
-        request, response, gateway, map_name, stored, received.key, replace_response
+        request, response, gateway, query.map, stored, received.key, replace_response
     )
 
 
@@ -153,7 +150,7 @@ class UploadOutcome:
             return cls(200, {"Location": status_url}, body)
         if job.state == JobState.SUCCEEDED:
             return cls(201, {"Location": status_url}, body)
-        return cls(202, {"Location": status_url, "Retry-After": "1"}, body)
+        return cls(202, accepted_headers(status_url), body)
 
 
 async def respond_to_upload(
@@ -199,16 +196,12 @@ def _store_upload(
     before_commit: BeforeCommit,
 ) -> StoreResult:
     """Validates and stores the photo; deletes the received bytes if they are not used."""
-    try:
+    with delete_if_refused(gateway.store, received.key):
         incoming = validate_photo(
             gateway.store, received, gateway.settings.max_image_pixels, key_id
         )
         with quota:
             stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, before_commit)
-    except PlacewiseError:
-        # Not for other exceptions: after a lost connection the row may have been committed.
-        gateway.store.delete(received.key)
-        raise
     if stored.photo.object_key != received.key:
         gateway.store.delete(received.key)
     return stored

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Query
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi import APIRouter
+from pydantic import Field
 
 from services.gateway.authentication import ADMIN
-from services.gateway.dependencies import GatewayDep, WebhookId, parse_cursor
-from services.gateway.schemas import ResponseModel
+from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageQuery, WebhookId
+from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
     EventKind,
-    Webhook,
     create_webhook,
     delete_webhook,
     get_webhook,
@@ -29,9 +27,7 @@ from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_t
 router = APIRouter(tags=["administration"])
 
 
-class CreateWebhookRequest(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class CreateWebhookRequest(RequestModel):
     url: str = Field(
         min_length=1,
         max_length=2000,
@@ -46,15 +42,6 @@ class WebhookResponse(ResponseModel):
     events: list[EventKind]
     created_at: datetime
 
-    @classmethod
-    def of(cls, webhook: Webhook) -> WebhookResponse:
-        return cls(
-            id=webhook.id,
-            url=webhook.url,
-            events=[EventKind(event) for event in webhook.events],
-            created_at=webhook.created_at,
-        )
-
 
 class CreatedWebhookResponse(WebhookResponse):
     secret: str = Field(description="signs the events; it is shown only once")
@@ -66,7 +53,7 @@ class DeliveryResponse(ResponseModel):
     event: EventKind
     state: DeliveryState
     attempts: int
-    next_attempt_at: datetime | None
+    next_attempt_at: datetime | None = Field(description="null unless it is pending")
     last_status: int | None = Field(description="HTTP status of the last response")
     last_error: str | None
     created_at: datetime
@@ -74,19 +61,9 @@ class DeliveryResponse(ResponseModel):
 
     @classmethod
     def of(cls, delivery: Delivery) -> DeliveryResponse:
-        pending = delivery.state == DeliveryState.PENDING
-        return cls(
-            id=delivery.id,
-            event_id=delivery.event_id,
-            event=EventKind(delivery.event),
-            state=DeliveryState(delivery.state),
-            attempts=delivery.attempts,
-            next_attempt_at=delivery.next_attempt_at if pending else None,
-            last_status=delivery.last_status,
-            last_error=delivery.last_error,
-            created_at=delivery.created_at,
-            ended_at=delivery.ended_at,
-        )
+        response = cls.model_validate(delivery)
+        pending = response.state == DeliveryState.PENDING
+        return response if pending else response.model_copy(update={"next_attempt_at": None})
 
 
 class DeliveriesResponse(ResponseModel):
@@ -94,24 +71,15 @@ class DeliveriesResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get(
-    "/webhooks",
-    operation_id="list_webhooks",
-    response_model=list[WebhookResponse],
-    dependencies=[ADMIN],
-)
+@router.get("/webhooks", operation_id="list_webhooks", dependencies=[ADMIN, NO_PARAMETERS])
 def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
     """List webhooks, newest first, without their secrets."""
     with gateway.catalog.read() as session:
-        return [WebhookResponse.of(webhook) for webhook in list_webhooks(session)]
+        return [WebhookResponse.model_validate(webhook) for webhook in list_webhooks(session)]
 
 
 @router.post(
-    "/webhooks",
-    operation_id="create_webhook",
-    status_code=201,
-    response_model=CreatedWebhookResponse,
-    dependencies=[ADMIN],
+    "/webhooks", operation_id="create_webhook", status_code=201, dependencies=[ADMIN, NO_PARAMETERS]
 )
 def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
     """Create a webhook: events are POSTed to the URL, signed with the returned secret.
@@ -127,41 +95,31 @@ def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> Created
         raise invalid_field_error("url", error.detail) from error
     with gateway.catalog.write() as session:
         webhook = create_webhook(session, body.url, body.events)
-        fields = WebhookResponse.of(webhook).model_dump()
+        fields = WebhookResponse.model_validate(webhook).model_dump()
         return CreatedWebhookResponse(**fields, secret=webhook.secret)
 
 
 @router.delete(
-    "/webhooks/{webhook_id}",
-    operation_id="delete_webhook",
-    response_model=WebhookResponse,
-    dependencies=[ADMIN],
+    "/webhooks/{webhook_id}", operation_id="delete_webhook", dependencies=[ADMIN, NO_PARAMETERS]
 )
 def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
     """Delete a webhook, its pending deliveries and its delivery log."""
     with gateway.catalog.write() as session:
-        return WebhookResponse.of(delete_webhook(session, webhook_id))
+        return WebhookResponse.model_validate(delete_webhook(session, webhook_id))
 
 
 @router.get(
-    "/webhooks/{webhook_id}/deliveries",
-    operation_id="list_deliveries",
-    response_model=DeliveriesResponse,
-    dependencies=[ADMIN],
+    "/webhooks/{webhook_id}/deliveries", operation_id="list_deliveries", dependencies=[ADMIN]
 )
 def read_deliveries(
-    gateway: GatewayDep,
-    webhook_id: WebhookId,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
-    cursor: Annotated[str | None, Query()] = None,
+    gateway: GatewayDep, webhook_id: WebhookId, query: PageQuery
 ) -> DeliveriesResponse:
     """List the deliveries of a webhook, newest first, kept for JOB_RETENTION_DAYS."""
-    before = parse_cursor(cursor)
+    before = query.before
     with gateway.catalog.read() as session:
         webhook = get_webhook(session, webhook_id)
-        deliveries = list_deliveries(session, webhook.id, limit + 1, before)
-    page = deliveries[:limit]
+        deliveries = list_deliveries(session, webhook.id, query.limit + 1, before)
+    page, next_cursor = query.split(deliveries)
     return DeliveriesResponse(
-        deliveries=[DeliveryResponse.of(delivery) for delivery in page],
-        next_cursor=str(page[-1].id) if len(deliveries) > limit else None,
+        deliveries=[DeliveryResponse.of(delivery) for delivery in page], next_cursor=next_cursor
     )

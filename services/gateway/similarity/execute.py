@@ -88,16 +88,13 @@ def select_ranking_weights(
 class SimilarityQuery:
     """The descriptor to search with, the generation to search in, and fields of the response."""
 
-    map_id: UUID
-    map_name: str
-    min_version: int
+    map: Map
     generation: Generation
     vocabulary: str
     object_key: str
     row: int
     photo_id: UUID | None
     filename: str
-    labels_are_paths: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +130,9 @@ def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> 
             raise _not_searchable_error(session, photo, map_name)
         descriptor, chunk = located
         return SimilarityQuery(
-            map_id=map_.id,
-            map_name=map_.name,
-            min_version=map_.version,
+            map=map_,
             generation=generation,
             vocabulary=vocabulary_standing(session, generation),
-            labels_are_paths=map_.place_labels_are_paths,
             object_key=chunk.object_key,
             row=descriptor.row,
             photo_id=photo.id,
@@ -158,16 +152,12 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
         generation = session.get(Generation, UUID(result["generation_id"]))
         if generation is None:
             raise Gone(
-                "query_expired",
-                "The generation of the query was deleted. Send the photo again.",
+                "query_expired", "The generation of the query was deleted. Send the photo again."
             )
         return SimilarityQuery(
-            map_id=map_.id,
-            map_name=map_.name,
-            min_version=map_.version,
+            map=map_,
             generation=generation,
             vocabulary=vocabulary_standing(session, generation),
-            labels_are_paths=map_.place_labels_are_paths,
             object_key=result["object_key"],
             row=result["row"],
             photo_id=None,
@@ -196,7 +186,7 @@ def find_similar(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
             match_probability=result.match_probabilities.get(hit.photo_id),
-            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map_name),
+            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map.name),
         )
         for hit in result.hits
     )
@@ -222,7 +212,7 @@ def run_similarity_search(
         calibration, ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
     )
     scheme = LevelScheme(
-        labels_are_paths=query.labels_are_paths, radii_m=gateway.settings.level_radii_m
+        labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
     )
     model = ((calibration and calibration.places) or PlaceModel()).for_scheme(scheme)
     certainty = search_params.certainty or gateway.settings.certainty
@@ -270,7 +260,7 @@ def run_similarity_search(
         missing=list(response.missing),
     )
     history = Search(
-        map_id=query.map_id,
+        map_id=query.map.id,
         generation_id=query.generation.id,
         query_photo_id=query.photo_id,
         query_filename=query.filename,
@@ -338,11 +328,11 @@ def _search_live_photos(
     while True:
         response = gateway.search.search(
             SearchRequest(
-                map_id=query.map_id,
+                map_id=query.map.id,
                 generation_id=query.generation.id,
                 object_key=query.object_key,
                 row=query.row,
-                min_version=query.min_version,
+                min_version=query.map.version,
                 k=k,
                 photos=photos,
                 min_score=min_score,

@@ -33,8 +33,6 @@ from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import (
     CompareRequest,
     CompareResult,
-    RerankCandidate,
-    RerankedCandidate,
     check_explainable,
     check_rerankable,
     query_expired_error,
@@ -69,11 +67,12 @@ def check_comparison_supported(
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-    recipe = gateway.settings.recipe(generation.extractor if generation else map_.extractor)
+    extractor = generation.extractor if generation else map_.extractor
+    config = gateway.settings.extractor_config(extractor)
     if search_params.rerank is not None:
-        check_rerankable(recipe)
+        check_rerankable(config)
     if search_params.explain:
-        check_explainable(recipe, generation.spec if generation else None)
+        check_explainable(config, generation.spec if generation else None)
 
 
 def start_comparison_of_stored_photo(
@@ -85,8 +84,7 @@ def start_comparison_of_stored_photo(
     """Searches with a stored photo and queues a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
     with gateway.catalog.write() as session:
-        session.add_all([job, history])
-        session.flush()
+        session.add(history)
         idempotent.store_job_response(session, job)
     gateway.hints.send(WakeupQueue.QUERY)
     return job
@@ -140,7 +138,8 @@ def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> Sim
             weighted_score=searched[candidate.photo_id].weighted_score,
             rerank_score=candidate.rerank_score,
             match_probability=params.match_probabilities.get(candidate.photo_id),
-            explanation=_explanation_response(candidate),
+            explanation=candidate.explanation
+            and ExplanationResponse.model_validate(candidate.explanation),
             **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
         )
         for candidate in live[: params.top_k]
@@ -164,12 +163,7 @@ def _build_compare_job(
         request=CompareRequest(
             query_photo_id=query.photo_id,
             query_job_id=describe_job_id,
-            candidates=tuple(
-                RerankCandidate(
-                    photo_id=hit.photo_id, score=hit.score, weighted_score=hit.weighted_score
-                )
-                for hit in result.hits
-            ),
+            candidates=tuple(result.hits),
             rerank=search_params.rerank or 0,
             explain=search_params.top_k if search_params.explain else 0,
             word_weights=result.word_weights,
@@ -180,18 +174,10 @@ def _build_compare_job(
     )
     job = Job(
         id=new_id(),
-        map_id=query.map_id,
+        map_id=query.map.id,
         kind=JobKind.COMPARE,
         priority=Priority.QUERY,
         generation_id=query.generation.id,
         params=params.model_dump(mode="json"),
     )
     return job, result.history_row
-
-
-def _explanation_response(candidate: RerankedCandidate) -> ExplanationResponse | None:
-    return (
-        ExplanationResponse.model_validate(candidate.explanation.model_dump())
-        if candidate.explanation
-        else None
-    )

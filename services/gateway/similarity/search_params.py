@@ -1,18 +1,19 @@
 """Query parameters of the searches: photo filters and the ranking parameters.
 
-`FilterDep` parses the filters of the similarity searches and of the metadata search;
-`SearchParamsDep` adds the ranking parameters of the similarity searches.
+`FilterParams` are those of the similarity searches and of the metadata search; `SimilarityParams`
+adds the ranking parameters of the similarity searches.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from datetime import datetime
 from uuid import UUID
 
-from fastapi import Depends, Query
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
+from services.gateway.dependencies import MapParams
+from shared.catalog.maps import Map
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -24,77 +25,73 @@ MAX_IDS = 1000
 MAX_IDS_CHARACTERS = 40_000
 
 
-def parse_photo_filter(
-    near: Annotated[
-        str | None,
-        Query(description="LAT,LON,RADIUS_M: photos taken within RADIUS_M metres of the point"),
-    ] = None,
-    box: Annotated[
-        str | None,
-        Query(description="S,W,N,E in degrees; W greater than E crosses the antimeridian"),
-    ] = None,
-    captured_after: Annotated[
-        str | None, Query(description="ISO 8601; no offset means UTC")
-    ] = None,
-    captured_before: Annotated[
-        str | None, Query(description="ISO 8601; no offset means UTC")
-    ] = None,
-    place: Annotated[
-        str | None,
-        Query(max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"),
-    ] = None,
-    place_under: Annotated[
-        str | None,
-        Query(
-            max_length=MAX_TEXT_CHARACTERS,
-            description="photos whose label is this level or lies below it; only for maps with "
-            "`place_labels_are_paths`",
-        ),
-    ] = None,
-    tags: Annotated[
-        str | None, Query(max_length=5000, description="separated by commas; photos must have all")
-    ] = None,
-    ids: Annotated[
-        str | None,
-        Query(max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"),
-    ] = None,
-) -> PhotoFilter:
-    """Parses the filter from the query parameters.
+class FilterParams(MapParams):
+    """Query parameters that filter photos."""
 
-    Raises:
-        Unprocessable: `invalid_field`, with the name of the invalid parameter.
-    """
-    if place is not None and "\0" in place:
-        raise invalid_field_error("place", "contains a NUL character")
-    if place_under is not None and ("\0" in place_under or not place_under.strip("/ ")):
-        raise invalid_field_error("place_under", "names no level of a path")
-    return PhotoFilter(
-        near=_parse_circle(near) if near is not None else None,
-        box=_parse_box(box) if box is not None else None,
-        captured_after=parse_time("captured_after", captured_after) if captured_after else None,
-        captured_before=parse_time("captured_before", captured_before) if captured_before else None,
-        place=place or None,
-        place_under=place_under.rstrip("/") if place_under is not None else None,
-        tags=tuple(parse_tags(tags.split(","))) if tags else (),
-        ids=_parse_ids(ids) if ids is not None else None,
+    near: str | None = Field(
+        None, description="LAT,LON,RADIUS_M: photos taken within RADIUS_M metres of the point"
+    )
+    box: str | None = Field(
+        None, description="S,W,N,E in degrees; W greater than E crosses the antimeridian"
+    )
+    captured_after: str | None = Field(None, description=TIME)
+    captured_before: str | None = Field(None, description=TIME)
+    place: str | None = Field(
+        None, max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"
+    )
+    place_under: str | None = Field(
+        None,
+        max_length=MAX_TEXT_CHARACTERS,
+        description="photos whose label is this level or lies below it; only for maps with "
+        "`place_labels_are_paths`",
+    )
+    tags: str | None = Field(
+        None, max_length=5000, description="separated by commas; photos must have all"
+    )
+    ids: str | None = Field(
+        None, max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"
     )
 
+    def photo_filter(self) -> PhotoFilter:
+        """Parses the filter.
 
-def check_place_filter(photo_filter: PhotoFilter, labels_are_paths: bool) -> None:
+        Raises:
+            Unprocessable: `invalid_field`, with the name of the invalid parameter.
+        """
+        if self.place is not None and "\0" in self.place:
+            raise invalid_field_error("place", "contains a NUL character")
+        level = self.place_under
+        if level is not None and ("\0" in level or not level.strip("/ ")):
+            raise invalid_field_error("place_under", "names no level of a path")
+        return PhotoFilter(
+            near=_parse_circle(self.near) if self.near is not None else None,
+            box=_parse_box(self.box) if self.box is not None else None,
+            captured_after=parse_optional_time("captured_after", self.captured_after),
+            captured_before=parse_optional_time("captured_before", self.captured_before),
+            place=self.place or None,
+            place_under=level.rstrip("/") if level is not None else None,
+            tags=tuple(parse_tags(self.tags.split(","))) if self.tags else (),
+            ids=_parse_ids(self.ids) if self.ids is not None else None,
+        )
+
+
+def check_place_filter(photo_filter: PhotoFilter, map_: Map) -> None:
     """Checks that the map has the levels that the filter names.
 
     Raises:
         Unprocessable: `invalid_field`, for `place_under` in a map whose labels are no paths.
     """
-    if photo_filter.place_under is not None and not labels_are_paths:
+    if photo_filter.place_under is not None and not map_.place_labels_are_paths:
         raise invalid_field_error(
             "place_under",
-            "needs a map whose place labels are paths: PATCH /api/v1/maps/{name} with "
+            f"needs place labels that are paths: PATCH /api/v1/maps/{map_.name} with "
             "`place_labels_are_paths`",
         )
 
 
-FilterDep = Annotated[PhotoFilter, Depends(parse_photo_filter)]
+def parse_optional_time(field: str, text: str | None) -> datetime | None:
+    """Parses a time; None if it is omitted or empty."""
+    return parse_time(field, text) if text else None
 
 
 def _parse_circle(text: str) -> Circle:
@@ -146,24 +143,47 @@ def _parse_ids(text: str) -> tuple[UUID, ...]:
     return tuple(ids)
 
 
-class SearchParams(BaseModel):
-    """Parameters of a similarity search.
-
-    Stored as JSON in the job of a query photo, which is described before the search runs.
-    """
+class RankingParams(BaseModel):
+    """Number of results of a similarity search, ranking, and limits of its cost."""
 
     model_config = ConfigDict(frozen=True)
 
-    top_k: int
-    min_score: float | None = None
-    photos: PhotoFilter = NO_FILTER
-    word_weights: bool = True
-    rerank: int | None = None
-    explain: bool = False
-    certainty: float | None = None
-    mode: Mode = Mode.AUTO
-    most_rows: int | None = None
-    most_seconds: float | None = None
+    top_k: int = Field(10, ge=1, le=100, description="Maximum number of photos to return.")
+    min_score: float | None = Field(
+        None, ge=-1, le=1, description="Minimum cosine similarity of the returned photos."
+    )
+    word_weights: bool = Field(
+        True, description="Rank by the word weights of the map, if it has any."
+    )
+    rerank: int | None = Field(
+        None,
+        ge=1,
+        le=MAX_RERANK_CANDIDATES,
+        description="Compare the first N photos with the query patch by patch, and rerank them.",
+    )
+    explain: bool = Field(
+        False, description="Return the clusters and patches that contribute to each similarity."
+    )
+    certainty: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="Share of the answers that must be right: the estimate answers at the finest "
+        "level that is certain enough. Default: CERTAINTY.",
+    )
+    mode: Mode = Field(
+        Mode.AUTO,
+        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
+        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
+    )
+    most_rows: int | None = Field(
+        None,
+        ge=0,
+        description="Stop the search after reading this many rows; `certificate` reports it.",
+    )
+    most_seconds: float | None = Field(
+        None, gt=0, description="Stop the search after this many seconds; `certificate` reports it."
+    )
 
     @property
     def needs_comparison(self) -> bool:
@@ -171,86 +191,19 @@ class SearchParams(BaseModel):
         return self.rerank is not None or self.explain
 
 
-TopK = Annotated[int, Query(ge=1, le=100, description="Maximum number of photos to return.")]
-MinScore = Annotated[
-    float | None,
-    Query(ge=-1, le=1, description="Minimum cosine similarity of the returned photos."),
-]
-ModeParam = Annotated[
-    Mode,
-    Query(
-        alias="mode",
-        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
-        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
-    ),
-]
-MaxRows = Annotated[
-    int | None,
-    Query(
-        ge=0, description="Stop the search after reading this many rows; `certificate` reports it."
-    ),
-]
-MaxSeconds = Annotated[
-    float | None,
-    Query(gt=0, description="Stop the search after this many seconds; `certificate` reports it."),
-]
-UseWordWeights = Annotated[
-    bool,
-    Query(
-        alias="word_weights",
-        description="Rank by the word weights of the map, if it has any.",
-    ),
-]
-Rerank = Annotated[
-    int | None,
-    Query(
-        ge=1,
-        le=MAX_RERANK_CANDIDATES,
-        description="Compare the first N photos with the query patch by patch, and rerank them.",
-    ),
-]
-Explain = Annotated[
-    bool,
-    Query(description="Return the clusters and patches that contribute to each similarity."),
-]
+class SearchParams(RankingParams):
+    """Parameters of a similarity search.
+
+    Stored as JSON in the job of a query photo, which is described before the search runs.
+    """
+
+    photos: PhotoFilter = NO_FILTER
 
 
-Certainty = Annotated[
-    float | None,
-    Query(
-        gt=0,
-        le=1,
-        description="Share of the answers that must be right: the estimate answers at the finest "
-        "level that is certain enough. Default: CERTAINTY.",
-    ),
-]
+class SimilarityParams(RankingParams, FilterParams):
+    """Query parameters of the similarity searches."""
 
-
-def parse_search_params(
-    photos: FilterDep,
-    top_k: TopK = 10,
-    min_score: MinScore = None,
-    word_weights: UseWordWeights = True,
-    rerank: Rerank = None,
-    explain: Explain = False,
-    certainty: Certainty = None,
-    mode: ModeParam = Mode.AUTO,
-    most_rows: MaxRows = None,
-    most_seconds: MaxSeconds = None,
-) -> SearchParams:
-    """Dependency that collects the query parameters of a similarity search."""
-    return SearchParams(
-        top_k=top_k,
-        min_score=min_score,
-        photos=photos,
-        word_weights=word_weights,
-        rerank=rerank,
-        explain=explain,
-        certainty=certainty,
-        mode=mode,
-        most_rows=most_rows,
-        most_seconds=most_seconds,
-    )
-
-
-SearchParamsDep = Annotated[SearchParams, Depends(parse_search_params)]
+    def search_params(self) -> SearchParams:
+        """Parses the filter; raises as `photo_filter`."""
+        ranking = self.model_dump(include=set(RankingParams.model_fields))
+        return SearchParams(photos=self.photo_filter(), **ranking)

@@ -248,10 +248,7 @@ def multipart_schema(
         required: Required text fields.
         fields: JSON schemas of the text fields.
     """
-    properties = {
-        FILE_FIELD: {"type": "string", "format": "binary", "description": file},
-        **fields,
-    }
+    properties = {FILE_FIELD: {"type": "string", "format": "binary", "description": file}, **fields}
     schema = {"type": "object", "required": [FILE_FIELD, *required], "properties": properties}
     return {
         "requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
@@ -283,8 +280,7 @@ class _SingleFileHandler:
         """Raises InvalidRequest (`no_file`) if the form has no file."""
         if not self._file_seen:
             raise InvalidRequest(
-                "no_file",
-                f"The form has no file in the field {FILE_FIELD!r}: curl -F file=@PHOTO.",
+                "no_file", f"The form has no file in the field {FILE_FIELD!r}: curl -F file=@PHOTO."
             )
 
     def begin(self, name: str, filename: str | None) -> None:

@@ -8,7 +8,13 @@ beginning (except a gzipped one).
 
 from __future__ import annotations
 
-from services.steward.archives.archive import Archive, ArchiveLimits, ArchiveMember, open_buffered
+from services.steward.archives.archive import (
+    Archive,
+    ArchiveLimits,
+    ArchiveMember,
+    BoundedFile,
+    RangedFile,
+)
 from services.steward.archives.tar_archive import TarArchive
 from services.steward.archives.zip_archive import ZipArchive
 from shared.errors import Gone, Unprocessable
@@ -32,7 +38,7 @@ def open_archive(store: ObjectStore, key: str, limits: ArchiveLimits) -> Archive
     if info is None:
         raise Gone("archive_gone", "The archive is no longer in the object store. Upload it again.")
     archive_format = detect_archive_format(store.read_range(key, 0, ARCHIVE_SIGNATURE_BYTES))
-    file = open_buffered(store, key, info.size_bytes)
+    file = BoundedFile(RangedFile(store, key, info.size_bytes))
     if archive_format == ArchiveFormat.ZIP:
         return ZipArchive(file, info.size_bytes, limits)
     if archive_format in (ArchiveFormat.TAR, ArchiveFormat.GZIP):

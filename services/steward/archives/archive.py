@@ -6,12 +6,19 @@ that waits for the extractors may pause for hours in the middle of an archive.
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import io
+import math
 import os
-from collections.abc import Iterator
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Protocol
 
 from shared.errors import PlacewiseError, TooLarge, Unprocessable
 from shared.storage import ObjectStore
@@ -21,6 +28,18 @@ if TYPE_CHECKING:
 
 
 ARCHIVE_READ_BYTES = 256 * 1024
+
+# What the standard library raises for content that it can't read.
+READ_ERRORS = (
+    EOFError,
+    RuntimeError,
+    ValueError,
+    gzip.BadGzipFile,
+    struct.error,
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class MemberKind(StrEnum):
@@ -40,11 +59,6 @@ class ArchiveMember:
     """Its start in the archive (in the decompressed one, if it is gzipped), in bytes."""
     size_bytes: int
     """Declared size, uncompressed."""
-    packed_bytes: int
-    """Declared size, compressed."""
-    method: int = 0
-    """A zip's compression method; 0 is stored."""
-    crc32: int | None = None
     fault: PlacewiseError | None = None
     """Why it can't be read."""
 
@@ -108,10 +122,19 @@ def unsupported_member_error(description: str) -> PlacewiseError:
     )
 
 
-RANGE_BUFFER_BYTES = 256 * 1024  # bytes per request
+@contextlib.contextmanager
+def convert_read_errors(to_error: Callable[[str], PlacewiseError]) -> Iterator[None]:
+    """Convert the standard library's errors inside the block with `to_error`."""
+    try:
+        yield
+    except READ_ERRORS as error:
+        raise to_error(str(error)) from None
 
 
-class RangeReader(io.RawIOBase):
+BUFFER_BYTES = 256 * 1024  # bytes per request
+
+
+class RangedFile(io.RawIOBase):
     """Seekable, unbuffered file over an object; each read is a range request."""
 
     def __init__(self, store: ObjectStore, key: str, size_bytes: int) -> None:
@@ -146,16 +169,32 @@ class RangeReader(io.RawIOBase):
         return len(piece)
 
 
-def open_buffered(store: ObjectStore, key: str, size_bytes: int) -> io.BufferedReader:
-    """Open an object of the given size as a buffered, seekable file."""
-    return io.BufferedReader(
-        cast("io.RawIOBase", RangeReader(store, key, size_bytes)), RANGE_BUFFER_BYTES
-    )
+class BoundedFile(io.BufferedReader):
+    """Buffered file of which no more than a limit is read inside `bounded`.
 
+    `zipfile` and `tarfile` read a directory or a header of any declared size into memory.
+    """
 
-def read_exactly(file: io.BufferedIOBase, size_bytes: int) -> bytes:
-    """Read `size_bytes` bytes; fewer only at the end of the file."""
-    data = b""
-    while len(data) < size_bytes and (piece := file.read(size_bytes - len(data))):
-        data += piece
-    return data
+    def __init__(self, raw: io.RawIOBase) -> None:
+        super().__init__(raw, BUFFER_BYTES)
+        self._remaining: float = math.inf
+        self._error: PlacewiseError | None = None
+
+    @contextlib.contextmanager
+    def bounded(self, max_bytes: int, error: PlacewiseError) -> Iterator[None]:
+        """Raise the error when more than `max_bytes` are read inside the block."""
+        self._remaining, self._error = max_bytes, error
+        try:
+            yield
+        finally:
+            self._remaining, self._error = math.inf, None
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if self._error is None:
+            return super().read(size)
+        allowed = int(self._remaining) + 1
+        data = super().read(allowed if size is None or size < 0 else min(size, allowed))
+        self._remaining -= len(data)
+        if self._remaining < 0:
+            raise self._error
+        return data

@@ -169,18 +169,12 @@ def _validate_member(
 
 def member_location(member: ArchiveMember) -> dict[str, Any]:
     """Return the location of a member as JSON, for `member_from_location`."""
-    return {
-        "offset": member.offset,
-        "size_bytes": member.size_bytes,
-        "packed_bytes": member.packed_bytes,
-        "method": member.method,
-        "crc32": member.crc32,
-    }
+    return {"offset": member.offset, "size_bytes": member.size_bytes}
 
 
 def member_from_location(name: str, location: dict[str, Any]) -> ArchiveMember:
     """Return the member at a location that `member_location` returned."""
-    return ArchiveMember(name=name, kind=MemberKind.FILE, **location)
+    return ArchiveMember(name, MemberKind.FILE, location["offset"], location["size_bytes"])
 
 
 def list_prefix_photos(store: ObjectStore, prefix: str, max_photos: int) -> BatchListing:

@@ -14,12 +14,12 @@ import contextlib
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import Any
 from uuid import UUID
 
+from cachetools import LRUCache
 from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
@@ -30,7 +30,6 @@ from services.steward.batches.listing import (
     list_prefix_photos,
     member_from_location,
 )
-from services.steward.job_runner import JobInterrupted, JobRunner
 from services.steward.metrics import StewardMetrics
 from shared.catalog.batch_items import (
     BatchItem,
@@ -61,6 +60,7 @@ from shared.ingest.validation import (
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.runner import JobInterrupted, JobRunner
 from shared.jobs.transitions import release_job, succeed_job, wake_waiting_jobs
 from shared.storage import ObjectStore
 from shared.storage.keys import new_original_key
@@ -82,16 +82,13 @@ class BatchItemImporter:
         self._hints = hints
         self._settings = settings
         self._quota = PhotoQuota(catalog)
-        self._archives: OrderedDict[UUID, Archive] = OrderedDict()
+        self._archives: LRUCache[UUID, Archive] = LRUCache(MAX_OPEN_ARCHIVES)
 
     def open_batch_archive(self, job: Job) -> Archive:
         """Return the batch's archive, opened once. Raises as `open_archive` does."""
         if job.id not in self._archives:
             limits = ArchiveLimits(self._settings.max_batch_photos, self._settings.max_archive_size)
             self._archives[job.id] = open_archive(self._store, job.params["object_key"], limits)
-        self._archives.move_to_end(job.id)
-        while len(self._archives) > MAX_OPEN_ARCHIVES:
-            self._archives.popitem(last=False)
         return self._archives[job.id]
 
     def close_archive(self, job: Job) -> None:
@@ -257,11 +254,11 @@ class BatchWorker:
         self._disk = DiskSpace(settings)
         self._importer = BatchItemImporter(catalog, store, hints, settings)
         metrics = metrics or StewardMetrics(CollectorRegistry())
-        self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics)
+        self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics.count_jobs)
 
     def run(self, stop: threading.Event) -> None:
         """Run batches until `stop` is set."""
-        self._runner.run(stop, lambda job: self._run_slice(job, stop))
+        self._runner.run(lambda: self.run_next(stop), stop, stop.wait)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run a slice of the next batch; False when there is none."""

@@ -218,7 +218,7 @@ def collect_direct_uploads(catalog: Catalog, store: ObjectStore) -> None:
     the same response.
     """
     expired = or_(
-        and_(PresignedUpload.answer.is_(None), PresignedUpload.expires_at < db_now()),
+        and_(PresignedUpload.response_body.is_(None), PresignedUpload.expires_at < db_now()),
         PresignedUpload.expires_at < db_now_plus(-COMPLETED_UPLOAD_SECONDS),
     )
     with catalog.read() as session:

@@ -263,7 +263,7 @@ def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
     upload_ids = _parse_uuids(key.removeprefix(INCOMING) for key in keys)
     waiting = session.scalars(
         select(PresignedUpload.id).where(
-            PresignedUpload.id.in_(upload_ids), PresignedUpload.answer.is_(None)
+            PresignedUpload.id.in_(upload_ids), PresignedUpload.response_body.is_(None)
         )
     )
     return [incoming_key(upload_id) for upload_id in waiting]

@@ -1,10 +1,10 @@
 """Checkpoints and model files of VPR models.
 
-A checkpoint is PyTorch Lightning's `.ckpt`, which describes its own network:
+A checkpoint has the keys of PyTorch Lightning's `.ckpt`, and describes its own network:
 
     state_dict         tensors whose names begin with `model.`
     hyper_parameters   {"model": VprModelConfig.model_dump(), ...}
-    epoch, global_step, callbacks, ...     as Lightning writes them
+    epoch, global_step, ...     of the training; `last.ckpt` also holds the optimizer's state
 
 It is read with `load_tensors`: tensors and plain values only, and no code is executed. The network
 is built on the `meta` device first and then takes the file's own tensors, whose shapes are compared
@@ -18,7 +18,7 @@ their names in `VprModel.state_dict()`, float32 as they were trained, and one me
     config        VprModelConfig, complete
     fingerprint   `model_fingerprint` of the model
 
-It has no optimizer and scheduler state; a Lightning checkpoint is three times as large.
+It has no optimizer state; `last.ckpt` is three times as large.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""VprModelConfig: the architecture of a VPR model, validated. Imports no torch."""
+"""VprModelConfig: the architecture of a VPR model, validated."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.errors import Unprocessable
 
 STAGES = {
@@ -34,18 +35,6 @@ ALIASES = {
     **{f"dinov2_{size}": f"dinov2_vit{size}14" for size in "sblg"},
 }
 
-VPR_AGGREGATORS = {
-    "cosplace": "CosPlace",
-    "avg": "AVG",
-    "gem": "GeM",
-    "convap": "ConvAP",
-    "mixvpr": "MixVPR",
-    "netvlad": "NetVLAD",
-    "salad": "SALAD",
-    "boq": "BoQ",
-}
-"""Canonical names by the lowercase substring that selects them."""
-
 NO_FREEZING = -1
 MIN_STAGE_TO_CROP = 2  # a stem alone has a receptive field of a few pixels
 MAX_SIDE_PIXELS = 4096
@@ -57,7 +46,7 @@ class VprModelConfig(BaseModel):
     """The architecture of a VPR model; `model_dump()` returns plain types.
 
     Names are canonicalised: backbones by any name in STAGES or ALIASES, case-insensitive, with `-`
-    for `_`; aggregators by any name that contains a key of VPR_AGGREGATORS.
+    for `_`; aggregators by any name that contains a key of AGGREGATORS.
 
     Raises:
         Unprocessable: `unknown_backbone`, `unknown_aggregator` (both list the valid names),
@@ -113,13 +102,12 @@ class VprModelConfig(BaseModel):
     @field_validator("agg_arch")
     @classmethod
     def _canonical_aggregator(cls, name: str) -> str:
-        for substring, canonical in VPR_AGGREGATORS.items():
-            if substring in name.lower():
+        for canonical in AGGREGATORS:
+            if canonical.lower() in name.lower():
                 return canonical
         raise Unprocessable(
             "unknown_aggregator",
-            f"Unknown aggregator {name!r} (agg_arch). Valid names: "
-            f"{', '.join(VPR_AGGREGATORS.values())}.",
+            f"Unknown aggregator {name!r} (agg_arch). Valid names: {', '.join(AGGREGATORS)}.",
         )
 
     @model_validator(mode="after")

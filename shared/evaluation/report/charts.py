@@ -1,151 +1,90 @@
-"""SVG charts of reports: recall, precision-recall and distance curves, map, and the stylesheet.
+"""Charts of reports, drawn with matplotlib: curves of recall, precision and distance, and a map.
 
-The charts are written as SVG text, so that a report needs no plotting library and no script.
+Each chart is an `<img>` with an SVG inside, so that a report is one file. Equal charts have equal
+bytes. matplotlib is imported when the first chart is drawn: most evaluations write no report.
 """
 
 from __future__ import annotations
 
-import math
+import base64
+import io
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.datasets.open_dataset import DatasetPhoto
 from shared.evaluation.results import EvaluationResult
 from shared.evaluation.retrieval_metrics import distance_error
 
-WIDTH, HEIGHT = 460, 300
-LEFT, RIGHT, TOP, BOTTOM = 54, 14, 14, 44
-# The palette of Okabe and Ito, which is distinguishable with any colour vision.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# From the palette of Okabe and Ito, which is distinguishable with any colour vision.
+BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#c4c4c4"
 
 
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """Axis of a line chart: range, ticks and number format."""
+def percent_chart(
+    x_label: str, y_label: str, *, x_ticks: Sequence[float] | None = None, log: bool = False
+) -> tuple[Figure, Axes]:
+    """Create a chart with a y axis from 0 to 100 %.
 
-    label: str
-    low: float
-    high: float
-    ticks: Sequence[float]
-    log: bool = False
-    percent: bool = False
+    Args:
+        x_label: label of the x axis.
+        y_label: label of the y axis, whose values are from 0 to 1.
+        x_ticks: ticks of the x axis, from its first to its last value. None: from 0 to 100 %.
+        log: logarithmic x axis.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import PercentFormatter
 
-    def fraction(self, value: float) -> float:
-        """Return a value's position on the axis, clipped to 0 ... 1."""
-        if self.log:
-            low, high, value = math.log(self.low), math.log(self.high), math.log(value)
-        else:
-            low, high = self.low, self.high
-        return min(1.0, max(0.0, (value - low) / (high - low)))
-
-    def text(self, value: float) -> str:
-        return f"{100 * value:g} %" if self.percent else f"{value:g}"
-
-
-@dataclass(frozen=True, slots=True)
-class Series:
-    """Labelled points of a line chart."""
-
-    label: str
-    points: Sequence[tuple[float, float]]
-    line: bool = True
-    """draw a line; if false, points with the label next to them"""
+    figure = Figure(figsize=(5, 3.3), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set(xlabel=x_label, ylabel=y_label, ylim=(-0.02, 1.02))
+    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    if log:
+        axes.set_xscale("log")
+    if x_ticks is None:
+        axes.set_xlim(-0.02, 1.02)
+        axes.xaxis.set_major_formatter(PercentFormatter(1))
+    else:
+        axes.set_xticks(x_ticks, [f"{tick:g}" for tick in x_ticks])
+        axes.minorticks_off()
+    axes.grid(color="#e5e5e5")
+    return figure, axes
 
 
-def percent_axis(label: str) -> Axis:
-    """Create an axis from 0 to 100 %."""
-    return Axis(label, 0.0, 1.0, (0, 0.25, 0.5, 0.75, 1.0), percent=True)
+def render_chart(figure: Figure, title: str) -> str:
+    """Render a chart as an `<img>` element; the title is its alternative text."""
+    from matplotlib import rc_context
 
-
-def line_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
-    """Render a line chart as `<svg>`; values outside an axis are clipped to it."""
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">',
-        f"<title>{escape(title)}</title>",
-    ]
-    parts += _grid(x, y)
-    for number, each in enumerate(series):
-        colour = COLOURS[number % len(COLOURS)]
-        points = [(_x(x, a), _y(y, b)) for a, b in each.points]
-        if each.line:
-            path = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-            parts.append(
-                f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2"/>'
-            )
-            parts.append(
-                f'<text x="{WIDTH - RIGHT - 6}" y="{HEIGHT - BOTTOM - 10 - 15 * number}" '
-                f'text-anchor="end" fill="{colour}">{escape(each.label)}</text>'
-            )
-        for a, b in points if not each.line or len(points) <= 20 else ():
-            parts.append(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>')
-        if not each.line:
-            for a, b in points:
-                is_right = a > WIDTH * 0.6
-                parts.append(
-                    f'<text x="{a + (-7 if is_right else 7):.1f}" y="{b - 6:.1f}" fill="{colour}" '
-                    f'text-anchor="{"end" if is_right else "start"}">{escape(each.label)}</text>'
-                )
-    parts.append("</svg>")
-    return "".join(parts)
-
-
-def _grid(x: Axis, y: Axis) -> list[str]:
-    bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-    parts = [
-        f'<rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}" class="p"/>'
-    ]
-    for tick in x.ticks:
-        tick_x = _x(x, tick)
-        parts.append(
-            f'<line x1="{tick_x:.1f}" y1="{TOP}" x2="{tick_x:.1f}" y2="{bottom}" class="g"/>'
-        )
-        parts.append(
-            f'<text x="{tick_x:.1f}" y="{bottom + 15}" text-anchor="middle">{x.text(tick)}</text>'
-        )
-    for tick in y.ticks:
-        tick_y = _y(y, tick)
-        parts.append(
-            f'<line x1="{LEFT}" y1="{tick_y:.1f}" x2="{right}" y2="{tick_y:.1f}" class="g"/>'
-        )
-        parts.append(
-            f'<text x="{LEFT - 5}" y="{tick_y + 4:.1f}" text-anchor="end">{y.text(tick)}</text>'
-        )
-    middle = (LEFT + right) / 2
-    parts.append(
-        f'<text x="{middle}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x.label)}</text>'
-    )
-    parts.append(
-        f'<text transform="translate(12 {(TOP + bottom) / 2}) rotate(-90)" '
-        f'text-anchor="middle">{escape(y.label)}</text>'
-    )
-    return parts
-
-
-def _x(axis: Axis, value: float) -> float:
-    return LEFT + axis.fraction(value) * (WIDTH - RIGHT - LEFT)
-
-
-def _y(axis: Axis, value: float) -> float:
-    return HEIGHT - BOTTOM - axis.fraction(value) * (HEIGHT - BOTTOM - TOP)
+    svg = io.StringIO()
+    with rc_context({"svg.hashsalt": title, "svg.fonttype": "none"}):
+        figure.savefig(svg, format="svg", metadata={"Creator": None, "Date": None})
+    encoded = base64.b64encode(svg.getvalue().encode()).decode()
+    return f'<img src="data:image/svg+xml;base64,{encoded}" alt="{escape(title)}">'
 
 
 def recall_chart(result: EvaluationResult) -> str:
     """Render recall@k over k."""
-    curve = result.measured.recall_curve
-    ticks = [k for k in (1, 5, 10, 20, 50, 100) if k <= len(curve)]
-    x = Axis("k: number of retrieved photos", 1, max(2, len(curve)), ticks)
-    points = list(enumerate(curve, start=1))
-    series = [Series("all queries", points)]
+    curve = np.asarray(result.measured.recall_curve)
+    ks = np.arange(1, len(curve) + 1)
+    figure, axes = percent_chart(
+        "k: number of retrieved photos",
+        "recall@k",
+        x_ticks=[k for k in (1, 5, 10, 20, 50, 100) if k <= len(curve)],
+    )
+    axes.plot(ks, curve, ".-", color=BLUE, label="all queries")
     total = result.measured.recalls.queries
     findable = total - result.measured.recalls.without_positive
     if 0 < findable < total:
-        findable_points = [(k, recall * total / findable) for k, recall in points]
-        series.append(Series("queries with a positive", findable_points))
-    return line_chart("Recall@k", x, percent_axis("recall@k"), series)
+        axes.plot(ks, curve * total / findable, ".-", color=RED, label="queries with a positive")
+    axes.legend()
+    return render_chart(figure, "Recall@k")
 
 
 def precision_chart(result: EvaluationResult) -> str | None:
@@ -153,15 +92,10 @@ def precision_chart(result: EvaluationResult) -> str | None:
     curve = result.measured.curve
     if curve is None:
         return None
-    points = list(zip(curve.recall.tolist(), curve.precision.tolist(), strict=True))
-    shown = points[:: max(1, len(points) // 400)] + points[-1:]
-    label = f"area {curve.area:.3f}"
-    return line_chart(
-        "Precision and recall of the first match",
-        percent_axis("recall"),
-        percent_axis("precision"),
-        [Series(label, shown)],
-    )
+    figure, axes = percent_chart("recall", "precision")
+    axes.plot(curve.recall, curve.precision, color=BLUE, label=f"area {curve.area:.3f}")
+    axes.legend()
+    return render_chart(figure, "Precision and recall of the first match")
 
 
 def distance_chart(result: EvaluationResult) -> str | None:
@@ -170,71 +104,56 @@ def distance_chart(result: EvaluationResult) -> str | None:
     error = None if metres is None else distance_error(metres[:, 0])
     if error is None:
         return None
-    points = [(entry["metres"], entry["share"]) for entry in error["within"]]
-    x = Axis("x in metres", 1, 1000, (1, 5, 25, 100, 1000), log=True)
-    label = f"median {error['median_m']:.1f} m"
-    return line_chart(
-        "Distance of the first match",
-        x,
-        percent_axis("queries within x metres"),
-        [Series(label, points)],
+    figure, axes = percent_chart(
+        "x in metres", "queries within x metres", x_ticks=(1, 5, 25, 100, 1000), log=True
     )
+    axes.plot(
+        [entry["metres"] for entry in error["within"]],
+        [entry["share"] for entry in error["within"]],
+        ".-",
+        color=BLUE,
+        label=f"median {error['median_m']:.1f} m",
+    )
+    axes.legend()
+    return render_chart(figure, "Distance of the first match")
 
 
-MAP_PIXELS = 620  # width
-MAP_MARGIN_PIXELS = 12
 MAX_DATABASE_POINTS = 4000
 MAX_QUERY_POINTS = 2000
-MAX_SCALE_BAR_SHARE = 0.25  # share of the width
 
 
 def positions_chart(result: EvaluationResult) -> tuple[str, str] | None:
     """Render a map of the queries and their first matches, in UTM metres.
 
     Returns:
-        The `<svg>` and a caption that says how many queries are shown; None without positions.
+        The `<img>` and a caption that says how many queries are shown; None without positions.
     """
     zone = _most_common_zone(result.evaluation_set.queries)
-    database = [_point(photo, zone) for photo in result.evaluation_set.database]
-    queries = [_point(photo, zone) for photo in result.evaluation_set.queries]
-    drawable = [q for q, point in enumerate(queries) if point is not None]
-    known = [point for point in (*database, *queries) if point is not None]
-    if not drawable or not any(point is not None for point in database):
+    database = _utm_positions(result.evaluation_set.database, zone)
+    queries = _utm_positions(result.evaluation_set.queries, zone)
+    located = np.flatnonzero(~np.isnan(queries[:, 0]))
+    if not len(located) or np.isnan(database).all():
         return None
-    east, north = np.array(known).T
-    low, high = np.array([east.min(), north.min()]), np.array([east.max(), north.max()])
-    span = float(max(*(high - low), 1.0))
-    scale = (MAP_PIXELS - 2 * MAP_MARGIN_PIXELS) / span
-    height = int((high[1] - low[1]) * scale) + 2 * MAP_MARGIN_PIXELS + 24
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
 
-    def to_pixels(point: tuple[float, float]) -> tuple[float, float]:
-        x = MAP_MARGIN_PIXELS + (point[0] - low[0]) * scale
-        return x, height - 24 - MAP_MARGIN_PIXELS - (point[1] - low[1]) * scale
+    origin = np.nanmin(np.concatenate([database, queries]), axis=0)
+    database, queries = database - origin, queries - origin
+    located = located[:: -(-len(located) // MAX_QUERY_POINTS)]
+    starts, ends = queries[located], database[result.ranked.indices[located, 0]]
+    colours = np.where(result.measured.hits[located, 0], GREEN, RED)
+    has_match = ~np.isnan(ends[:, 0])
+    segments = np.stack([starts, ends], axis=1)[has_match]
 
-    label = "Map of queries and their first matches"
-    parts = [f'<svg viewBox="0 0 {MAP_PIXELS} {height}" role="img" class="m" aria-label="{label}">']
-    database_points = [point for point in database if point is not None]
-    parts += [
-        '<circle cx="{:.1f}" cy="{:.1f}" r="1.5" class="d"/>'.format(*to_pixels(point))
-        for point in database_points[:: max(1, -(-len(database_points) // MAX_DATABASE_POINTS))]
-    ]
-    shown = drawable[:: max(1, -(-len(drawable) // MAX_QUERY_POINTS))]
-    for query in shown:
-        point = queries[query]
-        assert point is not None
-        css_class = "r" if result.measured.hits[query, 0] else "w"
-        x, y = to_pixels(point)
-        match = database[result.ranked.indices[query, 0]]
-        if match is not None:
-            match_x, match_y = to_pixels(match)
-            parts.append(
-                f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{match_x:.1f}" y2="{match_y:.1f}" '
-                f'class="{css_class}"/>'
-            )
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" class="{css_class}"/>')
-    parts += [*_scale_bar(span, scale, height), "</svg>"]
-    caption = f"{len(shown)} of {len(queries)} queries, UTM zone {zone or 'unknown'}"
-    return "".join(parts), caption
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.add_subplot(aspect="equal", xlabel="metres east", ylabel="metres north")
+    shown = database[~np.isnan(database[:, 0])]
+    shown = shown[:: -(-len(shown) // MAX_DATABASE_POINTS)]
+    axes.scatter(shown[:, 0], shown[:, 1], s=4, color=GREY)
+    axes.add_collection(LineCollection(list(segments), colors=colours[has_match], linewidths=0.8))
+    axes.scatter(starts[:, 0], starts[:, 1], s=12, c=colours, zorder=3)
+    caption = f"{len(located)} of {len(queries)} queries, UTM zone {zone or 'unknown'}"
+    return render_chart(figure, "Map of queries and their first matches"), caption
 
 
 def _most_common_zone(photos: tuple[DatasetPhoto, ...]) -> str | None:
@@ -242,25 +161,13 @@ def _most_common_zone(photos: tuple[DatasetPhoto, ...]) -> str | None:
     return zones.most_common(1)[0][0] if zones else None
 
 
-def _point(photo: DatasetPhoto, zone: str | None) -> tuple[float, float] | None:
-    if photo.easting is None or photo.northing is None or photo.zone != zone:
-        return None
-    return photo.easting, photo.northing
-
-
-def _scale_bar(span: float, scale: float, height: int) -> list[str]:
-    """Render a scale bar of 1, 2 or 5 times a power of ten metres."""
-    min_metres = span * MAX_SCALE_BAR_SHARE / 2
-    power = 10.0 ** np.floor(np.log10(min_metres))
-    metres = next(m for m in (power, 2 * power, 5 * power, 10 * power) if m >= min_metres)
-    y = height - 12
-    return [
-        (
-            f'<line x1="{MAP_MARGIN_PIXELS}" y1="{y}" '
-            f'x2="{MAP_MARGIN_PIXELS + metres * scale:.1f}" y2="{y}" class="b"/>'
-        ),
-        f'<text x="{MAP_MARGIN_PIXELS + metres * scale + 6:.1f}" y="{y + 4}">{metres:g} m</text>',
-    ]
+def _utm_positions(photos: Sequence[DatasetPhoto], zone: str | None) -> NDArray[np.float64]:
+    """Return eastings and northings in metres, (photos, 2); NaN outside the zone or unknown."""
+    positions = np.full((len(photos), 2), np.nan)
+    for index, photo in enumerate(photos):
+        if photo.easting is not None and photo.northing is not None and photo.zone == zone:
+            positions[index] = photo.easting, photo.northing
+    return positions
 
 
 STYLE = """
@@ -270,11 +177,8 @@ h1{font-size:1.6rem}h2{margin-top:2.4rem;border-top:2px solid #ddd;padding-top:1
 table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.25rem .7rem;text-align:left;
 border-bottom:1px solid #e5e5e5;vertical-align:top}td.n{text-align:right;
 font-variant-numeric:tabular-nums}.charts{display:flex;flex-wrap:wrap;gap:1rem}
-.charts figure{margin:0;flex:1 1 420px;max-width:560px}svg{width:100%;height:auto;
-font:12px system-ui,sans-serif}svg .p{fill:none;stroke:#888}svg .g{stroke:#e5e5e5}
-svg.m{max-width:760px;border:1px solid #ddd}.m .d{fill:#c4c4c4}.m circle.r{fill:#009e73}
-.m circle.w{fill:#d55e00}.m line.r{stroke:#009e73}.m line.w{stroke:#d55e00;stroke-opacity:.55}
-.m .b{stroke:#1a1a1a;stroke-width:2}.wide{overflow-x:auto}.grid td{padding:.3rem;border:0}
+.charts figure{margin:0;flex:1 1 420px;max-width:560px}figure>img{width:100%;max-width:760px}
+.wide{overflow-x:auto}.grid td{padding:.3rem;border:0}
 .grid img,.grid .none{width:180px;height:135px;object-fit:cover;display:block;border:5px solid}
 .grid .none{background:#f2f2f2;color:#666;display:grid;place-items:center}
 .grid .query{border-color:#0057d9}.grid .right{border-color:#128a3a}

@@ -10,7 +10,7 @@ from typing import Any
 
 from shared.datasets.open_dataset import EvaluationSet
 from shared.evaluation.bootstrap import PairedDifference
-from shared.evaluation.report.charts import STYLE, Axis, Series, line_chart, percent_axis
+from shared.evaluation.report.charts import GREY, STYLE, percent_chart, render_chart
 from shared.evaluation.retrieval_metrics import RetrievalMetrics
 
 
@@ -61,10 +61,8 @@ class ComparedExtractor:
         if self.difference is None:
             return ""
         mean = f"{100 * self.difference.mean:+.1f}"
-        if self.difference.low is None or self.difference.high is None:
-            return mean
-        low, high = 100 * self.difference.low, 100 * self.difference.high
-        return f"{mean} ({low:+.1f} to {high:+.1f})"
+        interval = self.difference.interval_in_points()
+        return mean if interval is None else f"{mean} ({interval})"
 
     def as_json(self) -> dict[str, Any]:
         metrics = self.measured.as_json()
@@ -124,9 +122,7 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
 def _table_row(extractor: ComparedExtractor) -> str:
     values = [f"{100 * recall:.1f}" for recall in extractor.measured.recalls.recall_all.values()]
     interval = extractor.measured.recall_intervals
-    values.append(
-        f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-"
-    )
+    values.append(interval[0].as_percent() if interval else "-")
     milliseconds = extractor.milliseconds_a_photo
     values += [
         "-" if milliseconds is None else f"{milliseconds:.1f}",
@@ -145,16 +141,15 @@ def _cost_chart(
     known = [cost for cost in costs if cost > 0]  # excludes NaN
     if not known:
         return None
-    low = 10 ** math.floor(math.log10(min(known)))
-    high = 10 ** math.ceil(math.log10(max(known) * 1.0001))
-    steps = round(math.log10(high / low))
-    x = Axis(label, low, high, [low * 10**step for step in range(steps + 1)], log=True)
+    decades = range(
+        math.floor(math.log10(min(known))), math.ceil(math.log10(max(known) * 1.0001)) + 1
+    )
+    figure, axes = percent_chart(label, "R@1", x_ticks=[10.0**n for n in decades], log=True)
     is_optimal = pareto_front(costs, recalls)
     front = sorted((c, r) for c, r, on in zip(costs, recalls, is_optimal, strict=True) if on)
-    series = [Series("Pareto front", front)]
-    series += [
-        Series(each.name, [(cost, recall)], line=False)
-        for each, cost, recall in zip(compared, costs, recalls, strict=True)
-        if cost > 0
-    ]
-    return line_chart(title, x, percent_axis("R@1"), series)
+    axes.plot(*zip(*front, strict=True), ".-", color=GREY, label="Pareto front")
+    for each, cost, recall in zip(compared, costs, recalls, strict=True):
+        if cost > 0:
+            axes.plot(cost, recall, "o", label=each.name)
+    axes.legend(fontsize="small")
+    return render_chart(figure, title)

@@ -186,7 +186,7 @@ def _format_share(share: float, interval: ConfidenceInterval | None) -> str:
         return "-"
     if interval is None:
         return f"{share:.1%}"
-    return f"{share:.1%} ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+    return f"{share:.1%} ({interval.as_percent()})"
 
 
 def _format_number(value: float | None) -> str:

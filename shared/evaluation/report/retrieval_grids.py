@@ -131,11 +131,7 @@ def differences_section(result: EvaluationResult, comparison: RunComparison, sho
     """Render the comparison with another run: differences, and queries won and lost."""
     rows = []
     for k, difference in comparison.differences.items():
-        interval = (
-            "too few queries for an interval"
-            if difference.low is None or difference.high is None
-            else f"{100 * difference.low:+.1f} to {100 * difference.high:+.1f}"
-        )
+        interval = difference.interval_in_points() or "too few queries for an interval"
         verdict = "significant" if difference.is_significant else "not significant"
         rows.append(
             f'<tr><th>R@{k}</th><td class="n">{100 * difference.mean:+.1f}</td><td>{interval}</td>'

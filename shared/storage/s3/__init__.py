@@ -1,7 +1,7 @@
 """Object store in a bucket of any S3 server, through the minio client.
 
-`client` has the HTTP client, `bucket` connects and translates the client's errors, `streams` reads
-and writes objects as streams, `store` implements the interface of object stores.
+`bucket` connects and translates the client's errors, `streams` reads and writes objects as streams,
+`store` implements the interface of object stores.
 """
 
 from shared.storage.s3.bucket import Bucket, create_bucket

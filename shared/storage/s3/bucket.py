@@ -6,12 +6,17 @@ import contextlib
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from types import TracebackType
 from typing import Self
 from xml.etree.ElementTree import ParseError
 
 import urllib3
+from minio import Minio
 from minio.commonconfig import ENABLED, Filter
+from minio.credentials.credentials import Credentials
+from minio.credentials.providers import StaticProvider
 from minio.error import MinioException, S3Error
 from minio.helpers import BaseURL
 from minio.lifecycleconfig import AbortIncompleteMultipartUpload, LifecycleConfig, Rule
@@ -27,8 +32,8 @@ from urllib3.exceptions import (
 from urllib3.response import BaseHTTPResponse
 
 from shared.config.settings import Settings
-from shared.errors import Misconfigured, NotFound, PlacewiseError, StorageFull, Unavailable
-from shared.storage.s3.client import Connections, S3Client
+from shared.errors import Misconfigured, PlacewiseError, StorageFull, Unavailable
+from shared.storage.keys import object_not_found_error
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +51,8 @@ BAD_CREDENTIALS_CODES = {
 ACCESS_DENIED_CODES = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllowed"}
 WRONG_REGION_CODES = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
 CLOCK_SKEW_CODES = {"RequestTimeTooSkewed"}
+FORBIDDEN_STATUS = 403
+MAX_CLOCK_SKEW = timedelta(minutes=15)  # S3 rejects signatures with a larger one
 PRECONDITION_FAILED_CODES = {"PreconditionFailed"}
 SLOW_DOWN_CODES = {
     "SlowDown",
@@ -89,10 +96,11 @@ class RetryUnlessTimeout(urllib3.Retry):
 class Bucket:
     """One bucket on one server. Its client is thread-safe."""
 
-    client: S3Client
+    client: Minio
     name: str
     endpoint: str
     region: str
+    credentials: Credentials
     public: BaseURL
     """The server's URL for clients of Placewise."""
 
@@ -109,7 +117,7 @@ class Bucket:
             )
         # One timeout for both: urllib3 applies the connect timeout to sending the body.
         seconds = settings.s3_timeout_seconds
-        connections = Connections(
+        connections = urllib3.PoolManager(
             num_pools=2,
             maxsize=MAX_CONNECTIONS,
             timeout=urllib3.Timeout(connect=seconds, read=seconds),
@@ -122,10 +130,12 @@ class Bucket:
             ),
             cert_reqs="CERT_REQUIRED",  # by the system's certificate authorities, or SSL_CERT_FILE
         )
-        client = S3Client(
+        credentials = StaticProvider(
+            settings.s3_access_key, settings.s3_secret_key.get_secret_value()
+        )
+        client = Minio(
             settings.s3_endpoint,
-            settings.s3_access_key,
-            settings.s3_secret_key.get_secret_value(),
+            credentials=credentials,
             secure=settings.s3_secure,
             region=settings.s3_region,  # without it the client would request it first
             http_client=connections,
@@ -138,6 +148,7 @@ class Bucket:
             settings.s3_bucket,
             settings.s3_endpoint,
             settings.s3_region,
+            credentials.retrieve(),
             BaseURL(public, settings.s3_region),
         )
 
@@ -158,9 +169,15 @@ class Bucket:
             yield
         except S3Error as error:
             raise self._translate_s3_error(error, key) from error
-        except (MinioException, HTTPError, ParseError, OSError) as error:
+        except (MinioException, HTTPError, ParseError, ValueError, OSError) as error:
             log.warning("the object store at %s failed: %s", self.endpoint, error)
             raise self._unreachable_error(error) from error
+
+    def incomplete_response_error(self, key: str) -> Unavailable:
+        return Unavailable(
+            "object_store_unavailable",
+            f"The object store at {self.endpoint} sent an incomplete response for {key!r}.",
+        )
 
     def missing_error(self) -> Unavailable:
         return Unavailable(
@@ -172,7 +189,7 @@ class Bucket:
     def _translate_s3_error(self, error: S3Error, key: str | None) -> PlacewiseError:
         code = error.code or ""
         if code in NO_SUCH_KEY_CODES and key is not None:
-            return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
+            return object_not_found_error(key)
         if code in NO_SUCH_BUCKET_CODES:
             return self.missing_error()
         log.warning("the object store at %s rejected a request: %s", self.endpoint, error)
@@ -191,6 +208,8 @@ class Bucket:
                 f"The object store at {self.endpoint} is overloaded ({code}). Try again.",
                 retry_after_seconds=BUSY_RETRY_SECONDS,
             )
+        if error.response.status == FORBIDDEN_STATUS and _is_clock_wrong(error.response):
+            code = "RequestTimeTooSkewed"  # a response to HEAD has no body with the code
         advice = _advice(code, self.name)
         if advice is None:
             return Unavailable(
@@ -206,7 +225,7 @@ class Bucket:
         reason: object = error.reason if isinstance(error, MaxRetryError) else error
         if isinstance(reason, SSLError):
             advice = "Check S3_SECURE, and that the server uses HTTPS with a trusted certificate."
-        elif isinstance(error, MinioException | ParseError):
+        elif isinstance(error, MinioException | ParseError | ValueError):
             advice = "The response is not from an S3 server: check S3_ENDPOINT and S3_SECURE."
         else:
             advice = "Check S3_ENDPOINT, and that the server is running."
@@ -236,8 +255,22 @@ def _advice(code: str, bucket: str) -> str | None:
     if code in WRONG_REGION_CODES:
         return "Set S3_REGION to the region of the bucket."
     if code in CLOCK_SKEW_CODES:
-        return "The clock of this machine or of the object store is wrong: set it."
+        return (
+            "The clocks of this machine and of the object store differ by more than "
+            f"{MAX_CLOCK_SKEW.seconds // 60} minutes: synchronise both with NTP."
+        )
     return None
+
+
+def _is_clock_wrong(response: BaseHTTPResponse) -> bool:
+    """Return whether this machine's clock differs too much from the response's Date header."""
+    try:
+        server_time = parsedate_to_datetime(response.headers["date"])
+    except (KeyError, ValueError):
+        return False
+    return server_time.tzinfo is not None and (
+        abs(server_time - datetime.now(UTC)) > MAX_CLOCK_SKEW
+    )
 
 
 ALREADY_OWNED_CODE = "BucketAlreadyOwnedByYou"

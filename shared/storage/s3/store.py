@@ -2,20 +2,21 @@
 
 A presigned PUT is a URL that allows uploading one object for a limited time. It uses AWS Signature
 Version 4 in the query (docs.aws.amazon.com, "Authenticating Requests: Using Query Parameters").
-The minio client only signs the host; here size and checksum are signed too, so that a server that
-verifies them accepts no other content. Not every server does: the caller checks what was stored.
+`Minio.presigned_put_object` signs only the host. Here size and checksum are signed too, so that a
+server that verifies them accepts no other content; not every server does, hence the caller checks
+what was stored.
 """
 
 from __future__ import annotations
 
 import base64
 import contextlib
+import hashlib
 import logging
 from collections.abc import Callable, Iterator
-from datetime import UTC
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO, TypeVar
-from urllib.parse import SplitResult
 
 from minio import signer
 from minio.commonconfig import REPLACE, CopySource
@@ -24,50 +25,53 @@ from minio.helpers import queryencode
 from minio.time import to_amz_date
 
 from shared.errors import NotFound, StorageFull, Unavailable
-from shared.storage.folder import OWNER_MARK
-from shared.storage.keys import TRASH, check_key, is_valid_key
+from shared.storage.keys import TRASH, check_key, check_note_name
 from shared.storage.protocol import ObjectInfo, PresignedPut
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
-from shared.storage.s3.streams import S3Reader, S3Writer, open_object, read_range
+from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, open_object, read_range
 
 log = logging.getLogger(__name__)
-
-UNSIGNED_PAYLOAD = "UNSIGNED-PAYLOAD"
 
 
 def presign_put(
     bucket: Bucket, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
 ) -> PresignedPut:
     """Return a presigned PUT without sending a request; `sha256` is hexadecimal."""
-    provider, region = bucket.client._provider, bucket.region
-    assert provider is not None, "from_settings requires both keys"
-    credentials = provider.retrieve()
-    url = bucket.public.build(method="PUT", region=region, bucket_name=bucket.name, object_name=key)
+    now, credentials = datetime.now(UTC), bucket.credentials
+    url = bucket.public.build(
+        method="PUT", region=bucket.region, bucket_name=bucket.name, object_name=key
+    )
     checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
+    signed = {
+        "content-length": str(size_bytes),
+        "host": url.netloc,
+        "x-amz-checksum-sha256": checksum,
+    }
+    credential = signer.get_credential_string(credentials.access_key, now, bucket.region)
+    parameters = {
+        "X-Amz-Algorithm": signer.SIGN_V4_ALGORITHM,
+        "X-Amz-Credential": credential,
+        "X-Amz-Date": to_amz_date(now),
+        "X-Amz-Expires": str(expires_seconds),
+        "X-Amz-SignedHeaders": ";".join(signed),
+    }
+    query = "&".join(f"{name}={queryencode(value)}" for name, value in parameters.items())
+    header_lines = "".join(f"{name}:{value}\n" for name, value in signed.items())
+    canonical_request = (
+        f"PUT\n{url.path}\n{query}\n{header_lines}\n{';'.join(signed)}\nUNSIGNED-PAYLOAD"
+    )
+    scope = credential.removeprefix(f"{credentials.access_key}/")
+    request_hash = hashlib.sha256(canonical_request.encode()).hexdigest()
+    signature = signer.post_presign_v4(
+        f"{signer.SIGN_V4_ALGORITHM}\n{to_amz_date(now)}\n{scope}\n{request_hash}",
+        credentials.secret_key,
+        now,
+        bucket.region,
+    )
     headers = {"Content-Length": str(size_bytes), "x-amz-checksum-sha256": checksum}
-    signed = {**headers, "host": url.netloc}
-
-    now = bucket.client.now()
-    scope = signer._get_scope(now, region, "s3")
-    query = "&".join(
-        f"{name}={queryencode(value)}"
-        for name, value in {
-            "X-Amz-Algorithm": signer.SIGN_V4_ALGORITHM,
-            "X-Amz-Credential": f"{credentials.access_key}/{scope}",
-            "X-Amz-Date": to_amz_date(now),
-            "X-Amz-Expires": str(expires_seconds),
-            "X-Amz-SignedHeaders": ";".join(sorted(name.lower() for name in signed)),
-        }.items()
+    return PresignedPut(
+        f"{url._replace(query=query).geturl()}&X-Amz-Signature={signature}", headers
     )
-    unsigned = SplitResult(url.scheme, url.netloc, url.path, query, "")
-    canonical_request_hash, _ = signer._get_canonical_request_hash(
-        "PUT", unsigned, signed, UNSIGNED_PAYLOAD
-    )
-    signature = signer._get_signature(
-        signer._get_signing_key(credentials.secret_key, now, region, "s3"),
-        signer._get_string_to_sign(now, scope, canonical_request_hash),
-    )
-    return PresignedPut(f"{unsigned.geturl()}&X-Amz-Signature={signature}", headers)
 
 
 T = TypeVar("T")
@@ -118,8 +122,12 @@ class S3Store:
                 if not client.bucket_exists(bucket):
                     raise self.bucket.missing_error() from error
                 return None
-        assert stat.last_modified is not None, "S3 always sends it"
-        assert stat.size is not None
+        if (
+            stat.last_modified is None
+            or stat.size is None
+            or "content-length" not in (stat.metadata or {})
+        ):
+            raise self.bucket.incomplete_response_error(key)
         return ObjectInfo(key, stat.size, stat.last_modified.astimezone(UTC))
 
     def delete(self, key: str) -> None:
@@ -170,22 +178,22 @@ class S3Store:
         self.copy(source, target)
         self.delete(source)
 
-    def free_trash(self, least_free_bytes: int) -> int:
+    def free_trash(self, min_free_bytes: int) -> int:
         return 0  # the server's disk is not local; `_free_space_and_retry` handles a full one
 
     def read_note(self, name: str) -> bytes | None:
         try:
-            return self.get(_note(name))
+            return self.get(check_note_name(name))
         except NotFound:
             return None
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
         # Not every server supports conditional writes: the caller reads the note again.
         if replace or self.read_note(name) is None:
-            self.put(_note(name), data)
+            self.put(check_note_name(name), data)
 
     def delete_note(self, name: str) -> None:
-        self.delete(_note(name))
+        self.delete(check_note_name(name))
 
     def _free_space_and_retry(self, send: Callable[[], T]) -> T:
         """Call `send`; when the store is full, empty the trash and retry once."""
@@ -213,16 +221,8 @@ class S3Store:
         A full disk is not detected, because no object is written: in a bucket with versioning,
         each check would leave a version.
         """
-        client, bucket = self.bucket.client, self.bucket.name
         with self.bucket.translate_errors():
             # Checked first, because some servers create a missing bucket on a write.
-            if not client.bucket_exists(bucket):
+            if not self.bucket.client.bucket_exists(self.bucket.name):
                 raise self.bucket.missing_error()
-            upload_id = client._create_multipart_upload(bucket, PROBE_KEY, {})
-            client._abort_multipart_upload(bucket, PROBE_KEY, upload_id)
-
-
-def _note(name: str) -> str:
-    if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
-        raise ValueError(f"not the name of a note: {name!r}")
-    return name
+        MultipartUpload(self.bucket, PROBE_KEY).abort()

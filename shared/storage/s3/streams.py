@@ -10,7 +10,7 @@ import io
 import logging
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from minio.datatypes import Part
 from minio.error import S3Error
@@ -40,7 +40,10 @@ class S3Reader(io.RawIOBase):
         self._etag: str | None = None
         self._response: BaseHTTPResponse | None = self._request(0)
         self._etag = self._response.headers.get("etag")
-        self._size = int(self._response.headers["content-length"])
+        try:
+            self._size = int(self._response.headers["content-length"])
+        except (KeyError, ValueError):
+            raise bucket.incomplete_response_error(key) from None
 
     def readable(self) -> bool:
         return True
@@ -86,10 +89,7 @@ class S3Reader(io.RawIOBase):
         with self._bucket.translate_errors(self._key):
             data = self._response.read(requested)
         if len(data) < (requested if max_bytes is None else 1):
-            raise Unavailable(
-                "object_store_unavailable",
-                f"The object store at {self._bucket.endpoint} sent only a part of {self._key!r}.",
-            )
+            raise self._bucket.incomplete_response_error(self._key)
         self._position += len(data)
         return data
 
@@ -139,84 +139,101 @@ def read_range(bucket: Bucket, key: str, begin: int, size_bytes: int) -> bytes:
 PART_BYTES = 5 * 1024 * 1024
 
 
+class MultipartUpload:
+    """A multipart upload, sent part by part.
+
+    The client's public methods send parts only of a stream that they read themselves, but a writer
+    receives its data block by block. Hence the use of four private methods, all of them here, and
+    the narrow version range in pyproject.toml.
+    """
+
+    def __init__(self, bucket: Bucket, key: str) -> None:
+        """Start the upload. Raises as `Bucket.translate_errors` does, and so do all methods."""
+        self._bucket = bucket
+        self._key = key
+        self._parts: list[Part] = []
+        with bucket.translate_errors():
+            self._id = bucket.client._create_multipart_upload(bucket.name, key, {})
+
+    def send_part(self, data: bytes) -> None:
+        number = len(self._parts) + 1
+        with self._bucket.translate_errors():
+            etag = self._bucket.client._upload_part(
+                self._bucket.name, self._key, data, None, self._id, number
+            )
+        self._parts.append(Part(number, etag))
+
+    def complete(self) -> None:
+        with self._bucket.translate_errors():
+            result = self._bucket.client._complete_multipart_upload(
+                self._bucket.name, self._key, self._id, self._parts
+            )
+        if result.etag is None:
+            # S3 sends the status 200 before it is done; the body then reports an error.
+            raise Unavailable(
+                "object_store_unavailable",
+                f"The object store at {self._bucket.endpoint} could not complete a "
+                "multipart upload. Try again.",
+            )
+
+    def abort(self) -> None:
+        with self._bucket.translate_errors():
+            self._bucket.client._abort_multipart_upload(self._bucket.name, self._key, self._id)
+
+
 class S3Writer:
     """Sends an object as a multipart upload; one that fits into a single part, in one request.
 
     At most one part is in memory. The bucket's lifecycle rule removes the parts of a killed process
-    (`create_bucket`). The client's public multipart upload reads from a stream, but a writer
-    receives its data block by block: hence the use of private methods, and the narrow version
-    range in pyproject.toml.
+    (`create_bucket`).
     """
 
     def __init__(
-        self, bucket: Bucket, key: str, retry_when_full: Callable[[Callable[[], Any]], Any]
+        self, bucket: Bucket, key: str, retry_when_full: Callable[[Callable[[], None]], None]
     ) -> None:
         """`retry_when_full` calls its argument, and once more where it could free space."""
         self._bucket = bucket
         self._retry_when_full = retry_when_full
         self._key = key
         self._buffer = bytearray()
-        self._upload_id: str | None = None
-        self._parts: list[Part] = []
-        self._committed = False
+        self._upload: MultipartUpload | None = None
 
     def write(self, data: bytes) -> None:
         remaining = memoryview(data)
         while remaining:
             if len(self._buffer) == PART_BYTES:
-                self._send_part()
+                self._retry_when_full(self._send_part)
             free_bytes = PART_BYTES - len(self._buffer)
             self._buffer += remaining[:free_bytes]
             remaining = remaining[free_bytes:]
 
     def commit(self) -> None:
-        client, bucket = self._bucket.client, self._bucket.name
-        if self._upload_id is None:
-
-            def send() -> None:
-                with self._bucket.translate_errors():
-                    data = io.BytesIO(self._buffer)
-                    client.put_object(bucket, self._key, data, len(self._buffer))
-
-            self._retry_when_full(send)
+        if self._upload is None:
+            self._retry_when_full(self._send_whole)
         else:
-            self._send_part()
-            with self._bucket.translate_errors():
-                result = client._complete_multipart_upload(
-                    bucket, self._key, self._upload_id, self._parts
-                )
-            if result.etag is None:
-                # S3 sends the status 200 before it is done; the body then reports an error.
-                raise Unavailable(
-                    "object_store_unavailable",
-                    f"The object store at {self._bucket.endpoint} could not complete a "
-                    "multipart upload. Try again.",
-                )
-        self._committed = True
+            self._retry_when_full(self._send_part)
+            self._upload.complete()
+            self._upload = None
 
     def abort(self) -> None:
         self._buffer.clear()
-        if self._committed or self._upload_id is None:
+        upload, self._upload = self._upload, None
+        if upload is None:
             return
-        upload_id, self._upload_id = self._upload_id, None
         try:
-            with self._bucket.translate_errors():
-                self._bucket.client._abort_multipart_upload(self._bucket.name, self._key, upload_id)
+            upload.abort()
         except Unavailable as error:
             # They are not visible as an object, and the lifecycle rule removes them.
             log.warning("could not abort the multipart upload of %s: %s", self._key, error.detail)
 
+    def _send_whole(self) -> None:
+        with self._bucket.translate_errors():
+            self._bucket.client.put_object(
+                self._bucket.name, self._key, io.BytesIO(self._buffer), len(self._buffer)
+            )
+
     def _send_part(self) -> None:
-        client, bucket = self._bucket.client, self._bucket.name
-        number = len(self._parts) + 1
-
-        def send() -> str:
-            with self._bucket.translate_errors():
-                if self._upload_id is None:
-                    self._upload_id = client._create_multipart_upload(bucket, self._key, {})
-                return client._upload_part(
-                    bucket, self._key, bytes(self._buffer), None, self._upload_id, number
-                )
-
-        self._parts.append(Part(number, self._retry_when_full(send)))
+        if self._upload is None:
+            self._upload = MultipartUpload(self._bucket, self._key)
+        self._upload.send_part(bytes(self._buffer))
         self._buffer.clear()

@@ -114,8 +114,8 @@ def test_every_other_error_is_raised_at_once(catalog: Catalog, state: str) -> No
     with pytest.raises(DBAPIError) as caught:
         catalog.run(unit)
     assert runs == 1
-    told = to_unavailable(caught.value)
-    assert (told and told.code) == {
+    error = to_unavailable(caught.value)
+    assert (error and error.code) == {
         "23505": None,  # a bug, or the caller's business
         "55P03": "catalog_busy",
         "57014": "catalog_busy",
@@ -152,9 +152,9 @@ def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
     quick = catalog.with_timeouts(TransactionTimeouts(statement_seconds=0.2))
     with pytest.raises(OperationalError) as caught, quick.read() as session:
         session.execute(text("SELECT pg_sleep(30)"))
-    told = to_unavailable(caught.value)
-    assert told is not None
-    assert told.code == "catalog_busy"
+    error = to_unavailable(caught.value)
+    assert error is not None
+    assert error.code == "catalog_busy"
     with quick.read() as session:
         assert session.scalar(select(1)) == 1
 
@@ -165,6 +165,6 @@ def test_no_free_connection_is_told_within_the_configured_wait(catalog: Catalog)
             session.scalar(select(1))
         with pytest.raises(PoolTimeout) as caught, catalog.read() as one_too_many:
             one_too_many.scalar(select(1))
-    told = to_unavailable(caught.value)
-    assert told is not None
-    assert told.code == "catalog_busy"
+    error = to_unavailable(caught.value)
+    assert error is not None
+    assert error.code == "catalog_busy"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from uuid import UUID
 
-import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
@@ -15,15 +14,9 @@ from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.catalog.session import Catalog
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
-from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
 FILTERS = 25  # asked of each population of photos
-
-
-@pytest.fixture
-def map_id(catalog: Catalog) -> UUID:
-    with catalog.write() as session:
-        return add_map(session).id
 
 
 def store(
@@ -49,14 +42,14 @@ def store(
         return [PhotoFilterValues(*facts) for facts in found]
 
 
-def in_sql(catalog: Catalog, wanted: PhotoFilter) -> set[UUID]:
+def in_sql(catalog: Catalog, photo_filter: PhotoFilter) -> set[UUID]:
     with catalog.read() as session:
-        return set(session.scalars(select(Photo.id).where(*filter_conditions(wanted))))
+        return set(session.scalars(select(Photo.id).where(*filter_conditions(photo_filter))))
 
 
-def in_scan(photos: list[PhotoFilterValues], wanted: PhotoFilter) -> set[UUID]:
+def in_scan(photos: list[PhotoFilterValues], photo_filter: PhotoFilter) -> set[UUID]:
     columns = PhotoColumns.of(len(photos), enumerate(photos))
-    return set(columns.photo_id[build_row_mask(columns, wanted, ())])
+    return set(columns.photo_id[build_row_mask(columns, photo_filter, ())])
 
 
 def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_id: UUID) -> None:
@@ -71,13 +64,13 @@ def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_i
         drawn = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:30]]
         photos = store(catalog, map_id, drawn)
         for _ in range(FILTERS):
-            wanted = data.draw(photo_filters(photos))
-            sql, scan = in_sql(catalog, wanted), in_scan(photos, wanted)
+            photo_filter = data.draw(photo_filters(photos))
+            sql, scan = in_sql(catalog, photo_filter), in_scan(photos, photo_filter)
             for photo in photos:
-                expected = passes(photo, wanted)
+                expected = passes(photo, photo_filter)
                 if expected is None:
                     continue
-                here = (photo, wanted)
+                here = (photo, photo_filter)
                 assert (photo.photo_id in sql) == expected, here
                 findable = photo.role == PhotoRole.DATABASE
                 assert (photo.photo_id in scan) == (expected and findable), here

@@ -19,9 +19,8 @@ from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
 from shared.catalog.database_errors import to_unavailable
-from shared.catalog.file_checks import check_pages
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.schema import migrate
+from shared.catalog.schema import check_pages, migrate
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, StorageFull
@@ -99,7 +98,7 @@ def test_a_file_that_may_not_be_written_is_named(
     file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its permissions are not changed: to root they mean nothing."""
-    monkeypatch.setattr("shared.catalog.file_checks.os.access", lambda path, mode: False)
+    monkeypatch.setattr("shared.catalog.schema.os.access", lambda path, mode: False)
     with pytest.raises(Misconfigured, match="permissions") as caught:
         migrate(catalog)
     assert (caught.value.code, str(file) in caught.value.detail) == ("catalog_unreadable", True)
@@ -116,11 +115,11 @@ def test_a_large_catalog_is_read_whole_by_the_doctor_only(file: Path, catalog: C
 def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command: str) -> None:
     no_sqlite(file)
     done = run_command(command, env=environment(file.parent), cwd=file.parent)
-    said = done.stdout + done.stderr
+    output = done.stdout + done.stderr
     assert done.returncode == 1
-    assert str(file) in said
-    assert "placewise rebuild-catalog" in said
-    assert "Traceback" not in said
+    assert str(file) in output
+    assert "placewise rebuild-catalog" in output
+    assert "Traceback" not in output
 
 
 # --- while it runs ---------------------------------------------------------------------------
@@ -171,18 +170,18 @@ def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -
 def test_what_a_failing_disk_says_is_no_word_of_being_away() -> None:
     original = sqlite3.OperationalError("disk I/O error")
     original.sqlite_errorname = "SQLITE_IOERR_READ"
-    told = to_unavailable(OperationalError("SELECT 1", {}, original))
-    assert told is not None
-    assert (told.code, told.status) == ("catalog_io_error", 503)
-    assert "dmesg" in told.detail
+    error = to_unavailable(OperationalError("SELECT 1", {}, original))
+    assert error is not None
+    assert (error.code, error.status) == ("catalog_io_error", 503)
+    assert "dmesg" in error.detail
 
 
 def test_postgresql_without_room_is_full_and_not_away() -> None:
     class DiskFull(Exception):
         sqlstate = "53100"
 
-    told = to_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
-    assert isinstance(told, StorageFull)
+    error = to_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
+    assert isinstance(error, StorageFull)
 
 
 def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
@@ -195,7 +194,7 @@ def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
 
     event.listen(catalog.engine, "begin", full)
     usage = shutil._ntuple_diskusage(100, 100, 0)
-    monkeypatch.setattr("shared.catalog.file_checks.shutil.disk_usage", lambda folder: usage)
+    monkeypatch.setattr("shared.catalog.schema.shutil.disk_usage", lambda folder: usage)
     with pytest.raises(Misconfigured, match="Make room") as caught:
         migrate(catalog)
     assert caught.value.code == "disk_full"

@@ -123,8 +123,8 @@ def test_dinov2_is_described_with_weights_and_vocabulary_from_files(
     features = Dinov2("vits14", 11, "key", CPU, weights).features(
         torch.from_numpy(np.stack([pixels]))
     )
-    wanted = soft_vlad(features, torch.from_numpy(array), 1.0)
-    np.testing.assert_allclose(np.load(out), wanted, atol=1e-5)
+    reference = soft_vlad(features, torch.from_numpy(array), 1.0)
+    np.testing.assert_allclose(np.load(out), reference, atol=1e-5)
 
 
 def test_every_photo_that_cannot_be_described_is_named_and_nothing_is_written(
@@ -198,7 +198,7 @@ def test_interrupted_run_leaves_nothing_behind(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["--extractor", "anyloc-vits14", "--backbone", "dinov2_vits14"], "two_extractors", ""),
         (["--backbone", "dinov3"], "unknown_backbone", "dinov2_vits14"),
@@ -211,14 +211,14 @@ def test_interrupted_run_leaves_nothing_behind(
     ],
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused_before_anything_is_loaded(
-    photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str, said: str
+    photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str, message: str
 ) -> None:
     centres = tmp_path / "centres.npy"
     np.save(centres, np.eye(3, 16, dtype=np.float32))
     filled = [argument.format(centres=centres) for argument in arguments]
     problem = run_json(*photos, "--out", out, *filled, code=1)
     assert problem["code"] == code, problem
-    assert said in problem["detail"]
+    assert message in problem["detail"]
 
 
 def test_folder_that_is_not_there_is_named(photos: list[Path], tmp_path: Path) -> None:
@@ -256,10 +256,10 @@ def test_h5_file_holds_hlocs_global_features_by_name(
 ) -> None:
     features = out.with_suffix(".h5")
     run_json(*photos, "--out", features, "--root", tmp_path)
-    wanted = expected("test-tiny-avg", photos)
+    reference = expected("test-tiny-avg", photos)
     with h5py.File(features) as file:
         assert set(file) == {photo.name for photo in photos}
-        for photo, row in zip(photos, wanted, strict=True):
+        for photo, row in zip(photos, reference, strict=True):
             found = file[photo.name]["global_descriptor"]
             assert found.dtype == np.float32
             np.testing.assert_allclose(found[()], row, atol=1e-6)
@@ -276,6 +276,6 @@ def test_h5_file_holds_hlocs_global_features_by_name(
 def test_names_that_an_h5_file_can_not_hold_are_refused(
     photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str
 ) -> None:
-    said = {"photo": photos[0], "out": out.parent, "folder": tmp_path}
-    problem = run_json(*(argument.format(**said) for argument in arguments), code=1)
+    fields = {"photo": photos[0], "out": out.parent, "folder": tmp_path}
+    problem = run_json(*(argument.format(**fields) for argument in arguments), code=1)
     assert problem["code"] == code

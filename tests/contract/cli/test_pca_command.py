@@ -109,7 +109,7 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "arguments", "code", "said"),
+    ("rows", "arguments", "code", "message"),
     [
         (unit_rows(), ["--dimension", "17"], "pca_too_many_dimensions", "16"),
         (unit_rows(4), ["--dimension", "4"], "pca_too_few_rows", "there are 4"),
@@ -128,7 +128,7 @@ def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
     rows: NDArray[Any],
     arguments: list[str],
     code: str,
-    said: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("rows.npy", rows)
@@ -136,7 +136,7 @@ def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
     dimension = [] if "--dimension" in arguments else ["--dimension", "4"]
     problem = run("pca", "fit", "rows.npy", *arguments, *out, *dimension, code=1)
     assert problem["code"] == code, problem
-    assert said in problem["detail"]
+    assert message in problem["detail"]
     assert [path.name for path in tmp_path.iterdir()] == ["rows.npy"]
 
 

@@ -26,7 +26,8 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.folder import OWNER_MARK, FolderStore
+from shared.storage.folder import FolderStore
+from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 from shared.storage.s3 import Bucket, S3Store
@@ -117,9 +118,9 @@ def test_bucket_of_another_catalog_is_refused(
     started: Started, catalog: Catalog, other_catalog: Catalog, bucket: Bucket
 ) -> None:
     started(catalog, bucket)
-    said = refused(started, other_catalog, bucket, "bucket_taken")
-    assert bucket.name in said
-    assert "DATABASE_URL" in said
+    reported = refused(started, other_catalog, bucket, "bucket_taken")
+    assert bucket.name in reported
+    assert "DATABASE_URL" in reported
 
 
 def test_bucket_with_other_things_in_it_is_refused_and_left_alone(

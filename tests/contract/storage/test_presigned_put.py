@@ -108,8 +108,8 @@ def test_a_copy_stays_what_it_is(store: S3Store) -> None:
 
 def test_what_the_sender_said_of_the_bytes_is_not_copied(store: S3Store) -> None:
     put_here = presign(store)
-    said = {"Content-Type": "text/html", "Content-Encoding": "gzip"}
-    assert put(put_here.url, DATA, {**put_here.headers, **said}) == 200
+    fields = {"Content-Type": "text/html", "Content-Encoding": "gzip"}
+    assert put(put_here.url, DATA, {**put_here.headers, **fields}) == 200
     store.copy("incoming/a", "originals/a")
     copied = store.bucket.client.stat_object(store.bucket.name, "originals/a")
     assert copied.metadata is not None

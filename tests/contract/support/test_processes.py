@@ -18,6 +18,8 @@ from tests.support.processes import PLACEWISE, REPOSITORY, ForkedProcess, start
 from tests.support.server import environment, run_command
 from tests.support.servers.daemon import has_ended
 
+pytestmark = pytest.mark.servers
+
 SECONDS = 60.0
 
 

@@ -35,6 +35,8 @@ from tests.support.servers import (
 )
 from tests.support.servers.daemon import Daemon, has_ended
 
+pytestmark = pytest.mark.servers
+
 REPOSITORY = Path(__file__).parents[3]
 GONE_SECONDS = 20.0
 

@@ -75,8 +75,8 @@ def failed(service: Service, answer: httpx2.Response, code: str) -> str:
     return str(job["error"]["detail"])
 
 
-def switch(service: Service, map_name: str = "default", **wanted: Any) -> httpx2.Response:
-    return service("POST", "/generations", params={"map": map_name}, json=wanted)
+def switch(service: Service, map_name: str = "default", **params: Any) -> httpx2.Response:
+    return service("POST", "/generations", params={"map": map_name}, json=params)
 
 
 def keys(service: Service, prefix: str) -> list[str]:
@@ -105,23 +105,23 @@ def test_a_checkpoint_becomes_a_model_without_what_training_goes_on_with(service
     model = untrained()
     data = checkpoint_of(model, city="Genova", rate=float("nan"), long_text="a\x00b")
     result = done(service, send(service, data, licence="CC BY 4.0"))
-    said = service.json("GET", "/models/walks")
+    body = service.json("GET", "/models/walks")
     (stored,) = keys(service, MODELS)
     assert result == {
         "name": "walks",
         "extractor": "gsv:walks",
-        "fingerprint": said["fingerprint"],
+        "fingerprint": body["fingerprint"],
         "dimension": 128,
         "size_bytes": len(service.store.get(stored)),
         "already_there": False,
     }
-    assert stored.startswith(f"{MODELS}{said['sha256']}/")
+    assert stored.startswith(f"{MODELS}{body['sha256']}/")
     weights = module_fingerprint(model)[1]
     assert weights <= result["size_bytes"] < weights + 20_000 < len(data)
-    assert (said["licence"], said["note"], said["maps"]) == ("CC BY 4.0", None, [])
-    assert (said["image_size"], said["dimension"]) == (list(SIDES), 128)
-    assert said["config"]["agg_arch"] == "GeM"
-    assert said["about"] == {
+    assert (body["licence"], body["note"], body["maps"]) == ("CC BY 4.0", None, [])
+    assert (body["image_size"], body["dimension"]) == (list(SIDES), 128)
+    assert body["config"]["agg_arch"] == "GeM"
+    assert body["about"] == {
         "source": "best.ckpt",
         "lr": 0.0001,
         "city": "Genova",
@@ -130,7 +130,7 @@ def test_a_checkpoint_becomes_a_model_without_what_training_goes_on_with(service
         "epoch": 3,
         "global_step": 120,
     }
-    assert service.json("GET", "/models")["models"] == [said]
+    assert service.json("GET", "/models")["models"] == [body]
 
 
 def test_the_same_weights_again_are_fine_and_others_under_the_name_are_refused(
@@ -267,8 +267,8 @@ def test_a_map_is_described_as_the_model_itself_describes(walks: Service) -> Non
     walks.json("POST", "/maps", 201, json={"name": "new", "extractor": "gsv:walks"})
     walks.indexed(*range(PHOTOS), map_name="new")
     generation = active(walks, "new")
-    said = walks.json("GET", "/models/walks")
-    assert generation.spec["backbone_fingerprint"] == said["fingerprint"]
+    body = walks.json("GET", "/models/walks")
+    assert generation.spec["backbone_fingerprint"] == body["fingerprint"]
     assert generation.spec["preprocessing"] == {"name": "resize48x64", "version": 1}
     assert generation.spec["image_size"] == list(SIDES)
     assert generation.spec["normalisation"] == {"mean": list(MEAN), "std": list(STD)}
@@ -287,7 +287,7 @@ def test_a_map_is_described_as_the_model_itself_describes(walks: Service) -> Non
         )
         == PHOTOS
     )
-    assert said["maps"] == ["new"]
+    assert body["maps"] == ["new"]
 
 
 def test_a_map_switches_to_a_model_and_back_while_it_answers(walks: Service) -> None:
@@ -335,12 +335,12 @@ def test_photos_wait_for_a_model_that_is_not_there_yet(walks: Service) -> None:
         get_map(session, "default").extractor = "gsv:nights"
         session.execute(update(Generation).values(state="retired"))
     job_id = walks.upload(photo_bytes(9))["job_id"]
-    asked = walks.ask(photo_bytes(8))
+    response = walks.ask(photo_bytes(8))
     walks.drain()
     waits = walks.json("GET", f"/jobs/{job_id}")
     assert (waits["state"], waits["error"]["code"]) == ("queued", "model_missing")
-    told = walks.json("GET", f"/jobs/{asked}")
-    assert (told["state"], told["error"]["code"]) == ("failed", "model_missing")
+    body = walks.json("GET", f"/jobs/{response}")
+    assert (body["state"], body["error"]["code"]) == ("failed", "model_missing")
 
     done(walks, send(walks, some_checkpoint(1), "nights"))
     end_pauses(walks.catalog)

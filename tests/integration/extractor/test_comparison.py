@@ -39,10 +39,10 @@ from tests.integration.comparisons import (
     result,
     searches,
 )
+from tests.integration.extractor.small_gpu import make_too_heavy
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.small_gpu import make_too_heavy
 
 # tests/e2e/test_rerank_and_explain.py does the same on SQLite.
 pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
@@ -308,9 +308,9 @@ def test_candidate_that_the_gpu_can_not_hold_is_left_out_of_the_reranking_alone(
         *(pytest.approx(scores[one]) for one in ids(answer)[:3]),
         None,
     ]
-    (told,) = [text for text in caplog.messages if "is not compared" in text]
-    assert heavy in told
-    assert "The GPU ran out of memory" in told
+    (messages,) = [text for text in caplog.messages if "is not compared" in text]
+    assert heavy in messages
+    assert "The GPU ran out of memory" in messages
     assert jobs(service, "compare")[0]["state"] == "succeeded"
 
 

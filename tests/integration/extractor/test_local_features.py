@@ -17,7 +17,15 @@ from shared.catalog.maps import get_map
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.storage.keys import local_features_key
-from tests.integration.comparisons import column, compared, fit, ids, kept, lose_bytes, plain
+from tests.integration.comparisons import (
+    column,
+    compared,
+    feature_keys,
+    fit,
+    ids,
+    lose_bytes,
+    plain,
+)
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 
@@ -46,7 +54,7 @@ def keys(service: Service, photo_ids: list[str], map_name: str = "default") -> s
 def test_kept_features_give_the_same_scores_without_the_photos(service: Service) -> None:
     query = service.indexed(*range(5))[0]
     first = compared(service, query)
-    assert kept(service) == keys(service, ids(first)[:3]), "of what was reranked, no more"
+    assert feature_keys(service) == keys(service, ids(first)[:3]), "of what was reranked, no more"
     for photo_id in ids(first):
         lose_bytes(service, photo_id)
     again = compared(service, query)
@@ -57,7 +65,7 @@ def test_kept_features_give_the_same_scores_without_the_photos(service: Service)
 def test_damaged_features_are_made_anew(service: Service) -> None:
     query = service.indexed(0, 1)[0]
     first = compared(service, query)
-    (key,) = kept(service)
+    (key,) = feature_keys(service)
     whole = service.store.get(key)
     service.store.put(key, whole[:-7])
     assert column(compared(service, query), "rerank_score") == column(first, "rerank_score")
@@ -69,7 +77,7 @@ def test_kept_features_go_with_their_photo(service: Service) -> None:
     gone, stays = ids(compared(service, query))
     service.json("DELETE", f"/uploads/{gone}")
     collect_deleted_photos(service.catalog, service.store, 3600)
-    assert kept(service) == keys(service, [stays])
+    assert feature_keys(service) == keys(service, [stays])
 
 
 def test_kept_features_go_with_their_generation_and_with_their_map(service: Service) -> None:
@@ -78,17 +86,17 @@ def test_kept_features_go_with_their_generation_and_with_their_map(service: Serv
     fit(service, "words", clusters=4)
     compared(service, query, "words")
     of_first = keys(service, others, "words")
-    assert kept(service) == of_first
+    assert feature_keys(service) == of_first
     fit(service, "words", clusters=3)
     collect_ended_generations(service.catalog, service.store, 3600)
-    assert kept(service) == of_first, "in its grace it may still be compared"
+    assert feature_keys(service) == of_first, "in its grace it may still be compared"
     collect_ended_generations(service.catalog, service.store, -60)
-    assert kept(service) == set()
+    assert feature_keys(service) == set()
     compared(service, query, "words")
-    assert kept(service) == keys(service, others, "words")
+    assert feature_keys(service) == keys(service, others, "words")
     service.json("DELETE", "/maps/words")
     purge_deleted_maps(service.catalog, service.store)
-    assert kept(service) == set()
+    assert feature_keys(service) == set()
 
 
 def test_features_that_no_one_needs_are_orphans(service: Service) -> None:
@@ -102,7 +110,7 @@ def test_features_that_no_one_needs_are_orphans(service: Service) -> None:
     ):
         service.store.put(key, b"?")
     collect_orphans(service.catalog, service.store, -60)
-    assert kept(service) == keys(service, [stays])
+    assert feature_keys(service) == keys(service, [stays])
 
 
 def test_full_store_keeps_nothing_and_compares_all_the_same(
@@ -121,5 +129,5 @@ def test_full_store_keeps_nothing_and_compares_all_the_same(
     query = service.indexed(0, 1, 2)[0]
     monkeypatch.setattr(FolderStore, "put", put)
     assert None not in column(compared(service, query), "rerank_score")
-    assert kept(service) == set()
+    assert feature_keys(service) == set()
     assert plain(service, query)["total_similar"] == 2

@@ -36,7 +36,7 @@ from shared.storage.chunks import Rows, decode_rows, read_row
 from shared.storage.keys import WHITENINGS, WORK, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
-from tests.support.added import none_added
+from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_vocabulary_command.py does the same on SQLite.
@@ -158,12 +158,12 @@ def test_stored_rows_are_whitened_without_a_photo(
 
 
 def test_labelled_queries_are_projected_and_never_learnt_from(described: Workplace) -> None:
-    asked = sorted(described.rows())[:4]
+    searched = sorted(described.rows())[:4]
     with described.catalog.write() as session:
-        for photo_id in asked:
+        for photo_id in searched:
             session.get_one(Photo, photo_id).role = PhotoRole.QUERY
     before = described.rows()
-    expected = by_hand({one: row for one, row in before.items() if one not in asked})
+    expected = by_hand({one: row for one, row in before.items() if one not in searched})
     assert expected.sha256 != by_hand(before).sha256
 
     reduce(described)
@@ -171,7 +171,7 @@ def test_labelled_queries_are_projected_and_never_learnt_from(described: Workpla
     assert whitenings(described)[0].sha256 == expected.sha256
     assert whitenings(described)[0].rows == PHOTOS - 4
     rows = described.rows()
-    for photo_id in asked:
+    for photo_id in searched:
         assert same(rows[photo_id], projected(expected, before[photo_id]))
 
 
@@ -180,9 +180,9 @@ def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
     whitening = decode_whitening(reduced.store.get(stored.object_key)).whitening
     data = photo_bytes(50)
     expected = projected(whitening, expected_row("test-tiny-avg", data))
-    asked, (photo_id, _) = reduced.ask(data), reduced.upload_bytes(data)
+    response, (photo_id, _) = reduced.ask(data), reduced.upload_bytes(data)
     reduced.drain()
-    assert same(decode_rows(reduced.store.get(query_vector_key(asked)))[0], expected)
+    assert same(decode_rows(reduced.store.get(query_vector_key(response)))[0], expected)
     assert same(reduced.rows()[photo_id], expected)
 
 

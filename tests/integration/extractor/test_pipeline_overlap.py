@@ -15,10 +15,10 @@ from services.steward.tasks.maintenance import release_expired_leases
 from shared.descriptors.extractor import Extractor
 from shared.jobs import JobState
 from shared.storage import FolderStore
+from tests.integration.extractor.small_gpu import make_too_heavy
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
-from tests.support.small_gpu import make_too_heavy
 
 WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
@@ -48,9 +48,9 @@ class Gate:
         monkeypatch.setattr(Extractor, "describe", described)
         monkeypatch.setattr("services.extractor.worker.publish", published)
 
-    def await_seen(self, *wanted: str) -> None:
+    def await_seen(self, *expected: str) -> None:
         deadline = time.monotonic() + WAIT_SECONDS
-        while self.seen != list(wanted):
+        while self.seen != list(expected):
             assert time.monotonic() < deadline, self.seen
             time.sleep(0.01)
 

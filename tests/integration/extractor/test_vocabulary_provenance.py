@@ -30,8 +30,8 @@ def tiny_features() -> Provenance:
 def vocabulary_file(**provenance: Any) -> bytes:
     """Five centres in a file, learnt with the tiny features unless told otherwise."""
     centres = parse_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
-    said = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
-    return VocabularyFile(centres, said).encode()
+    fields = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
+    return VocabularyFile(centres, fields).encode()
 
 
 def import_file(workplace: Workplace, data: bytes, name: str) -> UUID:
@@ -113,8 +113,8 @@ def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace)
     first = vlads.active().vocabulary_id
     assert vlads.fit(**{**FIT, "seed": 1}).state == JobState.SUCCEEDED
     with vlads.catalog.write() as session:
-        kept = session.get_one(Vocabulary, first)
-        kept.provenance = {**kept.provenance, "backbone_fingerprint": "ef" * 32}
+        retained = session.get_one(Vocabulary, first)
+        retained.provenance = {**retained.provenance, "backbone_fingerprint": "ef" * 32}
     job = vlads.finish(vlads.start(JobKind.SWITCH, vocabulary_id=str(first)))
     assert job.state == JobState.FAILED
     assert job.error is not None

@@ -55,7 +55,7 @@ def make_service(
 @pytest.fixture
 def always_look(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 0.0)
-    monkeypatch.setattr(room_module, "POLL_COST_DIVISOR", 0.0)
+    monkeypatch.setattr("shared.jobs.queue_depth.POLL_COST_DIVISOR", 0.0)
 
 
 @pytest.fixture

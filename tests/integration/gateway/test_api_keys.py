@@ -110,7 +110,7 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
 
 
 @pytest.mark.parametrize(
-    "wanted",
+    "params",
     [
         {},
         {"name": "", "scopes": ["read"]},
@@ -122,6 +122,6 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
         {"name": "x", "scopes": ["read"], "key": "chosen"},
     ],
 )
-def test_a_key_that_can_not_be_made_is_refused(door: Door, wanted: dict[str, Any]) -> None:
-    problem(door(ADMIN, "POST", "/keys", json=wanted), 422, "invalid_field")
+def test_a_key_that_can_not_be_made_is_refused(door: Door, params: dict[str, Any]) -> None:
+    problem(door(ADMIN, "POST", "/keys", json=params), 422, "invalid_field")
     assert door(ADMIN, "GET", "/keys").json() == []

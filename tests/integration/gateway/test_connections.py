@@ -182,18 +182,18 @@ def test_a_trusted_proxy_has_any_number_of_connections_and_says_who_calls() -> N
 
 def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
     with serving(head_seconds=0.3) as server:
-        with server.connect() as silent, server.connect() as slow, server.connect() as kept:
+        with server.connect() as silent, server.connect() as slow, server.connect() as retained:
             slow.sendall(b"GET /whoami HT")
-            kept.sendall(ASK)
-            assert b"200 OK" in answer_of(kept)
+            retained.sendall(ASK)
+            assert b"200 OK" in answer_of(retained)
             assert read_to_the_end(silent) == b""
             answer = read_to_the_end(slow)
             assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
             assert b"request_too_slow" in answer
-            kept.sendall(ASK)
-            assert b"200 OK" in answer_of(kept), "a kept connection may rest between two calls"
-            kept.sendall(b"GET /")
-            assert b"408 Request Timeout" in read_to_the_end(kept), "not within one"
+            retained.sendall(ASK)
+            assert b"200 OK" in answer_of(retained), "a kept connection may rest between two calls"
+            retained.sendall(b"GET /")
+            assert b"408 Request Timeout" in read_to_the_end(retained), "not within one"
         assert server.connections.closed[Reason.SLOW_HEAD] == 3
         server.wait_for(lambda: server.connections.count == 0)
 

@@ -192,10 +192,10 @@ def test_two_callers_may_choose_the_same_key(door: Door) -> None:
 def test_an_upload_that_waited_is_answered_the_same(service: Service) -> None:
     wait = {"Prefer": "wait=30"}
     with ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(upload, service, photo_bytes(1), headers=wait)
-        while not asked.done():
+        searched = pool.submit(upload, service, photo_bytes(1), headers=wait)
+        while not searched.done():
             service.drain()
-        first = asked.result()
+        first = searched.result()
     assert first.status_code == 201, first.text
     again = upload(service, photo_bytes(1), headers=wait)
     same(first, again)

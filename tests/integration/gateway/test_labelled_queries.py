@@ -126,9 +126,9 @@ def test_a_role_is_said_at_upload_and_changed_later(service: Service) -> None:
     service.json("PATCH", f"/uploads/{turns}", json={"role": "query"})
     assert found() == {stays}
     assert counts() == (1, 1, 2)
-    asked = service.ask(photo_bytes(2))
+    response = service.ask(photo_bytes(2))
     service.drain()
-    answer = service.json("GET", f"/jobs/{asked}/result")
+    answer = service.json("GET", f"/jobs/{response}/result")
     assert [image["image_id"] for image in answer["similar_images"]] == [stays]
     service.json("PATCH", f"/uploads/{turns}", json={"role": None})  # null: as if never said
     assert found() == {stays, turns}
@@ -141,7 +141,7 @@ def test_a_role_is_said_at_upload_and_changed_later(service: Service) -> None:
 def test_a_new_photo_is_compared_with_what_its_own_filter_lets_pass(service: Service) -> None:
     """The filter waits with the job, and meets the map as it is when the answer is asked."""
     first, second = service.indexed(1, 2, captured_at="2024-05-06T07:08:09.123456+02:00")
-    asked = service.ask(
+    response = service.ask(
         near_copy(1),
         top_k=60,
         near="1,2,100",
@@ -152,7 +152,7 @@ def test_a_new_photo_is_compared_with_what_its_own_filter_lets_pass(service: Ser
     service.drain()
 
     def found() -> list[str]:
-        answer = service.json("GET", f"/jobs/{asked}/result")
+        answer = service.json("GET", f"/jobs/{response}/result")
         return [image["image_id"] for image in answer["similar_images"]]
 
     assert found() == []

@@ -41,8 +41,8 @@ from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.storage import FolderStore
 from shared.storage.keys import JOURNAL, TRASH
 from tests.integration.in_process_api import Service
-from tests.support.added import none_added
 from tests.support.catalog_rows import add_job, add_photo, read_job
+from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
@@ -135,7 +135,7 @@ def live_in(service: Service, name: str) -> None:
                 filename="sent.jpg",
                 size_bytes=1,
                 sha256="0" * 64,
-                said={},
+                photo_fields={},
                 expires_at=db_now_plus(3600),
             )
         )

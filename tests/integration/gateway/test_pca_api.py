@@ -65,8 +65,8 @@ def test_a_map_is_reduced_says_so_and_goes_back(vlad: Service) -> None:
     assert (about["dimension"], about["pca_from"], about["vocabulary"]) == (4, 32, "own")
 
     refused = post(vlad, "/generations", {"pca": 3})
-    said = problem(refused, 409, "already_reduced")
-    assert "placewise pca undo" in said["detail"]
+    body = problem(refused, 409, "already_reduced")
+    assert "placewise pca undo" in body["detail"]
 
     done(vlad, post(vlad, "/generations", {"vocabulary_id": reduced["vocabulary_id"]}))
     assert active(vlad)["spec"] == whole["spec"]

@@ -52,7 +52,7 @@ strict = pytest.mark.parametrize("store", ["s3"], indirect=True)
 
 
 def presign(
-    service: Service, photo: bytes = PHOTO, map_name: str = "default", **said: Any
+    service: Service, photo: bytes = PHOTO, map_name: str = "default", **fields: Any
 ) -> dict[str, Any]:
     """An announced upload."""
     file = {
@@ -61,7 +61,7 @@ def presign(
         "sha256": hashlib.sha256(photo).hexdigest(),
     }
     answer: dict[str, Any] = service.json(
-        "POST", "/uploads/presign", 201, params={"map": map_name}, json={**file, **said}
+        "POST", "/uploads/presign", 201, params={"map": map_name}, json={**file, **fields}
     )
     assert answer["method"] == "PUT"
     return answer
@@ -106,13 +106,13 @@ def test_the_urls_of_a_direct_upload_lead_to_its_map(service: Service) -> None:
 def test_a_photo_sent_straight_to_the_bucket_is_stored_described_and_found(
     service: Service, store: S3Store
 ) -> None:
-    said: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "latitude": 45.5,
         "longitude": 7.5,
         "tags": ["a", "b"],
         "metadata": {"n": 1},
     }
-    upload = presign(service, **said, captured_at="2026-05-01T12:00:00", heading=360)
+    upload = presign(service, **fields, captured_at="2026-05-01T12:00:00", heading=360)
     assert put(upload) == 200
     answer = complete(service, upload)
     assert answer.status_code == 202, answer.text
@@ -123,7 +123,7 @@ def test_a_photo_sent_straight_to_the_bucket_is_stored_described_and_found(
     service.drain()
     photo = service.json("GET", f"/uploads/{body['file_id']}")
     assert photo["searchable"]
-    assert {name: photo[name] for name in said} == said
+    assert {name: photo[name] for name in fields} == fields
     assert (photo["heading"], photo["captured_at"]) == (0, "2026-05-01T12:00:00Z")
     assert service("GET", f"/uploads/{body['file_id']}/image").content == PHOTO
     assert keys(store, "incoming/") == set()
@@ -274,9 +274,9 @@ def test_bytes_that_the_map_has_are_the_photo_that_it_has(service: Service, stor
 def test_what_was_not_completed_in_time_is_gone_and_collected(
     service: Service, store: S3Store, catalog: Catalog
 ) -> None:
-    upload, kept = presign(service), presign(service, photo_bytes(2))
+    upload, retained = presign(service), presign(service, photo_bytes(2))
     put(upload)
-    put(kept, photo_bytes(2))
+    put(retained, photo_bytes(2))
     with catalog.write() as session:
         session.execute(
             update(PresignedUpload)
@@ -286,9 +286,9 @@ def test_what_was_not_completed_in_time_is_gone_and_collected(
     problem(complete(service, upload), 410, "upload_expired")
     assert photos(catalog) == 0
     collect_direct_uploads(catalog, store)
-    assert keys(store) == {f"incoming/{kept['upload_id']}"}
+    assert keys(store) == {f"incoming/{retained['upload_id']}"}
     problem(complete(service, upload), 404, "upload_not_found")
-    assert complete(service, kept).status_code == 202
+    assert complete(service, retained).status_code == 202
 
 
 def test_orphans_under_incoming_go_and_what_is_awaited_stays(

@@ -96,8 +96,8 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call = Followed(service)
     for number in range(1, 5):
         photo = {"file": ("photo.jpg", photo_bytes(number))}
-        said = {"place": f"room {number // 2}", "captured_at": f"2026-01-0{number}T12:00:00Z"}
-        uploaded = call("upload", "POST", "/upload", files=photo, data=said)
+        fields = {"place": f"room {number // 2}", "captured_at": f"2026-01-0{number}T12:00:00Z"}
+        uploaded = call("upload", "POST", "/upload", files=photo, data=fields)
     fitted = call("fit_vocabulary", "POST", "/vocabularies", json={"clusters": 4})
     call.until_it_ends(fitted)
     file_id, job_id = uploaded["file_id"], uploaded["job_id"]
@@ -113,9 +113,9 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
 
     similar = call("similar_to_stored", "POST", f"/similarity/{file_id}")
     query = {"file": ("query.jpg", photo_bytes(5))}
-    asked = call("similar_to_upload", "POST", "/similarity", files=query)
-    call.until_it_ends(asked)
-    call("similarity_result", "GET", f"/jobs/{asked['job_id']}/result")
+    searched = call("similar_to_upload", "POST", "/similarity", files=query)
+    call.until_it_ends(searched)
+    call("similarity_result", "GET", f"/jobs/{searched['job_id']}/result")
     compared = call("similar_to_stored", "POST", f"/similarity/{file_id}", params={"rerank": 2})
     call.until_it_ends(compared)
 
@@ -130,8 +130,8 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
 
     file = {"file": ("it.npy", b"is looked at by the extractor")}
     call.cancel(call("import_vocabulary", "POST", "/vocabularies/import", files=file))
-    wanted = {"extractor": "test-tiny-avg"}
-    call.cancel(call("start_generation", "POST", "/generations", json=wanted))
+    params = {"extractor": "test-tiny-avg"}
+    call.cancel(call("start_generation", "POST", "/generations", json=params))
     call("add_model", "POST", "/models", files=file, data={"name": "one"})
     call("evaluate", "POST", "/evaluations")
     path = f"/generations/{similar['generation_id']}/word-weights"

@@ -79,8 +79,8 @@ def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
 
 
 def test_objects_are_written_read_and_deleted(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = check_object_store(Settings())
-    assert "wrote, read, listed and deleted" in said
+    reported = check_object_store(Settings())
+    assert "wrote, read, listed and deleted" in reported
     store = FolderStore(Settings().placewise_home / "objects", exclusive=False)
     assert list(store.list("")) == []
     monkeypatch.setattr(FolderStore, "read_range", lambda *_: b"all of it")

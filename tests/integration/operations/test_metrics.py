@@ -124,17 +124,17 @@ def test_a_gateway_tells_of_its_calls_by_route(service: Service) -> None:
     for _ in range(3):
         service("GET", f"/uploads/{file_id}")
     service("GET", "/nowhere/at-all")
-    told = read(service._client.get("/metrics").text)
-    requests = told["placewise_gateway_requests_total"]
+    text = read(service._client.get("/metrics").text)
+    requests = text["placewise_gateway_requests_total"]
     route = "/api/v1/uploads/{file_id}"
     assert requests[(("method", "GET"), ("route", route), ("status", "200"))] == 3
     assert requests[(("method", "GET"), ("route", "none"), ("status", "404"))] == 1
     assert not any(file_id in value for labels in requests for _, value in labels)
-    received = told["placewise_gateway_received_bytes_total"]
+    received = text["placewise_gateway_received_bytes_total"]
     assert received[(("route", "/api/v1/upload"),)] > len(photo_bytes(1))
-    count = told["placewise_gateway_request_seconds_count"]
+    count = text["placewise_gateway_request_seconds_count"]
     assert count[(("method", "GET"), ("route", route))] == 3
-    assert told["placewise_gateway_requests_under_way"][()] == 1, "the scrape itself"
+    assert text["placewise_gateway_requests_under_way"][()] == 1, "the scrape itself"
 
 
 def test_the_queue_is_counted_by_kind_and_state_with_the_age_of_its_oldest(

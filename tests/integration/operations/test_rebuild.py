@@ -105,7 +105,7 @@ def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
     write_journal(service.catalog, store)
     with service.catalog.write() as session:
         installation_id = get_or_create_installation(session).id
-    said = {file_id: photo(service, file_id, name) for file_id, name in left.items()}
+    fields = {file_id: photo(service, file_id, name) for file_id, name in left.items()}
     before = {file_id: answers(service, file_id, name) for file_id, name in left.items()}
     assert all(before.values())
 
@@ -116,7 +116,7 @@ def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
     assert (taken.maps, taken.photos, taken.queued_photos) == (2, 6, 0)
     assert taken.descriptors == 6
     assert taken.unnamed_photos == taken.lost_originals == 0
-    assert {file_id: photo(service, file_id, name) for file_id, name in left.items()} == said
+    assert {file_id: photo(service, file_id, name) for file_id, name in left.items()} == fields
     assert {file_id: answers(service, file_id, name) for file_id, name in left.items()} == before
     with service.catalog.read() as session:
         assert session.scalars(select(Installation.id)).one() == installation_id
@@ -295,7 +295,7 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     service.json("POST", "/maps", 201, json={"name": "later"})
     (elsewhere,) = service.indexed(4, map_name="later")
     write_journal(service.catalog, store)
-    said = {later: photo(service, later), first: photo(service, first)}
+    fields = {later: photo(service, later), first: photo(service, first)}
     before = {info.key for info in store.list("")}
 
     put_back(service.catalog, older)
@@ -312,7 +312,7 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     assert taken.changed_photos == 1
     assert catalog_lag(service.catalog, store) is None
     service.drain()
-    assert {id_: photo(service, id_) for id_ in said} == said
+    assert {id_: photo(service, id_) for id_ in fields} == fields
     assert [one["image_id"] for one in answers(service, first)] == [later]
     assert photo(service, elsewhere, "later")["searchable"]
     assert service("GET", f"/uploads/{second}").status_code == 404

@@ -28,8 +28,8 @@ def faults(report: IntegrityReport) -> set[tuple[str, str]]:
 
 def chunk_keys(service: Service) -> list[str]:
     with service.catalog.read() as session:
-        wanted = select(Chunk.object_key).where(Chunk.superseded_at.is_(None)).order_by(Chunk.id)
-        return list(session.scalars(wanted))
+        statement = select(Chunk.object_key).where(Chunk.superseded_at.is_(None)).order_by(Chunk.id)
+        return list(session.scalars(statement))
 
 
 def mend(service: Service, report: IntegrityReport) -> int:
@@ -60,8 +60,8 @@ def test_photos_of_a_damaged_chunk_are_described_again(service: Service, damage:
         service.store.delete(manifest)
         expected = ("missing", "manifest")
     else:
-        said = json.loads(service.store.get(manifest))
-        service.store.put(manifest, json.dumps({**said, "sha256": "0" * 64}).encode())
+        body = json.loads(service.store.get(manifest))
+        service.store.put(manifest, json.dumps({**body, "sha256": "0" * 64}).encode())
         expected = ("different", "manifest")
     report = looked(service)
     assert faults(report) == {expected}

@@ -57,8 +57,8 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
 ) -> None:
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     (lost,) = service.indexed(1)
-    asked, other = (*service.indexed(2), *service.indexed(3))
-    whole = similar(service, asked)
+    searched, other = (*service.indexed(2), *service.indexed(3))
+    whole = similar(service, searched)
     assert (whole["certificate"], whole["degraded"], whole["total_similar"]) == (
         "exhaustive",
         False,
@@ -72,7 +72,7 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
         service.store.put(key, data[:-1] + (b"x" if damage == "flipped" else b""))
 
     service = restarted(service)
-    found = similar(service, asked)
+    found = similar(service, searched)
     assert [image["image_id"] for image in found["similar_images"]] == [other]
     assert (found["degraded"], found["missing"]) == (True, [key])
     assert (found["certificate"], found["certified_k"]) == ("none", 0)
@@ -86,7 +86,7 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
     assert repair_descriptors(service.catalog, InProcessWakeups(), report) == 1
     service.drain()
     service.search.sync()
-    mended = similar(service, asked)
+    mended = similar(service, searched)
     assert mended["similar_images"] == whole["similar_images"]
     assert (mended["certificate"], mended["missing"]) == ("exhaustive", [])
     assert service.json("GET", "/health")["status"] == "healthy"
@@ -96,7 +96,7 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
 def test_a_search_is_answered_while_the_catalog_has_no_room_for_its_history(
     service: Service, caplog: pytest.LogCaptureFixture
 ) -> None:
-    asked, other = (*service.indexed(1), *service.indexed(2))
+    searched, other = (*service.indexed(1), *service.indexed(2))
 
     def full(*_: object) -> None:
         original = sqlite3.OperationalError("database or disk is full")
@@ -105,7 +105,7 @@ def test_a_search_is_answered_while_the_catalog_has_no_room_for_its_history(
 
     event.listen(Search, "before_insert", full)
     try:
-        found = similar(service, asked)
+        found = similar(service, searched)
     finally:
         event.remove(Search, "before_insert", full)
     assert [image["image_id"] for image in found["similar_images"]] == [other]

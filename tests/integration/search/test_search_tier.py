@@ -29,8 +29,8 @@ from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, encode_rows
-from tests.contract.search.test_search_backend import SmallMap, assert_answers, unit_rows
 from tests.support.search_tier import SearchServer, SearchTier
+from tests.support.small_map import SmallMap, assert_answers, unit_rows
 
 SLOTS = 7  # three shards have three, two and two of them
 BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth
@@ -152,14 +152,14 @@ def test_without_any_worker_search_is_unavailable(places: SmallMap, tier_of: Ope
 
 def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[SearchRequest]:
     """The worker never reaches the version that is asked for; what it was asked."""
-    asked: list[SearchRequest] = []
+    requests: list[SearchRequest] = []
 
     def search(request: SearchRequest) -> SearchResponse:
-        asked.append(request)
+        requests.append(request)
         raise Unavailable("search_behind", "Search has not caught up.")
 
     monkeypatch.setattr(server.worker, "search", search)
-    return asked
+    return requests
 
 
 def test_every_shard_answers_at_least_the_version_that_is_asked_for(
@@ -178,24 +178,24 @@ def test_of_a_replica_that_is_behind_the_other_one_answers(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(1, 2)
-    asked = behind(tier.servers[1][0], monkeypatch)
+    searched = behind(tier.servers[1][0], monkeypatch)
     for _ in range(10):
         response = ask(tier, places)
         assert response.missing == ()
         assert_answers(response, places.brute_force(VECTOR, 100))
-    assert asked, "the replica that is behind was never asked first"
+    assert searched, "the replica that is behind was never asked first"
 
 
 def test_a_shard_that_stays_behind_is_named_at_the_deadline(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(1, 1, search_timeout_seconds=0.5)
-    asked = behind(tier.servers[0][0], monkeypatch)
+    searched = behind(tier.servers[0][0], monkeypatch)
     started = time.monotonic()
     response = ask(tier, places)
     assert response.missing == ("shard 0/2",)
     assert response.hits
-    assert len(asked) > 2, "it was not asked again"
+    assert len(searched) > 2, "it was not asked again"
     assert time.monotonic() - started < 5
 
 
@@ -275,11 +275,11 @@ def test_a_damaged_query_row_of_another_shard_is_not_compared(
 
 def test_a_filter_is_applied_in_every_shard(places: SmallMap, tier_of: OpenTier) -> None:
     tier = tier_of(1, 1, 1)
-    wanted = tuple(list(places.rows)[::4])
-    response = ask(tier, places, photos=PhotoFilter(ids=wanted))
-    expected = [hit for hit in places.brute_force(VECTOR, 100) if hit[0] in wanted]
+    reference = tuple(list(places.rows)[::4])
+    response = ask(tier, places, photos=PhotoFilter(ids=reference))
+    expected = [hit for hit in places.brute_force(VECTOR, 100) if hit[0] in reference]
     assert_answers(response, expected)
-    assert response.rows_scanned == len(wanted)
+    assert response.rows_scanned == len(reference)
 
 
 def test_equal_scores_of_all_shards_come_in_the_order_of_the_photos(

@@ -215,8 +215,8 @@ def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
     job = fitted.job(job_id)
     assert (job.waiting_for, job.awaited) == (WaitingFor.SEARCH, ["stuck-a", "stuck-b"])
     assert fitted.generation(new_id).state == GenerationState.BUILDING
-    told = [record.message for record in caplog.records if "stuck-a, stuck-b" in record.message]
-    assert len(told) == 1, "once, not at every look"
+    messages = [record.message for record in caplog.records if "stuck-a, stuck-b" in record.message]
+    assert len(messages) == 1, "once, not at every look"
     fitted.cancel(job_id)
     assert (fitted.job(job_id).state, fitted.job(job_id).awaited) == (JobState.CANCELLED, None)
 

@@ -48,7 +48,7 @@ def upload_again(service: Service, data: bytes) -> Any:
 
 def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: Catalog) -> None:
     done = service.upload(photo_bytes(1))["job_id"]
-    asked = service.ask(near_copy(1))
+    response = service.ask(near_copy(1))
     service.drain()
     with catalog.write() as session:
         map_id = get_map(session, "default").id
@@ -57,7 +57,7 @@ def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: 
         ).id
     age_jobs(catalog, DAYS - 0.01)
     delete_old_jobs(catalog, DAYS)
-    assert jobs(catalog) == {done, asked, str(failed_fit)}
+    assert jobs(catalog) == {done, response, str(failed_fit)}
     age_jobs(catalog, DAYS + 0.01)
     recent = service.upload(photo_bytes(2))["job_id"]
     service.drain()

@@ -33,12 +33,16 @@ from shared.jobs import InProcessWakeups, Job, JobState
 from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
+from tests.integration.steward.webhook_receiver import (
+    Receiver,
+    certificate,
+    hanging_receiver,
+    receiving,
+)
 from tests.integration.workplace import Workplace
 from tests.support.archives import zip_of
-from tests.support.certificate import certificate
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.receiver import Receiver, hanging_receiver, receiving
 
 PHOTOS = 6
 
@@ -69,8 +73,8 @@ class Told:
         self.webhook = self.add("job.succeeded", "job.failed")
 
     def add(self, *events: str) -> dict[str, Any]:
-        wanted = {"url": self.receiver.url, "events": events}
-        made = self.door(ADMIN, "POST", "/webhooks", json=wanted)
+        params = {"url": self.receiver.url, "events": events}
+        made = self.door(ADMIN, "POST", "/webhooks", json=params)
         assert made.status_code == 201, made.text
         answer: dict[str, Any] = made.json()
         return answer
@@ -128,11 +132,11 @@ def test_a_described_photo_is_told_of_and_signed(told: Told) -> None:
     (message,) = told.receiver.messages
     assert message.path == "/hook?a=1"
     assert message.is_signed_with(told.webhook["secret"])
-    said = message.json()
-    assert said["type"] == "job.succeeded"
-    assert said["data"]["job_id"] == uploaded["job_id"]
-    assert said["data"]["file_id"] == uploaded["file_id"]
-    assert (said["data"]["kind"], said["data"]["map"]) == ("index", "default")
+    body = message.json()
+    assert body["type"] == "job.succeeded"
+    assert body["data"]["job_id"] == uploaded["job_id"]
+    assert body["data"]["file_id"] == uploaded["file_id"]
+    assert (body["data"]["kind"], body["data"]["map"]) == ("index", "default")
     (delivery,) = told.log()
     assert (delivery["state"], delivery["attempts"], delivery["last_status"]) == (
         "delivered",
@@ -351,11 +355,11 @@ def test_a_switched_generation_is_told_of_and_its_photos_are_not(
     assert vlads.fit().state == JobState.SUCCEEDED
     while told.send():
         pass
-    said = {message.json()["type"]: message.json()["data"] for message in told.receiver.messages}
+    body = {message.json()["type"]: message.json()["data"] for message in told.receiver.messages}
     assert len(told.receiver.messages) == 2, "one fit, one switch, and no reindex job"
-    assert said["job.succeeded"]["kind"] == "fit"
-    assert said["generation.switched"]["generation_id"] == str(vlads.active().id)
-    assert said["generation.switched"]["replaced_generation_id"] == str(before)
+    assert body["job.succeeded"]["kind"] == "fit"
+    assert body["generation.switched"]["generation_id"] == str(vlads.active().id)
+    assert body["generation.switched"]["replaced_generation_id"] == str(before)
 
 
 def test_a_deleted_webhook_is_told_nothing_more(told: Told) -> None:
@@ -399,8 +403,8 @@ def test_a_webhook_to_a_machine_of_our_own_is_refused(
     sqlite_catalog: Catalog, store: FolderStore, url: str
 ) -> None:
     door = Door(sqlite_catalog, store, Settings())
-    wanted = {"url": url, "events": ["job.failed"]}
-    field_refused(door(ADMIN, "POST", "/webhooks", json=wanted), "url")
+    params = {"url": url, "events": ["job.failed"]}
+    field_refused(door(ADMIN, "POST", "/webhooks", json=params), "url")
     assert door(ADMIN, "GET", "/webhooks").json() == []
 
 

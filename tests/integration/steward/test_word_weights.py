@@ -39,14 +39,14 @@ DEGREES_PER_M = math.degrees(1 / 6_371_008.8)
 Rows = NDArray[np.float32]
 
 
-def rows_of_places(places: int, views: int, told: bool, seed: int = 0) -> Rows:
+def rows_of_places(places: int, views: int, reported: bool, seed: int = 0) -> Rows:
     """VLAD-like rows, place by place. Two words are noise from photo to photo. With `told` the
     others show the place, faintly; else nothing does."""
     rng = np.random.default_rng(seed)
     own = np.repeat(rng.standard_normal((places, 2, WIDTH)), views, axis=0)
     noise = rng.standard_normal((places * views, WORDS, WIDTH))
     rows = noise.copy()
-    if told:
+    if reported:
         rows[:, :2] = own + 0.8 * noise[:, :2]
         rows[:, 2:] *= 2.0
     rows = rows.reshape(len(rows), -1)
@@ -76,14 +76,14 @@ class City:
         return evaluator.run_next(threading.Event())
 
     def start(self, **params: Any) -> UUID:
-        wanted = {"sample": TRIED, "seed": 0, "generation_id": str(self.generation_id)}
+        fields = {"sample": TRIED, "seed": 0, "generation_id": str(self.generation_id)}
         with self.catalog.write() as session:
             job = Job(
                 id=new_id(),
                 map_id=self.map_id,
                 kind=JobKind.WORD_WEIGHTS,
                 priority=Priority.EVALUATION,
-                params={**wanted, **params},
+                params={**fields, **params},
             )
             session.add(job)
         return job.id
@@ -147,7 +147,7 @@ def rooms(places: int, views: int = 3) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("spots", [street, rooms])
 def test_words_that_tell_places_apart_are_weighted_and_kept(city: City, spots: Any) -> None:
-    city.publish(rows_of_places(40, 3, told=True), spots(40))
+    city.publish(rows_of_places(40, 3, reported=True), spots(40))
     record = city.learn()
     assert record.outcome == Outcome.KEPT
     assert record.taught_by == ("coordinates" if spots is street else "places")
@@ -168,7 +168,7 @@ def test_words_that_tell_places_apart_are_weighted_and_kept(city: City, spots: A
 
 
 def test_weights_that_raise_nothing_are_not_kept(city: City) -> None:
-    city.publish(rows_of_places(40, 3, told=False), street(40))
+    city.publish(rows_of_places(40, 3, reported=False), street(40))
     record = city.learn()
     assert (record.outcome, record.applied, record.calibration) == (Outcome.NOT_KEPT, (), None)
     assert len(record.weights) == WORDS
@@ -176,7 +176,7 @@ def test_weights_that_raise_nothing_are_not_kept(city: City) -> None:
 
 
 def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
-    city.publish(rows_of_places(8, 3, told=True), street(8))
+    city.publish(rows_of_places(8, 3, reported=True), street(8))
     record = city.learn()
     assert (record.outcome, record.weights) == (Outcome.NOT_ENOUGH_PAIRS, ())
     assert record.near_pairs == 24
@@ -187,7 +187,7 @@ def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
 def test_a_burst_is_left_out_with_the_photo_that_is_tried(city: City) -> None:
     """Each place is a burst of three within 2 m, and three more 10 m on. A photo's burst is its
     twin: it would be found first in any case."""
-    rows = rows_of_places(40, 2, told=True)
+    rows = rows_of_places(40, 2, reported=True)
     spots = [
         {"latitude": (200 * place + 10 * view + twin) * DEGREES_PER_M, "longitude": 7.0}
         for place in range(40)
@@ -206,7 +206,7 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
     city: City, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for part in range(3):
-        city.publish(rows_of_places(40, 3, told=True)[part::3], [*street(40)][part::3])
+        city.publish(rows_of_places(40, 3, reported=True)[part::3], [*street(40)][part::3])
     first, again, other = (city.learn(seed=seed, sample=FEW) for seed in (0, 0, 1))
     assert first == again
     assert first.weights != other.weights
@@ -217,7 +217,7 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
 
 
 def test_chunks_merged_and_photos_deleted_since_change_no_row_of_another(city: City) -> None:
-    rows, spots = rows_of_places(40, 3, told=True), street(40)
+    rows, spots = rows_of_places(40, 3, reported=True), street(40)
     for begin in range(0, 120, 30):
         city.publish(rows[begin : begin + 30], spots[begin : begin + 30])
     before = city.learn(sample=FEW)
@@ -227,7 +227,7 @@ def test_chunks_merged_and_photos_deleted_since_change_no_row_of_another(city: C
 
 
 def test_rows_that_can_not_be_read_end_the_learning_and_keep_nothing(city: City) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     key = next(i.key for i in city.store.list("chunks/") if i.key.endswith(".npy"))
     city.store.put(key, city.store.get(key)[:-200])
     job_id = city.start()
@@ -284,13 +284,13 @@ def queued(city: City, word_weights: bool = True) -> str | None:
 def test_weights_are_learnt_by_themselves_after_the_evaluation_and_when_the_map_has_grown(
     city: City,
 ) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     assert queued(city) == JobKind.EVALUATE
     assert queued(city, word_weights=False) is None
     assert queued(city) == JobKind.WORD_WEIGHTS
     assert queued(city) is None
     more = [{**spot, "longitude": 8.0} for spot in street(20)]
-    city.publish(rows_of_places(20, 3, told=True, seed=1), more)
+    city.publish(rows_of_places(20, 3, reported=True, seed=1), more)
     assert queued(city) == JobKind.EVALUATE
     before = city.record()
     assert queued(city) == JobKind.WORD_WEIGHTS
@@ -303,7 +303,7 @@ def test_weights_are_learnt_by_themselves_after_the_evaluation_and_when_the_map_
 
 @pytest.mark.usefixtures("small_samples")
 def test_a_foreign_vocabulary_is_not_weighed_by_itself(city: City, service: Service) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     with service.catalog.write() as session:
         foreign = add_vocabulary(
             session,
@@ -323,7 +323,7 @@ def test_a_foreign_vocabulary_is_not_weighed_by_itself(city: City, service: Serv
 def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
     city: City,
 ) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     record = city.learn()
     assert queued(city) == JobKind.EVALUATE
     with city.catalog.read() as session:
@@ -345,7 +345,7 @@ def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
 
 
 def test_answers_rank_by_the_weights_and_say_so(city: City, service: Service) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     path = f"/similarity/{city.photos[7]}"
     before = service.json("POST", path, params={"top_k": 20})
     assert before["word_weights"] == "none"
@@ -354,8 +354,8 @@ def test_answers_rank_by_the_weights_and_say_so(city: City, service: Service) ->
     started = service.json("POST", f"/generations/{city.generation_id}/word-weights", 202, json={})
     assert city.work()
     assert service.json("GET", f"/jobs/{started['job_id']}")["result"]["outcome"] == "kept"
-    kept = service.json("GET", f"/generations/{city.generation_id}/word-weights")
-    assert (kept["outcome"], len(kept["weights"])) == ("kept", WORDS)
+    body = service.json("GET", f"/generations/{city.generation_id}/word-weights")
+    assert (body["outcome"], len(body["weights"])) == ("kept", WORDS)
 
     weighted = service.json("POST", path, params={"top_k": 20})
     assert weighted["word_weights"] == "applied"
@@ -375,7 +375,7 @@ def test_answers_rank_by_the_weights_and_say_so(city: City, service: Service) ->
 def test_the_least_score_is_of_the_plain_cosine_and_fills_up_the_answer(
     city: City, service: Service
 ) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     city.learn()
     path = f"/similarity/{city.photos[7]}"
     off = service.json("POST", path, params={"top_k": 40, "word_weights": False})
@@ -391,7 +391,7 @@ def test_the_least_score_is_of_the_plain_cosine_and_fills_up_the_answer(
 def test_the_estimate_is_judged_by_what_its_own_ranking_has_taught(
     city: City, service: Service
 ) -> None:
-    city.publish(rows_of_places(40, 3, told=True), street(40))
+    city.publish(rows_of_places(40, 3, reported=True), street(40))
     record = city.learn()
     assert record.calibration is not None
     threshold = f"{record.calibration.support_threshold:.4f}"

@@ -18,8 +18,14 @@ from services.trainer.arguments import build_arguments, load_yaml
 from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
-from tests.support.tiny_places import CITY, write_tiny_places
-from tests.support.train_runs import assert_same_weights, told, train, weights
+from tests.support.training_runs import (
+    CITY,
+    assert_same_weights,
+    run_arguments,
+    train,
+    weights,
+    write_tiny_places,
+)
 
 Json = dict[str, Any]
 
@@ -55,7 +61,7 @@ class StopAfter(NullDisplay):
 def whole(places: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Json]:
     """A run that nobody interrupted, its loggers and its test included."""
     out = tmp_path_factory.mktemp("whole")
-    said = told(places, out, experiment_phase="all", logger="csv,tensorboard")
+    said = run_arguments(places, out, experiment_phase="all", logger="csv,tensorboard")
     return out / "run", train(said)
 
 
@@ -110,7 +116,7 @@ def test_the_same_run_twice_gives_the_same_weights(
     whole: tuple[Path, Json], places: Path, tmp_path: Path
 ) -> None:
     folder, report = whole
-    again = train(told(places, tmp_path))
+    again = train(run_arguments(places, tmp_path))
     assert [epoch["loss"] for epoch in again["epochs"]] == [
         epoch["loss"] for epoch in report["epochs"]
     ]
@@ -130,7 +136,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     (name,) = report["sets"]
     display = StopAfter(stop, name if what == "places" else what, times)
     with pytest.raises(RunStopped):
-        run.run(build_arguments(told(places, tmp_path)), display, stop)
+        run.run(build_arguments(run_arguments(places, tmp_path)), display, stop)
     resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
     assert [epoch["figures"] for epoch in resumed["epochs"]] == [
         epoch["figures"] for epoch in report["epochs"]
@@ -138,6 +144,24 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     assert resumed["images"] == report["images"]
     assert_same_weights(folder / "checkpoints/last.ckpt", Path(resumed["last"]))
     assert_same_weights(Path(report["best"]["path"]), Path(resumed["best"]["path"]))
+
+
+def test_a_run_that_an_earlier_release_began_goes_on(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    """Lightning's Trainer wrote its checkpoint: random numbers in the state of a callback."""
+    stop = StopRequest()
+    with pytest.raises(RunStopped):
+        run.run(
+            build_arguments(run_arguments(places, tmp_path)), StopAfter(stop, "epoch 1", 2), stop
+        )
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    stored = torch.load(last, weights_only=True)
+    stored["callbacks"] = {"TrainingCallback": stored.pop("rng_state")}
+    del stored["MixedPrecision"]  # written with 16-mixed only
+    torch.save(stored, last)
+    resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
+    assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(resumed["last"]))
 
 
 def test_a_finished_run_learns_longer(whole: tuple[Path, Json], tmp_path: Path) -> None:
@@ -165,9 +189,11 @@ def test_frozen_layers_keep_their_weights_and_the_others_learn(
     places: Path, tmp_path: Path
 ) -> None:
     display = NullDisplay()
-    said = told(places, tmp_path, layers_to_freeze=0, max_steps=2)
+    said = run_arguments(places, tmp_path, layers_to_freeze=0, max_steps=2)
     report = train(said, display)
-    begun = train(told(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0"))
+    begun = train(
+        run_arguments(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0")
+    )
     before, after = weights(Path(begun["last"])), weights(Path(report["last"]))
     changed = {name for name in before if not torch.allclose(before[name], after[name])}
     assert changed
@@ -181,7 +207,7 @@ def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_pat
     broken = sorted((mine / "gsv_xs" / "train" / CITY).iterdir())[0]
     broken.write_bytes(broken.read_bytes()[:100])
     display = NullDisplay()
-    said = told(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
+    said = run_arguments(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
     report = train(said, display)
     assert list(report["bad_photos"]) == [str(broken)]
     assert report["images"] == 17
@@ -196,7 +222,9 @@ def test_a_checkpoint_alone_is_tested(
 ) -> None:
     _, trained = whole
     said = {
-        **told(places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]),
+        **run_arguments(
+            places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]
+        ),
     }
     del said["image_size"]  # the checkpoint knows it
     report = train(said)
@@ -208,7 +236,7 @@ def test_a_checkpoint_alone_is_tested(
 
 
 def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
-    train(told(places, tmp_path / "out", fast_dev_run=True, num_sanity_val_steps=1))
+    train(run_arguments(places, tmp_path / "out", fast_dev_run=True, num_sanity_val_steps=1))
     assert not (tmp_path / "out").exists()
 
 
@@ -232,13 +260,13 @@ def test_what_is_not_there_is_named_with_what_is_known(
     others: Json, code: str, said: str, places: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(PlacewiseError) as caught:
-        train(told(places, tmp_path, **others))
+        train(run_arguments(places, tmp_path, **others))
     assert caught.value.code == code
     assert said in caught.value.detail
 
 
 def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_path: Path) -> None:
-    said = told(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
+    said = run_arguments(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
     with pytest.raises(Unprocessable) as caught:
         train(said)
     assert caught.value.code in ("loss_not_finite", "features_not_finite")
@@ -247,7 +275,7 @@ def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_p
 def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_others(
     places: Path, tmp_path: Path
 ) -> None:
-    said = told(places, tmp_path, max_epochs=1)
+    said = run_arguments(places, tmp_path, max_epochs=1)
     del said["default_root_dir"], said["run_name"], said["agg_arch"]
     file = tmp_path / "grid.yaml"
     mixvpr = {"agg_arch": "MixVPR", "agg_config": {"nonsense": 1}}

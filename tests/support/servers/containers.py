@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 START_SECONDS = 180.0  # the first time, its image is fetched
 STOP_SECONDS = 60
 ASK_SECONDS = 3
-OLDEST_API = "1.44"  # said, so that making a client asks nothing yet
+OLDEST_API = "1.44"  # explicit, so that creating a client sends no request
 
 
 @functools.cache
@@ -103,5 +103,5 @@ class Container:
         self._container.reload()
         if self._container.status in ("created", "running"):
             return None
-        said: bytes = self._container.logs(tail=50)
-        return said.decode(errors="replace")
+        reported: bytes = self._container.logs(tail=50)
+        return reported.decode(errors="replace")

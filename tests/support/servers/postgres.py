@@ -29,7 +29,12 @@ HOW_TO_GET = (
 )
 # For databases that nobody kills. Without the second, a killed server forgets what it has committed
 # in the last half second: one that tests kill has PostgreSQL's own settings.
-FAST = {"fsync": "off", "synchronous_commit": "off", "full_page_writes": "off"}
+FAST = {
+    "fsync": "off",
+    "synchronous_commit": "off",
+    "full_page_writes": "off",
+    "autovacuum": "off",  # it would visit each test's database
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ HOW_TO_GET = (
 )
 ACCESS_KEY, SECRET_KEY = "placewise-tests", "a secret of the tests"
 TIMEOUT_SECONDS = 20.0  # long: where many tests run at once, an answer may take seconds
-# SeaweedFS makes files for each bucket, seven unless told otherwise; every test has its bucket.
+# SeaweedFS makes files for each bucket, seven by default; every test has its bucket.
 BUCKET_VOLUMES = 1
 VOLUMES = 2000
 
@@ -111,12 +111,14 @@ def _container() -> tuple[Container, int]:
     port = free_ports(1)[0]
     command = ["server", "-s3", "-s3.port=8333", "-master.telemetry=false"]
     command.append(f"-volume.max={VOLUMES}")
-    said = {
+    fields = {
         "AWS_ACCESS_KEY_ID": ACCESS_KEY,
         "AWS_SECRET_ACCESS_KEY": SECRET_KEY,
         "WEED_MASTER_VOLUME_GROWTH_COPY_1": str(BUCKET_VOLUMES),
     }
-    return Container("SeaweedFS", IMAGE, (8333, port), command, lambda: _answers(port), said), port
+    return Container(
+        "SeaweedFS", IMAGE, (8333, port), command, lambda: _answers(port), fields
+    ), port
 
 
 def _daemon() -> tuple[Daemon, int]:
@@ -149,7 +151,7 @@ def _answers(port: int) -> bool:
 
 
 def _stores(master: int) -> bool:
-    """Does the part that gives out volumes know the part that has them? It is told after start."""
+    """Whether a volume server has registered with the master, which happens after the start."""
     return b'"DataNodes"' in (_asked(f"http://127.0.0.1:{master}/dir/status") or b"")
 
 

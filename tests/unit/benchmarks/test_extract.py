@@ -85,7 +85,7 @@ def test_precisions_are_compared_on_the_photos_of_a_city() -> None:
     found = figures(report)
     assert 0.99 < found["patches, least cosine"] < found["patches, mean cosine"] < 1
     assert 0.99 < found["descriptors, least cosine"] < found["descriptors, mean cosine"] < 1
-    assert found["queries apart"] <= 2
+    assert found["difference of right queries"] <= 2
 
 
 @pytest.mark.parametrize(

@@ -9,44 +9,34 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.scale import Inputs, size_up
-from benchmarks.scale.inputs import Width
-from benchmarks.scale.limits import limits
-from benchmarks.scale.pages import amount, rounded
-from benchmarks.scale.plan import Plan, chunk_row_bytes
+from benchmarks.scale import PAGE, Sizing, format_amount, parse_assignments
 from services.cli.bench import app
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage.chunks import write_chunk
 from shared.storage.folder import FolderStore
 
-PAGE = Path(__file__).parents[3] / "docs" / "scale.md"
-
 runner = CliRunner()
 
 
-def plan_of(photos: int, dimension: int, **inputs: float) -> Plan:
-    found = Inputs().with_values(inputs)
-    width = next(width for width in Width.both(found) if width.dimension == dimension)
-    return Plan.of(photos, width, found)
+def plan_of(photos: int, dimension: int, **inputs: float) -> dict[str, float]:
+    return Sizing(inputs).evaluate(photos, dimension)[0]
 
 
 def test_page_has_the_tables_that_the_program_makes() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-    assert size_up([]).put_into(page) == page, (
+    assert Sizing({}).updated_page() == PAGE.read_text(encoding="utf-8"), (
         "run: placewise bench scale --markdown docs/scale.md, and read the text around the tables"
     )
 
 
 def test_page_with_another_price_is_another_page() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-    assert size_up(["price_gpu_hour=7"]).put_into(page) != page
+    assert Sizing({"price_gpu_hour": 7}).updated_page() != PAGE.read_text(encoding="utf-8")
 
 
 def test_page_without_a_place_for_a_table_is_refused() -> None:
     page = PAGE.read_text(encoding="utf-8").replace("<!-- end of limits -->", "")
     with pytest.raises(Misconfigured, match="end of limits"):
-        size_up([]).put_into(page)
+        Sizing({}, page)
 
 
 def test_a_plan_by_hand() -> None:
@@ -62,33 +52,23 @@ def test_a_plan_by_hand() -> None:
         queries_per_second=1,
         gpu_photos_per_second_98304=50,
     )
-    assert plan["a row in memory"] == 394_000
-    assert plan["rows in memory"] == 788e9  # two generations
-    assert plan["shards for memory"] == 16  # 788 GB in parts of 50 GB
-    assert plan["shards for time"] == 10  # 10 s in parts of one
+    assert plan["row_in_memory"] == 394_000
+    assert plan["rows_in_memory"] == 788e9  # two generations
+    assert plan["shards_for_memory"] == 16  # 788 GB in parts of 50 GB
+    assert plan["shards_for_time"] == 10  # 10 s in parts of one
     assert plan["shards"] == 16
-    assert plan["search workers"] == 48
-    assert plan["memory of one worker"] == pytest.approx(98.5e9)
-    assert plan["GPU time, once"] == 20_000
+    assert plan["search_workers"] == 48
+    assert plan["worker_memory"] == pytest.approx(98.5e9)
+    assert plan["gpu_time"] == 20_000
     assert plan["searches"] == 7_776_000
-    assert plan["together"] == pytest.approx(
-        sum(
-            plan[part]
-            for part in (
-                "extractors",
-                "search",
-                "objects kept",
-                "catalog",
-                "gateways, steward, Redis",
-            )
-        )
-    )
+    costs = ("extractor_cost", "search_cost", "object_cost", "catalog_cost", "other_cost")
+    assert plan["total_cost"] == pytest.approx(sum(plan[cost] for cost in costs))
 
 
 def test_an_extractor_is_as_fast_as_the_slower_of_gpu_and_decoding() -> None:
     slow_cpu = {"extractor_vcpus": 2, "pipeline_cpu_seconds": 0.1}
-    assert plan_of(1000, 98_304, **slow_cpu)["one extractor"] == 20
-    assert plan_of(1000, 98_304, gpu_photos_per_second_98304=3, **slow_cpu)["one extractor"] == 3
+    assert plan_of(1000, 98_304, **slow_cpu)["extractor_rate"] == 20
+    assert plan_of(1000, 98_304, gpu_photos_per_second_98304=3, **slow_cpu)["extractor_rate"] == 3
 
 
 def test_chunk_bytes_are_those_that_are_written(tmp_path: Path) -> None:
@@ -103,17 +83,18 @@ def test_chunk_bytes_are_those_that_are_written(tmp_path: Path) -> None:
     )
     assert written.rows == 1000
     on_disk = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
-    assert on_disk / 1000 == pytest.approx(chunk_row_bytes(64), rel=0.01)
+    assert on_disk / 1000 == pytest.approx(
+        4 * 64 + plan_of(1000, 7168)["chunks"] / 1000 - 4 * 7168, rel=0.01
+    )
 
 
 def test_limits_come_with_the_lowest_first_and_follow_the_inputs() -> None:
-    inputs = Inputs()
-    wide = Width.both(inputs)[1]
-    found = limits(wide, inputs)
-    assert [limit.photos for limit in found] == sorted(limit.photos for limit in found)
-    twice = {limit.what: limit for limit in limits(wide, inputs.with_values({"ram_used": 0.4}))}
-    memory = next(limit for limit in found if "one machine's memory" in limit.what)
-    assert twice[memory.what].photos == memory.photos / 2
+    found = Sizing({}).evaluate(1000, 98_304)[1]
+    order = [row[0] for row in Sizing({}).tables()["limits"][1:]]
+    assert [found[what] for what in order] == sorted(found.values())
+    half = Sizing({"ram_used": 0.4}).evaluate(1000, 98_304)[1]
+    what = "the rows exceed one machine's memory"
+    assert half[what] == found[what] / 2
 
 
 @pytest.mark.parametrize("given", ["price_gpu=2", "price_gpu_hour", "price_gpu_hour=no"])
@@ -123,24 +104,32 @@ def test_what_is_no_input_is_refused(given: str) -> None:
     assert json.loads(ended.output)["code"] == "unknown_input"
 
 
+def test_page_is_computed_from_its_own_inputs_only(tmp_path: Path) -> None:
+    page = tmp_path / "scale.md"
+    page.write_text(PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    ended = runner.invoke(app, ["scale", "--set", "ram_used=0.5", "--markdown", str(page)])
+    assert ended.exit_code == 2
+    assert runner.invoke(app, ["scale", "--markdown", str(page)]).exit_code == 0
+    assert page.read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
 def test_an_input_is_a_positive_number(value: str) -> None:
     with pytest.raises(Misconfigured, match="above 0"):
-        size_up([f"price_gpu_hour={value}"])
+        Sizing(parse_assignments([f"price_gpu_hour={value}"]))
 
 
-def test_json_has_inputs_plans_limits_and_scans() -> None:
+def test_json_has_inputs_plans_and_limits() -> None:
     ended = runner.invoke(app, ["scale", "--json", "--set", "price_gpu_hour=7"])
     assert ended.exit_code == 0
     found = json.loads(ended.output)
-    assert {"name": "price_gpu_hour", "value": 7.0}.items() <= found["inputs"][-5].items()
+    assert found["inputs"]["price_gpu_hour"] == 7
     assert {(plan["photos"], plan["dimensions"]) for plan in found["plans"]} == {
         (photos, dimensions)
         for photos in (10_000, 1_000_000, 100_000_000)
         for dimensions in (7168, 98_304)
     }
-    assert found["limits"]
-    assert found["scans"][0]["status"] == "today"
+    assert all(plan["limits"] for plan in found["plans"])
 
 
 @pytest.mark.parametrize(
@@ -151,17 +140,17 @@ def test_json_has_inputs_plans_limits_and_scans() -> None:
         (0.000_002_4, "s", "2.4 us"),
         (90, "s", "1.5 min"),
         (8000, "s", "2.22 h"),
-        (0, "B", "0 kB"),
+        (0, "B", "0 B"),
         (17.66, "/s", "17.7 /s"),
     ],
 )
 def test_amounts_have_three_digits_and_a_unit(value: float, unit: str, shown: str) -> None:
-    assert amount(value, unit) == shown
+    assert format_amount(value, unit) == shown
 
 
 @pytest.mark.parametrize(
     ("value", "shown"),
     [(0.0, "0"), (1000, "1,000"), (0.0116, "0.0116"), (45_678_901, "45,700,000")],
 )
-def test_rounded_keeps_three_digits(value: float, shown: str) -> None:
-    assert rounded(value) == shown
+def test_amount_without_a_unit_has_three_digits(value: float, shown: str) -> None:
+    assert format_amount(value) == shown

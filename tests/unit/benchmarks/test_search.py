@@ -197,10 +197,10 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
         )
         measure_growth(report, progress, sizes=[3000])
     figures = {figure.what: figure.measured for figure in report.figures}
-    assert figures["60 x 7,168: our answers that differ"] == 0
-    assert figures["load: wrong answers"] == figures["load: errors"] == 0
-    assert figures["load: answers"] > 0
-    assert figures["growth: scan of 3,000 codes, median"] > 0
+    assert figures["60 x 7,168: wrong results of Placewise"] == 0
+    assert figures["load: wrong results"] == figures["load: errors"] == 0
+    assert figures["load: results"] > 0
+    assert figures["growth: scan of 3,000 codes, p50"] > 0
     (comparison,) = report.details["comparisons"]
     assert len(comparison["rows"]) == 5 * 6
     exact = [row for row in comparison["rows"] if "Binary" not in row["method"]]
@@ -229,16 +229,16 @@ def test_a_wrong_answer_of_ours_is_a_missed_figure(
 
 
 def test_command_asks_for_what_its_options_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, object]] = []
+    requests: list[dict[str, object]] = []
 
     def fake(_progress: Progress, **options: object) -> Report:
-        asked.append(options)
+        requests.append(options)
         return Report("anything")
 
     monkeypatch.setattr("benchmarks.search.measure", fake)
     for arguments in ([], ["--long"], ["--photos", "5,3", "--load", "2"]):
         assert CliRunner().invoke(app, ["search", *arguments]).exit_code == 0
-    short, long, own = asked
+    short, long, own = requests
     assert (short["photos"], short["growth"], short["load_seconds"]) == ([2000], False, 0)
     assert short["dimensions"] == [512, 7168, 98_304]
     assert (long["photos"], long["growth"]) == ([1000, 5000, 10_000], True)

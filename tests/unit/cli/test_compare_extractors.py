@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import math
 
 import pytest
 
 from services.cli.evaluation.compare_extractors import ComparisonEntry, parse_entries
 from shared.errors import InvalidRequest
+from shared.evaluation.report.charts import percent_chart, render_chart
 from shared.evaluation.report.comparison import pareto_front
 
 
@@ -37,3 +39,18 @@ def test_front_holds_what_nothing_beats_in_price_and_worth() -> None:
 
 def test_equal_ones_are_both_on_the_front() -> None:
     assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True]
+
+
+def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:
+    def chart() -> str:
+        figure, axes = percent_chart("metres", "recall", x_ticks=(1, 10), log=True)
+        axes.plot([1, 10], [0.2, 0.8], label="all queries")
+        axes.legend()
+        return render_chart(figure, "Recall & more")
+
+    one = chart()
+    assert chart() == one
+    assert one.endswith('alt="Recall &amp; more">')
+    svg = base64.b64decode(one.partition("base64,")[2].partition('"')[0]).decode()
+    assert "all queries" in svg
+    assert "dc:date" not in svg

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from services.cli.datasets.commands import app
 from shared.datasets.open_dataset import open_evaluation_set
-from tests.support.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
+from tests.unit.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
 
 
 def called(*arguments: object, code: int = 0) -> str:
@@ -43,17 +43,17 @@ def whole_set(base: Path) -> None:
 
 def test_check_tells_what_is_there(tmp_path: Path) -> None:
     whole_set(tmp_path)
-    told = asked("check", tmp_path, "--decode")
-    assert told["layouts"] == ["gsv_xs", "database and queries folders"]
-    assert told["training"]["cities"] == {
+    reported = asked("check", tmp_path, "--decode")
+    assert reported["layouts"] == ["gsv_xs", "database and queries folders"]
+    assert reported["training"]["cities"] == {
         "osl": {"places": 1, "photos": 3},
         "trt": {"places": 1, "photos": 2},
     }
-    assert told["training"]["photos_per_place"] == {"least": 2, "median": 2.5, "most": 3}
-    (one,) = told["evaluation"]
+    assert reported["training"]["photos_per_place"] == {"least": 2, "median": 2.5, "most": 3}
+    (one,) = reported["evaluation"]
     assert (one["database"], one["queries"], one["queries_without_positives"]) == (3, 2, 1)
     assert one["fingerprint"] == open_evaluation_set(tmp_path).fingerprint
-    assert (told["decoded"], told["problems"]) == (True, [])
+    assert (reported["decoded"], reported["problems"]) == (True, [])
     printed = called("check", tmp_path)
     for part in ("5 photos of 2 places in 2 cities", "osl", one["fingerprint"][:12], "25 m"):
         assert part in printed
@@ -67,7 +67,9 @@ def test_check_names_photos_that_do_not_decode_with_their_count(tmp_path: Path) 
     assert asked("check", tmp_path)["problems"] == []
     (problem,) = asked("check", tmp_path, "--decode", code=1)["problems"]
     assert (problem["code"], problem["count"]) == ("undecodable_photo", 2)
-    assert all(str(path) in said for path, said in zip(broken, problem["examples"], strict=True))
+    assert all(
+        str(path) in reported for path, reported in zip(broken, problem["examples"], strict=True)
+    )
 
 
 def test_check_names_photos_that_are_listed_and_not_there(tmp_path: Path) -> None:
@@ -98,9 +100,9 @@ def test_check_names_what_stands_twice(tmp_path: Path) -> None:
 def test_check_goes_on_where_one_set_can_not_be_opened(tmp_path: Path) -> None:
     whole_set(tmp_path)
     save_names(tmp_path / "lost_dbImages.npy", ["a.jpg"])
-    told = asked("check", tmp_path, code=1)
-    assert [one["name"] for one in told["evaluation"]] == [tmp_path.name.replace("_", "")]
-    assert [problem["code"] for problem in told["problems"]] == ["bad_list"]
+    reported = asked("check", tmp_path, code=1)
+    assert [one["name"] for one in reported["evaluation"]] == [tmp_path.name.replace("_", "")]
+    assert [problem["code"] for problem in reported["problems"]] == ["bad_list"]
 
 
 def test_check_of_a_folder_of_nothing_says_so(tmp_path: Path) -> None:
@@ -122,11 +124,11 @@ def test_ground_truth_is_written_for_lists_of_every_kind(tmp_path: Path, kind: s
             case _:
                 write_csv(lists[role], ("path",), [(name,) for name in names])
     out = tmp_path / "gt.npy"
-    told = asked(
+    reported = asked(
         "ground-truth", "--database", lists["database"], "--queries", lists["queries"],
         "--radius", 25, "--out", out,
     )  # fmt: skip
-    assert (told["positives"], told["queries_without_positives"]) == (2, 1)
+    assert (reported["positives"], reported["queries_without_positives"]) == (2, 1)
     assert np.load(out, allow_pickle=True).tolist() == [[1, 2], []]
     assert json.loads((tmp_path / "gt.json").read_text())["rule"] == "radius 25 m"
 

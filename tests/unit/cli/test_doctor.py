@@ -49,10 +49,10 @@ def test_weights_that_fit_are_named_without_being_loaded(
     settings = settings_with(
         monkeypatch, DINO_MODEL="dinov2_vits14", DESC_LAYER="0", DINO_WEIGHTS=small
     )
-    said = check_extractor(settings)
-    assert "anyloc-vits14:layer=0" in said
-    assert str(small) in said
-    assert "GB) match" in said
+    reported = check_extractor(settings)
+    assert "anyloc-vits14:layer=0" in reported
+    assert str(small) in reported
+    assert "GB) match" in reported
 
 
 def test_weights_without_the_chosen_layer_are_found_out(
@@ -122,9 +122,9 @@ def pretend_gpu(monkeypatch: pytest.MonkeyPatch, total: int) -> None:
 
 def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_gpu(monkeypatch, 16 * GB)
-    said = check_memory(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
-    assert "anyloc-vitg14 requires about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in said
-    assert "the GPU has 16.0 GB" in said
+    reported = check_memory(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
+    assert "anyloc-vitg14 requires about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in reported
+    assert "the GPU has 16.0 GB" in reported
 
 
 def test_a_gpu_that_is_too_small_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

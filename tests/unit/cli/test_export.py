@@ -8,17 +8,24 @@ import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from uuid import NAMESPACE_URL, UUID, uuid5
 
 import numpy as np
 import pytest
 from rich.progress import Progress
 
+from placewise.client import Client
 from services.cli.export import PairNames, export_descriptors, export_geojson, export_pairs
-from shared.client import Client
 from shared.errors import Conflict, InvalidRequest, NotFound
+from tests.support.api_responses import (
+    GENERATION,
+    GENERATION_ID,
+    PHOTO,
+    PHOTO_ID,
+    SIMILAR,
+    STATS,
+)
 from tests.unit.client.test_client import FakeServer, running_server
-
-GENERATION = "01a1fca4-c1a2-7356-bf32-75e1cb64beb1"
 
 
 @pytest.fixture
@@ -35,20 +42,17 @@ def client(server: FakeServer) -> Iterator[Client]:
 
 def photo(name: str, role: str = "database", **about: Any) -> dict[str, Any]:
     return {
-        "image_id": f"id-{name}",
+        **PHOTO,
+        "image_id": str(photo_id(name)),
         "original_filename": name,
-        "upload_time": "2026-11-21T05:46:58Z",
-        "captured_at": None,
-        "heading": None,
         "latitude": None,
-        "longitude": None,
-        "place": None,
-        "tags": [],
-        "metadata": {},
         "role": role,
-        "image_url": "/image",
         **about,
     }
+
+
+def photo_id(name: str) -> UUID:
+    return uuid5(NAMESPACE_URL, name)
 
 
 def will_list(server: FakeServer, *photos: dict[str, Any]) -> None:
@@ -56,8 +60,9 @@ def will_list(server: FakeServer, *photos: dict[str, Any]) -> None:
 
 
 def will_find(server: FakeServer, *names: str, **estimate: Any) -> None:
-    images = [photo(name) for name in names]
-    server.will_answer(200, {"similar_images": images, "estimate": estimate})
+    images = [{**photo(name), "similarity_score": 0.5} for name in names]
+    estimate = {**SIMILAR["estimate"], **estimate}
+    server.will_answer(200, {**SIMILAR, "similar_images": images, "estimate": estimate})
 
 
 def refuse(server: FakeServer, code: str) -> None:
@@ -88,7 +93,7 @@ def test_a_map_without_queries_pairs_its_own_photos_and_passes_over_what_waits(
     will_find(server, "b.jpg")
     refuse(server, "not_searchable")
     text, report = pairs_of(client, PairNames.ID)
-    assert text == "id-a.jpg id-b.jpg\n"
+    assert text == f"{photo_id('a.jpg')} {photo_id('b.jpg')}\n"
     assert report["passed_over"] == 1
 
 
@@ -105,7 +110,7 @@ def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused(
 def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     server: FakeServer, client: Client
 ) -> None:
-    server.will_answer(200, {"total_images": 2})
+    server.will_answer(200, STATS)
     will_list(
         server,
         photo("a.jpg", latitude=45.5, longitude=7.25, tags=["é"]),
@@ -126,7 +131,7 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
 
 
 def test_geojson_of_an_empty_map_is_an_empty_collection(server: FakeServer, client: Client) -> None:
-    server.will_answer(200, {"total_images": 0})
+    server.will_answer(200, {**STATS, "total_images": 0})
     will_list(server)
     file = io.BytesIO()
     export_geojson(client, file, False, Progress(disable=True))
@@ -152,8 +157,8 @@ def test_descriptors_of_the_active_generation_can_be_mapped_into_memory(
     server.will_answer(
         200,
         [
-            {"generation_id": "other", "state": "building"},
-            {"generation_id": GENERATION, "state": "active"},
+            {**GENERATION, "generation_id": PHOTO_ID, "state": "building"},
+            GENERATION,
         ],
     )
     files = {
@@ -168,7 +173,7 @@ def test_descriptors_of_the_active_generation_can_be_mapped_into_memory(
     mapped = np.load(out / "descriptors.npy", mmap_mode="r")
     assert np.array_equal(mapped, rows)
     assert sorted(path.name for path in out.iterdir()) == sorted(files)
-    assert server.asked[1][1] == f"/api/v1/generations/{GENERATION}/descriptors"
+    assert server.asked[1][1] == f"/api/v1/generations/{GENERATION_ID}/descriptors"
 
 
 def test_a_refused_export_leaves_no_file(
@@ -176,7 +181,7 @@ def test_a_refused_export_leaves_no_file(
 ) -> None:
     server.will_answer(404, NotFound("generation_not_found", "None.").as_problem())
     with pytest.raises(NotFound):
-        export_descriptors(client, tmp_path, GENERATION, Progress(disable=True))
+        export_descriptors(client, tmp_path, GENERATION_ID, Progress(disable=True))
     assert list(tmp_path.iterdir()) == []
 
 

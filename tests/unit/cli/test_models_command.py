@@ -153,9 +153,9 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
     backbone = Dinov2("vits14", 0, "value", CPU)
     assert backbone.fingerprint == fetched["fingerprint"]
 
-    asked = len(server.asked)
+    count = len(server.requests)
     assert command("fetch", VITS) == fetched
-    assert len(server.asked) == asked, "what is here is not asked for again"
+    assert len(server.requests) == count, "a file that is present is not requested again"
 
 
 def test_an_interrupted_fetch_goes_on_where_it_ended(
@@ -165,10 +165,10 @@ def test_an_interrupted_fetch_goes_on_where_it_ended(
     server.break_after = [5_000_000]
     refused = command("fetch", VITS, exit_code=1)
     assert refused["code"] == "weights_missing"
-    server.asked.clear()
+    server.requests.clear()
     fetched = command("fetch", VITS)
     assert Path(fetched["path"]).read_bytes() == vits_weights
-    assert server.asked == [(VITS_FILE, "bytes=5000000-")]
+    assert server.requests == [(VITS_FILE, "bytes=5000000-")]
 
 
 def test_a_file_that_is_not_what_the_hub_promises_is_refused(
@@ -178,8 +178,8 @@ def test_a_file_that_is_not_what_the_hub_promises_is_refused(
     server.files[VITS_FILE] = vits_weights[:-4] + b"\0\0\0\0"
     refused = command("fetch", VITS, exit_code=1)
     assert refused["code"] == "download_corrupt"
-    kept = [p for p in (caches / "huggingface").rglob("*") if p.is_file()]
-    assert [p for p in kept if p.stat().st_size > 0] == []
+    retained = [p for p in (caches / "huggingface").rglob("*") if p.is_file()]
+    assert [p for p in retained if p.stat().st_size > 0] == []
     assert not listed("anyloc-vits14")["here"]
 
 
@@ -240,7 +240,7 @@ def test_weights_of_an_entry_come_by_a_download_that_goes_on(
     hubconf.write_text(hubconf.read_text().replace("http://127.0.0.1:9", server.url))
     fetched = command("fetch", f"torchhub:{folder}:from_network")
     assert fetched["here"]
-    assert server.asked == [("/weights.pth", None), ("/weights.pth", "bytes=10000-")]
+    assert server.requests == [("/weights.pth", None), ("/weights.pth", "bytes=10000-")]
     assert (caches / "torch" / "hub" / "checkpoints" / "weights.pth").exists()
 
 
@@ -273,9 +273,9 @@ def test_fetched_code_says_how_maps_may_use_it(caches: Path) -> None:
     name = f"torchhub:{write_hub(caches / 'hub', licence=None)}:colours"
     result = CliRunner().invoke(models.app, ["fetch", name])
     assert result.exit_code == 0, result.output
-    said = result.output.replace("\n", "")
-    assert f"TORCHHUB_ALLOWED={name}" in said
-    assert "Licence: none found" in said
+    reported = result.output.replace("\n", "")
+    assert f"TORCHHUB_ALLOWED={name}" in reported
+    assert "Licence: none found" in reported
 
 
 def test_an_extractor_for_tests_has_nothing_to_fetch() -> None:

@@ -55,7 +55,7 @@ def test_ground_truth_may_be_a_table_of_integers(tmp_path: Path, files: tuple[Pa
 
 
 @pytest.mark.parametrize(
-    ("array", "code", "said"),
+    ("array", "code", "message"),
     [
         (np.empty((0, 5), np.int64), "predictions_empty", "(0, 5)"),
         (np.empty((5, 0), np.int64), "predictions_empty", "(5, 0)"),
@@ -68,12 +68,12 @@ def test_ground_truth_may_be_a_table_of_integers(tmp_path: Path, files: tuple[Pa
     ],
 )
 def test_file_that_is_no_predictions_of_these_queries_is_refused(
-    tmp_path: Path, files: tuple[Path, Path], array: Any, code: str, said: str
+    tmp_path: Path, files: tuple[Path, Path], array: Any, code: str, message: str
 ) -> None:
     np.save(tmp_path / "bad.npy", array, allow_pickle=True)
     problem = run("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
     assert problem["code"] == code
-    assert said in problem["detail"]
+    assert message in problem["detail"]
 
 
 def test_text_is_no_predictions_file(tmp_path: Path, files: tuple[Path, Path]) -> None:
@@ -85,9 +85,9 @@ def test_text_is_no_predictions_file(tmp_path: Path, files: tuple[Path, Path]) -
 def lists(folder: Path, database: int = 6, queries: int = 5) -> list[object]:
     """Options that name both lists: one as an array, one as a text."""
     there = [f"database/@{500_000 + 10 * n}.00@4000000.00@32@T@.jpg" for n in range(database)]
-    asked = [f"queries/@{500_000 + 10 * n}.00@4000003.00@32@T@.jpg" for n in range(queries)]
+    requests = [f"queries/@{500_000 + 10 * n}.00@4000003.00@32@T@.jpg" for n in range(queries)]
     np.save(folder / "database.npy", np.array(there))
-    (folder / "queries.txt").write_text("\n".join(asked) + "\n")
+    (folder / "queries.txt").write_text("\n".join(requests) + "\n")
     return ["--database", folder / "database.npy", "--queries", folder / "queries.txt"]
 
 
@@ -132,10 +132,10 @@ def test_ground_truth_of_the_same_photos_in_another_order_is_refused(
 ) -> None:
     given = lists(tmp_path)
     names = np.load(tmp_path / "database.npy").tolist()
-    asked = (tmp_path / "queries.txt").read_text().splitlines()
+    text = (tmp_path / "queries.txt").read_text().splitlines()
     positives = [np.array(row, np.int64) for row in TRUTH]
     write_ground_truth(
-        tmp_path / "own.npy", positives, database=names, queries=asked, rule="radius 25 m"
+        tmp_path / "own.npy", positives, database=names, queries=text, rule="radius 25 m"
     )
     arguments = ["--predictions", files[0], "--ground-truth", tmp_path / "own.npy", *given]
     assert run(*arguments)["rule"] == "radius 25 m"

@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
+from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto, read_photo_manifest
-from services.cli.ingest.upload import JournalEntry, UploadJournal, upload_photos
-from shared.client import Client
+from services.cli.ingest.upload import upload_photos
+from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
 from shared.errors import InvalidRequest, NotFound
+from tests.support.api_responses import JOB, PHOTO_ID, STATS, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 
 TAKEN = JournalEntry("file", "job")
@@ -96,23 +98,20 @@ def test_a_run_that_was_broken_off_sends_only_the_rest(
 ) -> None:
     (tmp_path / "2.jpg").write_bytes(b"two")
     photos = [photo, LocalPhoto(tmp_path / "2.jpg", {})]
-    stats = {"searchable_images": 2, "vocabulary": "own", "total_images": 2}
-    ended = {"state": "succeeded", "error": None, "waiting_for": None}
-    uploaded = {"file_id": "two", "job_id": "j2", "already_there": False, "status": "queued"}
     with UploadJournal(path, server.url, None) as journal:
         journal.add(photo, TAKEN)
-    server.will_answer(200, stats)
-    server.will_answer(202, uploaded)
+    server.will_answer(200, STATS)
+    server.will_answer(202, UPLOADED)
     server.will_answer(404, NotFound("job_not_found", "Deleted.").as_problem())
-    server.will_answer(200, ended)
-    server.will_answer(200, stats)
+    server.will_answer(200, JOB)
+    server.will_answer(200, STATS)
     with Client(server.url) as client, UploadJournal(path, server.url, None) as journal:
         report = upload_photos(client, photos, False, Progress(disable=True), journal=journal)
     assert uploads(server) == 1
     assert (report["uploaded"], report["already_there"]) == (1, 1)
     assert report["refused"] == report["failed"] == []
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line.get("file_id") for line in lines] == [None, "file", "two"]
+    assert [line.get("file_id") for line in lines] == [None, "file", PHOTO_ID]
 
 
 def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:

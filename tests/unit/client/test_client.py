@@ -13,10 +13,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from uuid import UUID
 
 import pytest
 
-from shared.client import Client
+from placewise.client import Client
 from shared.errors import (
     Conflict,
     Gone,
@@ -31,6 +32,7 @@ from shared.errors import (
     Unprocessable,
     UnsupportedMedia,
 )
+from tests.support.api_responses import JOB, PHOTO_ID, SIMILAR, STARTED, STATS, UPLOADED
 
 
 class FakeServer(HTTPServer):
@@ -151,8 +153,8 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_said(
 ) -> None:
     photo = tmp_path / "street.jpg"
     photo.write_bytes(b"the photo's bytes")
-    server.will_answer(202, {"file_id": "abc"})
-    assert client.upload(photo, latitude=45.5, place=None) == {"file_id": "abc"}
+    server.will_answer(202, UPLOADED)
+    assert client.upload(photo, latitude=45.5, place=None).file_id == UUID(PHOTO_ID)
     method, path, body = server.asked[0]
     assert (method, path) == ("POST", "/api/v1/upload")
     assert b'filename="street.jpg"' in body
@@ -165,7 +167,7 @@ def test_upload_may_be_called_otherwise_than_its_file(
     server: FakeServer, client: Client, tmp_path: Path
 ) -> None:
     (tmp_path / "5f0e.jpg").write_bytes(b"bytes")
-    server.will_answer(202, {})
+    server.will_answer(202, UPLOADED)
     client.upload(tmp_path / "5f0e.jpg", filename="Piazza Castello.jpg")
     assert b'filename="Piazza Castello.jpg"' in server.asked[0][2]
 
@@ -188,11 +190,11 @@ def test_file_that_cannot_be_read_is_an_error_before_anything_is_sent(
 
 
 def test_map_is_named_in_every_call(server: FakeServer) -> None:
-    server.will_answer(200, {})
-    server.will_answer(200, {})
+    server.will_answer(200, STATS)
+    server.will_answer(200, {"images": [], "next_cursor": None})
     with Client(server.url + "/", map_name="lab") as client:
         client.stats()
-        client.search(filename="a b")
+        assert list(client.photos(filename="a b")) == []
     assert server.asked[0][1] == "/api/v1/database/stats?map=lab"
     assert "map=lab" in server.asked[1][1]
     assert "filename=a" in server.asked[1][1]
@@ -200,10 +202,10 @@ def test_map_is_named_in_every_call(server: FakeServer) -> None:
 
 def test_waiting_polls_until_the_job_has_ended(server: FakeServer, client: Client) -> None:
     for state in ("queued", "running", "succeeded"):
-        server.will_answer(200, {"state": state})
+        server.will_answer(200, {**JOB, "state": state})
     seen: list[str] = []
-    job = client.wait_for("abc", lambda found: seen.append(found["state"]))
-    assert job == {"state": "succeeded"}
+    job = client.wait("abc", on_progress=lambda found: seen.append(found.state))
+    assert job.as_json() == JOB
     assert seen == ["queued", "running", "succeeded"]
 
 
@@ -213,9 +215,10 @@ def test_query_that_takes_longer_is_fetched_when_its_job_has_ended(
     photo = tmp_path / "where.jpg"
     photo.write_bytes(b"bytes")
     server.will_answer(202, {"job_id": "abc", "result_url": "/api/v1/queries/abc/similar"})
-    server.will_answer(200, {"state": "succeeded"})
-    server.will_answer(200, {"similar_images": []})
-    assert client.similar_to_file(photo) == {"similar_images": []}
+    server.will_answer(200, JOB)
+    server.will_answer(200, SIMILAR)
+    assert client.similar(photo, wait_seconds=7).as_json() == SIMILAR
+    assert server.headers[0]["Prefer"] == "wait=7"
     assert [asked[1].split("?")[0] for asked in server.asked][1:] == [
         "/api/v1/jobs/abc",
         "/api/v1/queries/abc/similar",
@@ -237,8 +240,8 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     # The client's alone: threads that other tests have left go by the real one.
     own = SimpleNamespace(sleep=sleep, monotonic=lambda: clock[0])
-    monkeypatch.setattr("shared.client.wire.time", own)
-    monkeypatch.setattr("shared.client.sending.random", SimpleNamespace(uniform=lambda low, _: low))
+    monkeypatch.setattr("placewise.transport.time", own)
+    monkeypatch.setattr("placewise.protocol.random", SimpleNamespace(uniform=lambda low, _: low))
     return waits
 
 
@@ -262,9 +265,9 @@ def test_a_repeated_upload_sends_the_same_key_and_all_its_bytes_again(
     refuse(server, AWAY)
     refuse(server, StorageFull("disk_full", "Full.", retry_after_seconds=7))
     refuse(server, Conflict("idempotency_key_in_use", "Under way.", retry_after_seconds=1))
-    server.will_answer(202, {"file_id": "abc"})
+    server.will_answer(202, UPLOADED)
     with Client(server.url, patience_seconds=60) as client:
-        assert client.upload(photo) == {"file_id": "abc"}
+        assert client.upload(photo).as_json() == UPLOADED
     assert [photo.read_bytes() in body for _, _, body in server.asked] == [True] * 4
     keys = [headers.get("Idempotency-Key") for headers in server.headers]
     assert keys[0] is not None
@@ -275,8 +278,9 @@ def test_a_repeated_upload_sends_the_same_key_and_all_its_bytes_again(
 def test_each_call_has_a_key_of_its_own_and_only_what_makes_something_has_one(
     server: FakeServer, slept: list[float]
 ) -> None:
-    for _ in range(4):
-        server.will_answer(200, {})
+    deleted = {"success": True, "message": "", "deleted_file_id": PHOTO_ID}
+    for answer in (STARTED, STARTED, STATS, deleted):
+        server.will_answer(200, answer)
     with Client(server.url, patience_seconds=60) as client:
         client.evaluate()
         client.evaluate()
@@ -314,17 +318,17 @@ def test_a_server_that_says_when_to_come_again_is_obeyed_however_long(
     seen: list[tuple[str, float]] = []
     for seconds in (30, 60, 4000):
         refuse(server, TooManyRequests("queue_full", "Full.", retry_after_seconds=seconds))
-    server.will_answer(200, {"here": True})
+    server.will_answer(200, STATS)
     with Client(server.url) as client:
-        patient = client.patient(1, lambda error, seconds: seen.append((error.code, seconds)))
-        assert patient.stats() == {"here": True}
+        patient = client.with_patience(1, lambda error, seconds: seen.append((error.code, seconds)))
+        assert patient.stats().as_json() == STATS
     assert slept == [30, 60, 300]
     assert seen == [("queue_full", seconds) for seconds in slept]
 
 
 def test_a_proxys_retry_after_is_obeyed_too(server: FakeServer, slept: list[float]) -> None:
     refuse(server, AWAY, **{"Retry-After": "9"})
-    server.will_answer(200, {})
+    server.will_answer(200, STATS)
     with Client(server.url, patience_seconds=60) as client:
         client.stats()
     assert slept == [9]
@@ -363,9 +367,9 @@ def test_a_direct_upload_announces_sends_and_completes(
     )
     server.will_answer(503, b"<Error><Code>SlowDown</Code></Error>")
     server.will_answer(200, b"")
-    server.will_answer(202, {"file_id": "abc"})
+    server.will_answer(202, UPLOADED)
     with Client(server.url, map_name="lab", key="secret", patience_seconds=60) as client:
-        assert client.upload_direct(photo, latitude=45.5, place=None) == {"file_id": "abc"}
+        assert client.upload_direct(photo, latitude=45.5, place=None).as_json() == UPLOADED
     announced, *sent, completed = server.asked
     assert announced[1] == "/api/v1/uploads/presign?map=lab"
     assert json.loads(announced[2]) == {

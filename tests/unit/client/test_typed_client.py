@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from uuid import UUID
 
@@ -16,51 +18,13 @@ from pydantic import BaseModel
 import placewise
 from placewise import answers
 from services.gateway import schemas
-from services.gateway.routes import batches, evaluations, maps
+from services.gateway.routes import batches, evaluations, keys, maps, models
 from services.gateway.routes import stats as figures
 from services.gateway.routes import stats as history
+from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
 
-JOB = {
-    "job_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-    "kind": "index",
-    "state": "succeeded",
-    "stage": None,
-    "waiting_for": None,
-    "awaited": None,
-    "progress": {"done": 1, "total": 1, "failed": 0},
-    "attempts": 1,
-    "file_id": None,
-    "result": None,
-    "error": None,
-    "created_at": "2026-11-21T05:46:58Z",
-    "started_at": None,
-    "finished_at": None,
-    "status_url": "/api/v1/jobs/01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-    "result_url": None,
-    "request_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
-}
-PHOTO = {
-    "image_id": "01a1fca4-c1a2-7356-bf32-75e1cb64beb1",
-    "image_path": "/image",
-    "original_filename": "street.jpg",
-    "upload_time": "2026-11-21T05:46:58Z",
-    "file_size": 5,
-    "width": 4,
-    "height": 3,
-    "metadata": {},
-    "tags": ["a"],
-    "latitude": 45.5,
-    "longitude": None,
-    "heading": None,
-    "captured_at": None,
-    "place": None,
-    "role": "database",
-    "image_url": "/image",
-    "thumbnail_url": "/thumbnail",
-}
-STARTED = {"job_id": JOB["job_id"], "status": "queued", "status_url": "/", "result_url": None}
 SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Photo, schemas.PhotoResponse),
     (answers.OnePhoto, schemas.PhotoDetailResponse),
@@ -81,6 +45,12 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Search, history.SearchHistoryEntry),
     (answers.Map, maps.MapResponse),
     (answers.Stats, figures.StatsResponse),
+    (answers.WordWeights, evaluations.WordWeightsResponse),
+    (answers.DeletedMap, maps.DeletedMapResponse),
+    (answers.AddedModel, models.ModelResponse),
+    (answers.RemovedModel, models.RemovedModelResponse),
+    (answers.Key, keys.KeyResponse),
+    (answers.CreatedKey, keys.CreatedKeyResponse),
 ]
 
 
@@ -169,6 +139,66 @@ def test_waiting_raises_what_the_job_has_failed_of(server: FakeServer) -> None:
     assert seen == ["running", "failed"]
 
 
+def test_watching_a_job_shows_each_state_and_does_not_raise_its_failure(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Long polls of a job that waits for something return at once: it is polled with pauses."""
+    waits: list[float] = []
+    own = SimpleNamespace(sleep=waits.append, monotonic=time.monotonic)
+    monkeypatch.setattr("placewise.client.time", own)
+    server.will_answer(200, {**JOB, "state": "running"})
+    server.will_answer(200, {**JOB, "state": "queued", "waiting_for": "vocabulary"})
+    server.will_answer(200, {**JOB, "state": "cancelled"})
+    with placewise.connect(server.url) as places:
+        seen = list(places.watch(answers.Started(**STARTED), poll_seconds=2))
+    assert [job.state for job in seen] == ["running", "queued", "cancelled"]
+    assert "wait=2" in server.asked[0][1]
+    assert waits == [1.0]
+    with pytest.raises(placewise.Unprocessable) as caught:
+        seen[-1].raise_for_failure()
+    assert caught.value.code == "job_ended"
+
+
+def test_keys_are_created_with_the_limits_that_are_given(server: FakeServer) -> None:
+    limits = {"requests_per_minute": 60, "upload_bytes_per_day": None, "max_photos": None}
+    times = {"created_at": JOB["created_at"], "expires_at": None, "last_used_at": None}
+    key = {"id": JOB["job_id"], "name": "me", "prefix": "pw_1", "scopes": ["read"], **limits}
+    server.will_answer(201, {**key, **times, "revoked_at": None, "key": "pw_1secret"})
+    with placewise.connect(server.url) as places:
+        created = places.create_key("me", ["read"], days=None, requests_per_minute=60)
+    assert json.loads(server.asked[0][2]) == {
+        "name": "me",
+        "scopes": ["read"],
+        "requests_per_minute": 60,
+    }
+    assert (created.key, created.requests_per_minute) == ("pw_1secret", 60)
+
+
+def test_a_model_is_sent_with_its_name_and_the_progress_is_reported(
+    server: FakeServer, tmp_path: Path
+) -> None:
+    checkpoint = tmp_path / "best.ckpt"
+    checkpoint.write_bytes(b"w" * 300_000)
+    server.will_answer(202, STARTED)
+    sent: list[int] = []
+    with placewise.connect(server.url) as places:
+        places.add_model(checkpoint, "lab", licence="MIT", on_sent=sent.append)
+    method, path, body = server.asked[0]
+    assert (method, path) == ("POST", "/api/v1/models")
+    assert b'name="licence"' in body
+    assert b'name="note"' not in body
+    assert checkpoint.read_bytes() in body
+    assert sent == sorted(sent)
+    assert sent[-1] == 300_000
+
+
+def test_an_answer_is_given_back_as_the_server_sent_it(server: FakeServer) -> None:
+    sent = {**SIMILAR, "similar_images": [{**PHOTO, "similarity_score": 1.0}], "newer": [1]}
+    server.will_answer(200, sent)
+    with placewise.connect(server.url) as places:
+        assert places.similar(UUID(str(PHOTO["image_id"]))).as_json() == sent
+
+
 def test_waiting_ends_when_its_time_is_over(server: FakeServer) -> None:
     server.will_answer(200, {**JOB, "state": "running"})
     with placewise.connect(server.url) as places, pytest.raises(placewise.Unavailable) as caught:
@@ -179,18 +209,7 @@ def test_waiting_ends_when_its_time_is_over(server: FakeServer) -> None:
 def test_asynchronous_client_uploads_waits_and_lists(server: FakeServer, tmp_path: Path) -> None:
     path = tmp_path / "street.jpg"
     path.write_bytes(b"the photo's bytes" * 100_000)
-    uploaded = {
-        "file_id": PHOTO["image_id"],
-        "job_id": JOB["job_id"],
-        "filename": "street.jpg",
-        "file_size": 5,
-        "upload_time": "2026-11-21T05:46:58Z",
-        "status": "queued",
-        "status_url": "/",
-        "already_there": False,
-        "message": "",
-    }
-    server.will_answer(202, uploaded)
+    server.will_answer(202, UPLOADED)
     server.will_answer(200, JOB)
     server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
 

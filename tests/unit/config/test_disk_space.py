@@ -28,7 +28,7 @@ def test_the_reserve_is_freed_on_a_full_disk_and_written_again_once_there_is_roo
     tmp_path: Path, disk: SimpleNamespace
 ) -> None:
     reserve, file = DiskReserve(tmp_path, GIGABYTE // 2), tmp_path / "reserve.bin"
-    reserve.keep()
+    reserve.maintain()
     status = file.stat()
     assert (status.st_size, status.st_mode & 0o777) == (RESERVE_BYTES, 0o600)
     assert status.st_blocks * 512 >= RESERVE_BYTES, "a hole reserves nothing"
@@ -36,10 +36,10 @@ def test_the_reserve_is_freed_on_a_full_disk_and_written_again_once_there_is_roo
     reserve.release()
     assert not file.exists()
     disk.free = GIGABYTE // 2
-    reserve.keep()
+    reserve.maintain()
     assert not file.exists(), "uploads would be refused for it"
     disk.free += RESERVE_BYTES
-    reserve.keep()
+    reserve.maintain()
     assert file.exists()
 
 
@@ -50,7 +50,7 @@ def test_a_reserve_that_finds_no_room_leaves_nothing(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("shared.config.disk_space.os.posix_fallocate", full, raising=False)
-    DiskReserve(tmp_path, 0).keep()
+    DiskReserve(tmp_path, 0).maintain()
     assert list(tmp_path.iterdir()) == []
 
 

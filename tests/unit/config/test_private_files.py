@@ -79,8 +79,8 @@ def test_caches_are_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     describe.seconds, describe.photos = 0.0, 0  # type: ignore[attr-defined]
     (tmp_path / "photo.jpg").write_bytes(b"photo")
-    kept = CachedDescriber(describe, tmp_path / "rows", {}, max_bytes=10**9)  # type: ignore[arg-type]
-    list(kept([tmp_path / "photo.jpg"]))
+    retained = CachedDescriber(describe, tmp_path / "rows", {}, max_bytes=10**9)  # type: ignore[arg-type]
+    list(retained([tmp_path / "photo.jpg"]))
     store = FolderStore(tmp_path / "objects")
     store.put("chunks/a.npy", b"rows")
     monkeypatch.setattr(store, "file", lambda key: None)  # as a bucket

@@ -317,16 +317,16 @@ def test_torch_hub_entries_are_allowed_by_their_canonical_names(
     monkeypatch.setenv("TORCHHUB_ALLOWED", f" {HUB}:b=2,a=01\n{HUB} ")
     settings = Settings()
     assert settings.allowed_hub_extractors == (f"{HUB}:a=1,b=2", HUB)
-    assert settings.recipe(f"{HUB}:b=02,a=1").name == f"{HUB}:a=1,b=2"
+    assert settings.extractor_config(f"{HUB}:b=02,a=1").name == f"{HUB}:a=1,b=2"
     with pytest.raises(Misconfigured, match="TORCHHUB_ALLOWED") as caught:
-        settings.recipe(f"{HUB}:a=1")
+        settings.extractor_config(f"{HUB}:a=1")
     assert caught.value.code == "torchhub_not_allowed"
 
 
 def test_no_torch_hub_entry_is_allowed_unless_someone_says_so() -> None:
     assert Settings().allowed_hub_extractors == ()
     with pytest.raises(Misconfigured, match="not allowed here"):
-        Settings().recipe(HUB)
+        Settings().extractor_config(HUB)
 
 
 def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
@@ -334,7 +334,7 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
 ) -> None:
     monkeypatch.setenv("EXTRACTOR", f"{HUB}:a=01")
     assert Settings().allowed_hub_extractors == (f"{HUB}:a=1",)
-    assert Settings().recipe(f"{HUB}:a=1").hub is not None
+    assert Settings().extractor_config(f"{HUB}:a=1").hub is not None
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,16 @@ from scipy.io import savemat
 
 from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
-from tests.support.data_sets import utm_name, write_csv, write_photo, write_photos
-from tests.support.evaluation_sets import code_of, names, pair, rows
+from tests.unit.data_sets import (
+    code_of,
+    names,
+    pair,
+    rows,
+    utm_name,
+    write_csv,
+    write_photo,
+    write_photos,
+)
 
 
 def test_pair_of_folders_is_a_set_named_after_its_folder(tmp_path: Path) -> None:

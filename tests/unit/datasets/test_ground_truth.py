@@ -19,12 +19,12 @@ from shared.evaluation.recall import positives_within
 from shared.geodesy import distance_m
 
 
-def shot(**said: object) -> DatasetPhoto:
-    return DatasetPhoto(Path("photo.jpg"), "photo.jpg", **said)  # type: ignore[arg-type]
+def shot(**fields: object) -> DatasetPhoto:
+    return DatasetPhoto(Path("photo.jpg"), "photo.jpg", **fields)  # type: ignore[arg-type]
 
 
-def at(east: float, north: float, zone: str | None = None, **said: object) -> DatasetPhoto:
-    return shot(easting=east, northing=north, zone=zone, **said)
+def at(east: float, north: float, zone: str | None = None, **fields: object) -> DatasetPhoto:
+    return shot(easting=east, northing=north, zone=zone, **fields)
 
 
 def on_earth(latitude: float, longitude: float) -> DatasetPhoto:

@@ -187,10 +187,10 @@ def test_published_ground_truth_is_refused_where_it_can_not_belong(tmp_path: Pat
         assert caught.value.code == "ground_truth_of_other_lists"
 
 
-@pytest.mark.parametrize("said", ["", "[]", "{}", json.dumps({"database": 3, "rule": "x"})])
-def test_broken_word_of_what_it_belongs_to_is_no_permission(tmp_path: Path, said: str) -> None:
+@pytest.mark.parametrize("message", ["", "[]", "{}", json.dumps({"database": 3, "rule": "x"})])
+def test_broken_word_of_what_it_belongs_to_is_no_permission(tmp_path: Path, message: str) -> None:
     path = written(tmp_path)
-    path.with_suffix(".json").write_text(said)
+    path.with_suffix(".json").write_text(message)
     with pytest.raises(InvalidRequest) as caught:
         read_ground_truth(path, database=["a", "b", "c"], queries=["x", "y"])
     assert caught.value.code == "bad_ground_truth"

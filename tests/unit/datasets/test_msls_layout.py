@@ -10,8 +10,7 @@ import utm
 
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
-from tests.support.data_sets import write_csv, write_photos
-from tests.support.evaluation_sets import code_of, names, rows
+from tests.unit.data_sets import code_of, names, rows, write_csv, write_photos
 
 
 def msls_city(folder: Path, photos: list[dict[str, Any]]) -> None:

@@ -10,8 +10,16 @@ import pytest
 from shared.datasets.ground_truth_files import write_ground_truth
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.errors import InvalidRequest
-from tests.support.data_sets import save_lists, save_names, utm_name, write_photos
-from tests.support.evaluation_sets import code_of, names, pair, rows
+from tests.unit.data_sets import (
+    code_of,
+    names,
+    pair,
+    rows,
+    save_lists,
+    save_names,
+    utm_name,
+    write_photos,
+)
 
 
 def npy_set(base: Path, end: str = "_gtImages") -> tuple[list[str], list[str]]:

@@ -9,7 +9,7 @@ import pytest
 
 from shared.datasets.open_dataset import TrainingSet, open_training_set
 from shared.errors import InvalidRequest, NotFound, PlacewiseError
-from tests.support.data_sets import utm_name, write_csv, write_photo, write_photos
+from tests.unit.data_sets import utm_name, write_csv, write_photo, write_photos
 
 GSV_XS = ("place_id", "class_name", "UTMx", "UTMy", "filename")
 GSV_CITIES = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")

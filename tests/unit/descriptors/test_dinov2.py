@@ -21,11 +21,10 @@ from tests.support.vit import (
     SIDE,
     SWIGLU,
     WITH_REGISTERS,
-    bicubic_weights,
-    plain_forward,
     random_weights,
     save,
 )
+from tests.unit.descriptors.dinov2_reference import bicubic_weights, plain_forward
 
 CPU = torch.device("cpu")
 NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU, "registers": WITH_REGISTERS}
@@ -71,9 +70,9 @@ def test_features_are_those_of_a_whole_forward_pass(
         backbone = load(files[network], shape, layer, facet)
         features = backbone.features(torch.from_numpy(photos(*size)))
         assert features.dtype == torch.float32
-        wanted = expected(network, size)[layer][facet]
-        assert features.shape == wanted.shape
-        np.testing.assert_allclose(features, wanted, atol=2e-5, err_msg=f"layer {layer}")
+        reference = expected(network, size)[layer][facet]
+        assert features.shape == reference.shape
+        np.testing.assert_allclose(features, reference, atol=2e-5, err_msg=f"layer {layer}")
 
 
 @pytest.mark.parametrize("size", SHAPES)
@@ -86,9 +85,9 @@ def test_features_of_each_published_depth_are_those_of_a_whole_forward_pass(
     shape = replace(published, width=4 * published.heads)
     weights = random_weights(shape)
     file = save(weights, tmp_path / "weights.pth")
-    wanted = plain_forward(weights, shape, photos(70, 98))[layer]["value"]
+    reference = plain_forward(weights, shape, photos(70, 98))[layer]["value"]
     features = load(file, shape, layer, "value").features(torch.from_numpy(photos(70, 98)))
-    np.testing.assert_allclose(features, wanted, atol=CLOSE)
+    np.testing.assert_allclose(features, reference, atol=CLOSE)
 
 
 def test_features_of_the_whole_vits14_are_those_of_a_whole_forward_pass(tmp_path: Path) -> None:
@@ -96,12 +95,12 @@ def test_features_of_the_whole_vits14_are_those_of_a_whole_forward_pass(tmp_path
     shape = SHAPES["vits14"]
     weights = random_weights(shape)
     file = save(weights, tmp_path / "weights.pth")
-    wanted = plain_forward(weights, shape, photos(224, 224)[:1])
+    reference = plain_forward(weights, shape, photos(224, 224)[:1])
     for layer, facet in ((10, "value"), (11, "token")):
         backbone = Dinov2("vits14", layer, facet, CPU, file)
         features = backbone.features(torch.from_numpy(photos(224, 224)[:1]))
         assert tuple(features.shape) == (1, 256, 384)
-        np.testing.assert_allclose(features, wanted[layer][facet], atol=CLOSE)
+        np.testing.assert_allclose(features, reference[layer][facet], atol=CLOSE)
 
 
 def test_pixels_between_whole_numbers_are_not_rounded(files: dict[str, Path]) -> None:
@@ -110,8 +109,8 @@ def test_pixels_between_whole_numbers_are_not_rounded(files: dict[str, Path]) ->
     whole = torch.from_numpy(photos(126, 70))
     np.testing.assert_array_equal(backbone.features(whole.float()), backbone.features(whole))
     between = whole.float() + 0.4
-    wanted = plain_forward(random_weights(PLAIN), PLAIN, between.numpy())[1]["value"]
-    np.testing.assert_allclose(backbone.features(between), wanted, atol=2e-5)
+    reference = plain_forward(random_weights(PLAIN), PLAIN, between.numpy())[1]["value"]
+    np.testing.assert_allclose(backbone.features(between), reference, atol=2e-5)
     assert float((backbone.features(between) - backbone.features(whole)).abs().max()) > 1e-4
 
 

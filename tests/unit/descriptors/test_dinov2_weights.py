@@ -130,37 +130,38 @@ def test_a_file_may_go_once_it_is_loaded(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_refused_with_three_ways_to_get_it(tmp_path: Path) -> None:
-    said = refusal(tmp_path / "gone.pth", "weights_missing")
-    assert f"DINO_WEIGHTS={tmp_path / 'gone.pth'} does not exist" in said
+    reported = refusal(tmp_path / "gone.pth", "weights_missing")
+    assert f"DINO_WEIGHTS={tmp_path / 'gone.pth'} does not exist" in reported
     assert "is not a file" in refusal(tmp_path, "weights_missing")
 
 
 def test_nothing_is_random_when_a_tensor_is_missing(tmp_path: Path) -> None:
     weights = random_weights(PLAIN)
     del weights["blocks.1.ls2.gamma"]
-    said = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
     assert (
-        "w.pth can't be used for dinov2-vits14: it has no tensor blocks.1.ls2.gamma (32,)" in said
+        "w.pth can't be used for dinov2-vits14: it has no tensor blocks.1.ls2.gamma (32,)"
+        in reported
     )
 
 
 def test_many_missing_tensors_are_counted(tmp_path: Path) -> None:
-    said = refusal(save(random_weights(PLAIN, blocks=1), tmp_path / "w.pth"), "weights_unfit")
-    assert "blocks.1.norm1.weight (32,)" in said
-    assert "and 15 more" in said
+    reported = refusal(save(random_weights(PLAIN, blocks=1), tmp_path / "w.pth"), "weights_unfit")
+    assert "blocks.1.norm1.weight (32,)" in reported
+    assert "and 15 more" in reported
 
 
 def test_a_wrong_shape_is_named_with_the_one_expected(tmp_path: Path) -> None:
     weights = random_weights(PLAIN)
     weights["pos_embed"] = weights["pos_embed"][:, :257].clone()
-    said = refusal(save(weights, tmp_path / "w.safetensors"), "weights_unfit")
-    assert "pos_embed is (1, 257, 32), expected (1, 1370, 32)" in said
+    reported = refusal(save(weights, tmp_path / "w.safetensors"), "weights_unfit")
+    assert "pos_embed is (1, 257, 32), expected (1, 1370, 32)" in reported
 
 
 def test_weights_of_another_size_are_recognised(tmp_path: Path) -> None:
     base = {"cls_token": torch.zeros(1, 1, 768)}
-    said = refusal(save(base, tmp_path / "w.pth"), "weights_unfit")
-    assert "look like the weights of dinov2-vitb14" in said
+    reported = refusal(save(base, tmp_path / "w.pth"), "weights_unfit")
+    assert "look like the weights of dinov2-vitb14" in reported
 
 
 def test_weights_with_registers_are_not_taken_for_those_without(tmp_path: Path) -> None:
@@ -176,8 +177,8 @@ def test_weights_with_registers_are_not_taken_for_those_without(tmp_path: Path) 
 )
 def test_numbers_that_are_no_weights_are_refused(spoilt: torch.Tensor, tmp_path: Path) -> None:
     weights = {**random_weights(PLAIN), "blocks.0.norm1.bias": spoilt}
-    said = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
-    assert "blocks.0.norm1.bias holds numbers that are not finite floats" in said
+    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    assert "blocks.0.norm1.bias holds numbers that are not finite floats" in reported
 
 
 def _half_of(suffix: str) -> Callable[[Path], bytes]:
@@ -235,8 +236,8 @@ def offline_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.usefixtures("offline_cache")
 def test_weights_that_can_not_be_downloaded_are_an_error_and_never_random() -> None:
-    said = refusal(None, "weights_missing")
-    assert "DINO_WEIGHTS is not set" in said
+    reported = refusal(None, "weights_missing")
+    assert "DINO_WEIGHTS is not set" in reported
     with pytest.raises(Misconfigured, match=r"timm/vit_giant_patch14_dinov2\.lvd142m"):
         Extractor(get_extractor_config("anyloc-vitg14", allow_test_extractors=False), CPU)
 

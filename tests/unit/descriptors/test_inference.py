@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
+import weakref
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, ru
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
 from shared.storage import FolderStore
-from tests.support.added import none_added
+from tests.support.checkpoints import none_added
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 SIDE = 224  # pixels: as large as what passes are counted by
@@ -63,7 +65,7 @@ def test_pass_that_does_not_fit_is_halved_and_that_is_remembered() -> None:
     )
     backbone.passes.clear()
     made.describe(many, None)
-    made.at("bfloat16").describe(many[:3], None)
+    made.with_precision("bfloat16").describe(many[:3], None)
     assert backbone.passes == [2] * 5 + [2, 1]
 
 
@@ -114,11 +116,12 @@ def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegistry) -> None:
-    first = models.extractor("test-tiny-avg")
-    first.limit.record_out_of_memory(8, SIDE * SIDE)
+    models.extractor("test-tiny-avg").limit.record_out_of_memory(8, SIDE * SIDE)
+    first_backbone = weakref.ref(models.extractor("test-tiny-avg").backbone)
     other = models.extractor("test-slow-avg")
+    gc.collect()
+    assert first_backbone() is None, "its memory is free"
     again = models.extractor("test-tiny-avg")
-    assert again.backbone is not first.backbone
     assert again.limit.photos(16, SIDE * SIDE) == 4
     assert other.limit.photos(16, SIDE * SIDE) == 16
 

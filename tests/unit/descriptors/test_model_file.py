@@ -62,12 +62,12 @@ def test_a_file_that_this_release_does_not_understand_is_refused(
     path = tmp_path / "model.safetensors"
     tensors = {name: t.clone() for name, t in checkpoint.model.state_dict().items()}
     config = checkpoint.config.model_dump(mode="json")
-    said = {"format": 1, "config": config, "fingerprint": checkpoint.fingerprint}
+    fields = {"format": 1, "config": config, "fingerprint": checkpoint.fingerprint}
     for metadata, weights in (
         ({}, tensors),
-        ({METADATA_KEY: json.dumps({**said, "format": 2})}, tensors),
-        ({METADATA_KEY: json.dumps({**said, "config": {**config, "agg_arch": "New"}})}, tensors),
-        ({METADATA_KEY: json.dumps(said)}, {"one": torch.zeros(1)}),
+        ({METADATA_KEY: json.dumps({**fields, "format": 2})}, tensors),
+        ({METADATA_KEY: json.dumps({**fields, "config": {**config, "agg_arch": "New"}})}, tensors),
+        ({METADATA_KEY: json.dumps(fields)}, {"one": torch.zeros(1)}),
     ):
         path.write_bytes(save(weights, metadata))
         with pytest.raises(Unavailable) as caught:

@@ -52,9 +52,9 @@ def projected(rows: Rows, by: PcaWhitening) -> Rows:
     return PcaProjection(by, CPU).project(rows)
 
 
-def refusal(code: str, rows: Rows, kept: int) -> str:
+def refusal(code: str, rows: Rows, components: int) -> str:
     with pytest.raises(Unprocessable) as caught:
-        fit_pca(rows, kept)
+        fit_pca(rows, components)
     assert caught.value.code == code
     return caught.value.detail
 
@@ -63,7 +63,7 @@ def refusal(code: str, rows: Rows, kept: int) -> str:
 
 
 @pytest.mark.parametrize(
-    ("count", "dimension", "kept"),
+    ("count", "dimension", "components"),
     [
         (60, 200, 12),
         (200, 200, 30),
@@ -73,17 +73,19 @@ def refusal(code: str, rows: Rows, kept: int) -> str:
         (60, 16, 4),  # NumPy 2.4 negates rows of four float32 wrongly, in place and by columns
     ],
 )
-def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, kept: int) -> None:
+def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, components: int) -> None:
     rows, queries = unit_rows(count, dimension), unit_rows(20, dimension, seed=1)
-    ours = fit_pca(rows, kept, block_bytes=40_000)
-    theirs = PCA(n_components=kept, whiten=True, svd_solver="full").fit(rows.astype(np.float64))
+    ours = fit_pca(rows, components, block_bytes=40_000)
+    theirs = PCA(n_components=components, whiten=True, svd_solver="full").fit(
+        rows.astype(np.float64)
+    )
     expected = theirs.transform(queries.astype(np.float64))
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     signs = np.sign((ours.directions * theirs.components_).sum(axis=1))
     np.testing.assert_allclose(projected(queries, ours) * signs, expected, atol=2e-4)
     np.testing.assert_allclose(ours.variances, theirs.explained_variance_, rtol=1e-4)
     assert ours.explained == pytest.approx(theirs.explained_variance_ratio_.sum(), rel=1e-5)
-    assert (ours.kept, ours.dimension, ours.rows) == (kept, dimension, count)
+    assert (ours.kept, ours.dimension, ours.rows) == (components, dimension, count)
 
 
 def test_both_ways_give_the_same_projection() -> None:
@@ -119,16 +121,16 @@ def test_signs_do_not_depend_on_how_the_directions_were_found() -> None:
 
 
 def test_fit_holds_no_matrix_of_the_dimension(tmp_path: Path) -> None:
-    dimension, count, kept = 98_304, 40, 8
+    dimension, count, retained = 98_304, 40, 8
     file = np.memmap(tmp_path / "rows", np.float32, "w+", shape=(count, dimension))
     rng = np.random.default_rng(3)
     for row in file:
         row[:] = rng.standard_normal(dimension, dtype=np.float32)
     tracemalloc.start()
-    by = fit_pca(file, kept, block_bytes=1_000_000)
+    by = fit_pca(file, retained, block_bytes=1_000_000)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert by.directions.shape == (kept, dimension)
+    assert by.directions.shape == (retained, dimension)
     result = by.directions.nbytes + 8 * dimension + by.mean.nbytes
     assert peak < result + 5_000_000, "the rows alone have 15.7 MB, and are never held together"
 
@@ -285,7 +287,7 @@ def test_fingerprint_is_that_of_the_projection(fitted: PcaWhitening) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "message"),
     [
         ("mean", None, "no mean"),
         ("rows", None, "no rows"),
@@ -300,14 +302,14 @@ def test_fingerprint_is_that_of_the_projection(fitted: PcaWhitening) -> None:
     ],
 )
 def test_files_that_would_spoil_descriptors_are_refused(
-    fitted: PcaWhitening, name: str, value: NDArray[np.generic] | None, said: str
+    fitted: PcaWhitening, name: str, value: NDArray[np.generic] | None, message: str
 ) -> None:
     stored = load(PcaWhiteningFile(fitted, None).encode())
     if value is None:
         del stored[name]
     else:
         stored[name] = value
-    assert said in unfit(save(stored))
+    assert message in unfit(save(stored))
 
 
 def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
@@ -315,8 +317,8 @@ def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
         assert "or it is truncated" in unfit(broken)
     whole = load(data)
-    for spec, said in (("{", "can't be read"), ("[1]", "is not a JSON object")):
-        assert said in unfit(save(whole, {"spec": spec}))
+    for spec, reported in (("{", "can't be read"), ("[1]", "is not a JSON object")):
+        assert reported in unfit(save(whole, {"spec": spec}))
 
 
 def unfit(data: bytes) -> str:

@@ -40,7 +40,7 @@ def small_vit(shape: VitShape, folder: Path) -> Extractor:
 def networks(request: pytest.FixtureRequest, tmp_path: Path) -> dict[Precision, Extractor]:
     """One transformer with random weights in both precisions."""
     single = small_vit(NETWORKS[request.param], tmp_path)
-    return {precision: single.at(precision) for precision in PRECISIONS}
+    return {precision: single.with_precision(precision) for precision in PRECISIONS}
 
 
 def pixels(count: int) -> NDArray[np.uint8]:
@@ -72,12 +72,12 @@ def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
 
 def test_spec_tells_precisions_apart_and_single_means_what_it_meant() -> None:
     single = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
-    half = single.at("bfloat16")
+    half = single.with_precision("bfloat16")
     assert single.spec(None)["precision"] == "float32"
     assert half.spec(None) == {**single.spec(None), "precision": "bfloat16"}
     assert spec_fingerprint(half.spec(None)) != spec_fingerprint(single.spec(None))
     assert half.backbone is single.backbone
-    assert half.at("float32").spec(None) == single.spec(None)
+    assert half.with_precision("float32").spec(None) == single.spec(None)
 
 
 def test_half_precision_computes_otherwise_and_comes_near(

@@ -196,7 +196,7 @@ def test_licence_of_the_code_is_read_or_said_to_be_missing(
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ("missing_entry", "missing_entry"),
         ("fails", "KeyError: 'no such backbone'"),
@@ -212,9 +212,9 @@ def test_licence_of_the_code_is_read_or_said_to_be_missing(
     ],
 )
 def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
-    folder: Path, entry: str, said: str
+    folder: Path, entry: str, message: str
 ) -> None:
-    assert said in refusal(folder, entry)
+    assert message in refusal(folder, entry)
 
 
 def test_the_size_that_a_network_wants_can_be_given(folder: Path) -> None:
@@ -237,9 +237,9 @@ def test_code_of_others_prints_nothing_into_an_answer(
 
 
 def test_a_missing_folder_is_an_error_with_the_three_ways(tmp_path: Path) -> None:
-    said = refusal(tmp_path / "gone", "colours", "weights_missing")
-    assert f"there is no {tmp_path / 'gone' / 'hubconf.py'}" in said
-    assert "placewise models fetch torchhub:" in said
+    reported = refusal(tmp_path / "gone", "colours", "weights_missing")
+    assert f"there is no {tmp_path / 'gone' / 'hubconf.py'}" in reported
+    assert "placewise models fetch torchhub:" in reported
 
 
 def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(

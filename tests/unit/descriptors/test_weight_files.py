@@ -72,21 +72,21 @@ def test_a_break_costs_only_what_was_not_there_yet(server: FilesServer, target: 
     server.break_after = [2_000_000, 1_000_000]
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
-    assert [part for _, part in server.asked] == [None, "bytes=2000000-", "bytes=3000000-"]
+    assert [part for _, part in server.requests] == [None, "bytes=2000000-", "bytes=3000000-"]
 
 
 def test_a_later_call_goes_on_where_an_earlier_one_ended(server: FilesServer, target: Path) -> None:
-    kept = break_off(server, target)
-    assert 0 < kept <= 2_000_000
+    retained = break_off(server, target)
+    assert 0 < retained <= 2_000_000
     assert not target.exists()
-    server.refuse, server.asked = [], []
+    server.refuse, server.requests = [], []
     seen: list[int] = []
     download_file(
         f"{server.url}/weights", target, sha256=HASH, on_progress=lambda done, _: seen.append(done)
     )
     assert target.read_bytes() == CONTENT
-    assert server.asked == [("/weights", f"bytes={kept}-")]
-    assert seen[0] == kept
+    assert server.requests == [("/weights", f"bytes={retained}-")]
+    assert seen[0] == retained
 
 
 def test_a_file_that_has_changed_meanwhile_comes_anew(server: FilesServer, target: Path) -> None:
@@ -102,7 +102,7 @@ def test_a_server_without_ranges_sends_all_of_it_again(server: FilesServer, targ
     server.break_after = [2_000_000]
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
-    assert [part for _, part in server.asked] == [None, None]
+    assert [part for _, part in server.requests] == [None, None]
 
 
 def test_a_download_that_was_complete_is_not_asked_for_again(
@@ -113,7 +113,7 @@ def test_a_download_that_was_complete_is_not_asked_for_again(
     begun(target).write_bytes(CONTENT)
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
-    assert server.asked[-1] == ("/weights", f"bytes={len(CONTENT)}-")
+    assert server.requests[-1] == ("/weights", f"bytes={len(CONTENT)}-")
 
 
 def test_more_than_there_is_is_thrown_away(server: FilesServer, target: Path) -> None:
@@ -142,7 +142,7 @@ def test_the_beginning_of_a_hash_is_enough(server: FilesServer, target: Path) ->
 def test_what_is_not_there_is_asked_for_once(server: FilesServer, target: Path) -> None:
     with pytest.raises(httpx2.HTTPStatusError, match="404"):
         download_file(f"{server.url}/others", target)
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
 
 
 def test_a_busy_server_is_asked_again(server: FilesServer, target: Path) -> None:
@@ -156,4 +156,4 @@ def test_a_file_that_is_there_is_not_asked_for(server: FilesServer, target: Path
     target.write_bytes(b"here")
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == b"here"
-    assert server.asked == []
+    assert server.requests == []

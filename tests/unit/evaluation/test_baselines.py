@@ -18,11 +18,11 @@ def test_descriptor_is_a_unit_vector_and_most_like_itself(name: str) -> None:
 
 
 def test_average_colour_prefers_the_nearer_colour() -> None:
-    wanted, near, far = (
+    expected, near, far = (
         average_colour(Image.new("RGB", (8, 8), colour))
         for colour in ((120, 90, 60), (126, 96, 66), (60, 90, 120))
     )
-    assert wanted @ near > wanted @ far
+    assert expected @ near > expected @ far
 
 
 def test_thumbnail_is_blind_to_brightness_and_contrast() -> None:

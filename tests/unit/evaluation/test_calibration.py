@@ -42,12 +42,12 @@ def test_the_calibration_error_of_one_bin_is_the_gap_between_said_and_true() -> 
 def test_the_calibration_error_is_the_mean_over_bins_of_equally_many() -> None:
     """Two bins of ten: what one says too much does not make up for what the other says too
     little."""
-    said = [0.2] * 10 + [0.8] * 10
+    reported = [0.2] * 10 + [0.8] * 10
     truth = [YES] * 4 + [NO] * 6 + [YES] * 6 + [NO] * 4
-    assert expected_calibration_error(said, truth) == pytest.approx(0.2)
+    assert expected_calibration_error(reported, truth) == pytest.approx(0.2)
     mixed = [pair for both in zip(range(10), range(10, 20), strict=True) for pair in both]
     assert expected_calibration_error(
-        [said[i] for i in mixed], [truth[i] for i in mixed]
+        [reported[i] for i in mixed], [truth[i] for i in mixed]
     ) == pytest.approx(0.2)
 
 
@@ -69,9 +69,9 @@ pairs = some.lists(
 
 @given(pairs)
 def test_the_auroc_is_that_of_all_pairs(judged: list[tuple[float, bool]]) -> None:
-    right = [said for said, ok in judged if ok]
-    wrong = [said for said, ok in judged if not ok]
-    found = auroc([said for said, _ in judged], [ok for _, ok in judged])
+    right = [reported for reported, ok in judged if ok]
+    wrong = [reported for reported, ok in judged if not ok]
+    found = auroc([reported for reported, _ in judged], [ok for _, ok in judged])
     if not right or not wrong:
         assert found is None
         return
@@ -80,14 +80,14 @@ def test_the_auroc_is_that_of_all_pairs(judged: list[tuple[float, bool]]) -> Non
 
 
 def test_recall_at_a_precision_takes_the_lowest_cut_that_is_good_enough() -> None:
-    said = [0.9, 0.8, 0.7, 0.6, 0.5]
+    reported = [0.9, 0.8, 0.7, 0.6, 0.5]
     right = [YES, YES, NO, YES, NO]
-    assert recall_at_precision(said, right, 4) == 2 / 4
-    assert recall_at_precision(said, right, 4, precision=0.75) == 3 / 4
-    assert recall_at_precision(said, right, 4, precision=0.7) == 3 / 4
-    assert recall_at_precision(said, right, 4, precision=0) == 3 / 4
+    assert recall_at_precision(reported, right, 4) == 2 / 4
+    assert recall_at_precision(reported, right, 4, precision=0.75) == 3 / 4
+    assert recall_at_precision(reported, right, 4, precision=0.7) == 3 / 4
+    assert recall_at_precision(reported, right, 4, precision=0) == 3 / 4
     assert recall_at_precision([0.9, 0.8], [NO, YES], 1) == 0, "no cut is good enough"
-    assert recall_at_precision(said, right, 0) == 0
+    assert recall_at_precision(reported, right, 0) == 0
     assert recall_at_precision([0.5, 0.5, 0.4], [YES, NO, YES], 2) == 0, "ties go together"
 
 
@@ -97,11 +97,11 @@ def test_recall_at_a_precision_is_the_best_over_all_cuts(
 ) -> None:
     best = 0
     for cut, _ in judged:
-        taken = [ok for said, ok in judged if said >= cut]
+        taken = [ok for reported, ok in judged if reported >= cut]
         if sum(taken) / len(taken) >= precision:
             best = max(best, sum(taken))
     found = recall_at_precision(
-        [said for said, _ in judged], [ok for _, ok in judged], len(judged), precision
+        [reported for reported, _ in judged], [ok for _, ok in judged], len(judged), precision
     )
     assert found == pytest.approx(best / len(judged))
 
@@ -155,9 +155,9 @@ def test_a_confidence_tells_right_from_wrong_and_stays_between_0_and_1() -> None
         judged += [(e, False) for e in some_evidence(40, 2, -apart)]
         learnt = fit_confidence(judged)
         assert learnt is not None
-        said = [learnt.probability(e) for e, _ in judged]
-        assert all(0 < p < 1 for p in said)
-        found = auroc(said, [ok for _, ok in judged])
+        reported = [learnt.probability(e) for e, _ in judged]
+        assert all(0 < p < 1 for p in reported)
+        found = auroc(reported, [ok for _, ok in judged])
         assert found is not None
         assert found > 0.9
         predicted = cross_validate(judged)

@@ -16,10 +16,10 @@ MUCH = 10**9
 
 
 class Fake:
-    """A row of the file's length for each photo, and which photos were asked for."""
+    """A row of the file's length for each photo, and the names of the described photos."""
 
     def __init__(self, dimension: int = 4) -> None:
-        self.asked: list[str] = []
+        self.described: list[str] = []
         self.dimension = dimension
         self.seconds = 0.0
         self.photos = 0
@@ -27,7 +27,7 @@ class Fake:
     def __call__(self, photos: Sequence[Path]) -> Iterator[Any]:
         for begin in range(0, len(photos), 3):
             batch = photos[begin : begin + 3]
-            self.asked += [photo.name for photo in batch]
+            self.described += [photo.name for photo in batch]
             self.seconds += 0.010 * len(batch)
             self.photos += len(batch)
             yield np.stack([self.row(photo) for photo in batch])
@@ -56,7 +56,7 @@ def test_rows_come_in_the_photos_order_whatever_was_there_already(
     all_rows(describe, photos[5:30:3])
     rows = all_rows(describe, photos)
     assert rows[:, 0].tolist() == [n + 1 for n in range(40)]
-    assert sorted(inner.asked) == sorted(photo.name for photo in photos), "each was made once"
+    assert sorted(inner.described) == sorted(photo.name for photo in photos), "each was made once"
 
 
 def test_photo_with_other_bytes_is_described_again(photos: list[Path], tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_photo_with_other_bytes_is_described_again(photos: list[Path], tmp_path:
     (tmp_path / "moved.jpg").write_bytes(bytes(1))
     rows = all_rows(describe, [tmp_path / "moved.jpg", photos[1]])
     assert rows[:, 0].tolist() == [1, 99]
-    assert inner.asked == ["0.jpg", "1.jpg", "1.jpg"], "a photo's name does not matter"
+    assert inner.described == ["0.jpg", "1.jpg", "1.jpg"], "a photo's name does not matter"
 
 
 def test_another_specification_has_rows_of_its_own(photos: list[Path], tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_interrupted_run_goes_on_where_it_was(photos: list[Path], tmp_path: Path
     again = Fake()
     describe = CachedDescriber(again, tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
     assert all_rows(describe, photos)[:, 0].tolist() == [n + 1 for n in range(40)]
-    assert len(again.asked) == 8, "of 40, one batch of 32 was kept"
+    assert len(again.described) == 8, "of 40, one batch of 32 was kept"
 
 
 def test_rows_that_were_refused_are_not_kept(photos: list[Path], tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_rows_that_were_refused_are_not_kept(photos: list[Path], tmp_path: Path)
         rows.throw(Unprocessable("features_not_finite", ""))  # type: ignore[attr-defined]
     again = Fake()
     all_rows(CachedDescriber(again, tmp_path / "kept", {"a": 1}, max_bytes=MUCH), photos[:3])
-    assert len(again.asked) == 3
+    assert len(again.described) == 3
 
 
 def test_time_a_photo_is_remembered(photos: list[Path], tmp_path: Path) -> None:
@@ -120,9 +120,9 @@ def test_what_was_used_longest_ago_makes_room(photos: list[Path], tmp_path: Path
     fill("old", MUCH)
     fill("new", MUCH)
     fill("third", 2_400_000)  # two and a half of them
-    assert fill("new", MUCH).asked == []
-    assert fill("third", MUCH).asked == []
-    assert len(fill("old", MUCH).asked) == 10
+    assert fill("new", MUCH).described == []
+    assert fill("third", MUCH).described == []
+    assert len(fill("old", MUCH).described) == 10
 
 
 def test_cache_without_room_still_describes(photos: list[Path], tmp_path: Path) -> None:
@@ -130,4 +130,4 @@ def test_cache_without_room_still_describes(photos: list[Path], tmp_path: Path) 
         inner = Fake()
         describe = CachedDescriber(inner, tmp_path / "kept", {"a": 1}, max_bytes=0)
         assert all_rows(describe, photos)[:, 0].tolist() == [n + 1 for n in range(40)]
-        assert len(inner.asked) == 40
+        assert len(inner.described) == 40

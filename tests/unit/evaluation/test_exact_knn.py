@@ -66,11 +66,11 @@ def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
 
 
 def test_progress_ends_where_it_said_it_would() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     rows = unit_rows(10, 4, 7)
-    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: told.append(heard))
-    assert told[-1] == (100, 100)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: reported.append(heard))
+    assert reported[-1] == (100, 100)
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
 
 
 def test_gpu_that_faiss_does_not_have_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,9 +40,9 @@ POSITIVES = indices([4, 2], [1], [], [3])
 """right at ranks 1 and 3; at rank 3; nothing to find; not found"""
 
 
-def shot(east: float | None = None, **said: Any) -> DatasetPhoto:
+def shot(east: float | None = None, **fields: Any) -> DatasetPhoto:
     north = None if east is None else 5_000_000.0
-    given: dict[str, Any] = {"easting": east, "northing": north, "zone": "32T", **said}
+    given: dict[str, Any] = {"easting": east, "northing": north, "zone": "32T", **fields}
     return DatasetPhoto(path=Path("photo.jpg"), name="photo.jpg", **given)
 
 

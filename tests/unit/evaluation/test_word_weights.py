@@ -120,7 +120,7 @@ def all_pairs(chosen: PairSplit, half: int, kind: str) -> list[tuple[int, int]]:
 def test_near_pairs_are_5_to_25_m_apart_far_ones_over_50_and_each_lies_in_one_half() -> None:
     spots = [*street(60), *(north(12_000 + 2 * n) for n in range(30))]  # a burst of 2 m steps
     chosen = sample_pairs(spots, seed=0, batch_photos=10_000)
-    assert chosen.by == PairSource.COORDINATES
+    assert chosen.source == PairSource.COORDINATES
     assert chosen.is_enough
     for half in (0, 1):
         for kind, least, most in (("near", 5.0, 25.0), ("far", 50.0, math.inf)):
@@ -166,7 +166,7 @@ def test_rooms_teach_by_their_labels() -> None:
     """Also those that bear the coordinates of their building, all the same."""
     spots = [PhotoLocation(45.0, 7.0, f"room {n // 6}") for n in range(240)]
     chosen = sample_pairs(spots, seed=0, batch_photos=100)
-    assert (chosen.by, chosen.is_enough) == (PairSource.PLACES, True)
+    assert (chosen.source, chosen.is_enough) == (PairSource.PLACES, True)
     for half in (0, 1):
         assert all(spots[a].place == spots[b].place for a, b in all_pairs(chosen, half, "near"))
         assert all(spots[a].place != spots[b].place for a, b in all_pairs(chosen, half, "far"))

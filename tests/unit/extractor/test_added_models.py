@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from services.extractor.added_models import STALE_PARTIAL_SECONDS, ModelFileCache
+from services.extractor.added_models import ModelFileCache
 from shared.errors import NotFound, Unavailable
 from shared.storage import FolderStore
+from shared.storage.copying import STALE_PARTIAL_SECONDS
 
 
 class Bucket(FolderStore):

@@ -10,7 +10,7 @@ from services.extractor.model_registry import MAX_EXTRACTORS, ModelRegistry
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.storage import FolderStore
-from tests.support.added import none_added
+from tests.support.checkpoints import none_added
 from tests.support.hub import write_hub
 
 

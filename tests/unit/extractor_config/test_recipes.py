@@ -110,7 +110,7 @@ def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "fields"),
     [
         ("anyloc-vitb14:depth=9", ["'depth'", ANYLOC_OPTIONS]),
         ("anyloc-vitb14:", ["''", ANYLOC_OPTIONS]),
@@ -136,10 +136,10 @@ def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
         ),
     ],
 )
-def test_bad_options_are_named_with_what_is_allowed(name: str, said: list[str]) -> None:
+def test_bad_options_are_named_with_what_is_allowed(name: str, fields: list[str]) -> None:
     detail = refusal(name, "bad_extractor_option")
     assert name.partition(":")[0] in detail
-    for words in said:
+    for words in fields:
         assert words in detail
 
 

@@ -77,9 +77,9 @@ def test_one_network_has_one_name(written: str, canonical: str) -> None:
 
 @pytest.mark.parametrize("pin", ["", "@main", "@v1.0", f"@{COMMIT[:39]}", f"@{COMMIT}0"])
 def test_code_that_is_not_pinned_to_a_commit_is_refused_with_how_to_pin_it(pin: str) -> None:
-    said = refusal(f"torchhub:gmberton/eigenplaces{pin}:get_trained_model", "torchhub_unpinned")
-    assert "torchhub:gmberton/eigenplaces@COMMIT:ENTRY" in said
-    assert "git ls-remote https://github.com/gmberton/eigenplaces HEAD" in said
+    reported = refusal(f"torchhub:gmberton/eigenplaces{pin}:get_trained_model", "torchhub_unpinned")
+    assert "torchhub:gmberton/eigenplaces@COMMIT:ENTRY" in reported
+    assert "git ls-remote https://github.com/gmberton/eigenplaces HEAD" in reported
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,9 @@ def test_only_the_loaded_model_tells_how_photos_are_brought_to_size() -> None:
 
 
 def test_maps_use_models_that_were_added_and_no_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Settings().recipe("gsv:walks").name == "gsv:walks"
+    assert Settings().extractor_config("gsv:walks").name == "gsv:walks"
     with pytest.raises(Misconfigured) as caught:
-        Settings().recipe("gsv:/models/best.ckpt")
+        Settings().extractor_config("gsv:/models/best.ckpt")
     assert caught.value.code == "model_not_added"
     assert "placewise models add /models/best.ckpt" in caught.value.detail
     monkeypatch.setenv("EXTRACTOR", "gsv:walks")

@@ -137,7 +137,7 @@ def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "fields",
     [
         {},
         {"host": ""},
@@ -152,11 +152,11 @@ def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
         {"host": "localhost:8000", "origin": ""},
     ],
 )
-def test_without_keys_no_page_of_elsewhere_may_call(said: dict[str, str]) -> None:
+def test_without_keys_no_page_of_elsewhere_may_call(fields: dict[str, str]) -> None:
     with pytest.raises(Forbidden) as caught:
-        check(LocalhostAuthenticator(), **said)
+        check(LocalhostAuthenticator(), **fields)
     assert caught.value.code == "foreign_page"
-    refused = said.get("origin") if is_local(said.get("host", "")) else said.get("host", "")
+    refused = fields.get("origin") if is_local(fields.get("host", "")) else fields.get("host", "")
     assert repr(refused) in caught.value.detail, "what was refused is named"
 
 
@@ -177,9 +177,9 @@ def test_without_keys_what_a_proxy_forwards_is_refused(header: str) -> None:
 def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
     keys = LocalhostAuthenticator(["https://maps.example"])
     check(keys, host="localhost:8000", origin="https://maps.example")
-    for said in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
+    for reported in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
         with pytest.raises(Forbidden):
-            check(keys, **{"host": "localhost", "origin": "https://maps.example", **said})
+            check(keys, **{"host": "localhost", "origin": "https://maps.example", **reported})
 
 
 # --- ADMIN_KEY ----------------------------------------------------------------------------------

@@ -273,7 +273,7 @@ def test_empty_file_is_refused(store: FolderStore, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sent", "kept"),
+    ("sent", "remaining"),
     [
         ("street.jpg", "street.jpg"),
         ("../../etc/passwd", "passwd"),
@@ -285,9 +285,9 @@ def test_empty_file_is_refused(store: FolderStore, name: str) -> None:
     ],
 )
 def test_only_the_last_part_of_the_file_name_is_kept(
-    store: FolderStore, sent: str, kept: str
+    store: FolderStore, sent: str, remaining: str
 ) -> None:
-    assert receive(store, file(name=sent) + END).filename == kept
+    assert receive(store, file(name=sent) + END).filename == remaining
 
 
 @pytest.mark.parametrize(

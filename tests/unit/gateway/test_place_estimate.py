@@ -248,10 +248,14 @@ PAIRS = ((0.5, north(0)), (0.2, north(700)))
 
 def test_before_an_evaluation_the_place_is_given_and_nothing_is_claimed_of_it() -> None:
     for known in (None, calibration(None)):
-        said = answer(known, *PAIRS)
-        assert (said.in_map, said.confidence, said.calibration) == (None, None, "uncalibrated")
-        assert said.latitude == pytest.approx(45.0)
-        assert said.radius_m == RADIUS_M
+        reported = answer(known, *PAIRS)
+        assert (reported.in_map, reported.confidence, reported.calibration) == (
+            None,
+            None,
+            "uncalibrated",
+        )
+        assert reported.latitude == pytest.approx(45.0)
+        assert reported.radius_m == RADIUS_M
 
 
 def test_support_over_the_threshold_is_in_the_map_and_under_it_is_not() -> None:
@@ -264,10 +268,10 @@ def test_support_over_the_threshold_is_in_the_map_and_under_it_is_not() -> None:
 
 def test_labelled_queries_give_a_confidence() -> None:
     learnt = fit_confidence(labelled(500))
-    said = answer(calibration(0.1, learnt), *PAIRS)
+    reported = answer(calibration(0.1, learnt), *PAIRS)
     assert learnt is not None
-    assert said.calibration == "calibrated"
-    assert said.confidence == pytest.approx(learnt.probability(PlaceEvidence(0.3, 0.5)))
+    assert reported.calibration == "calibrated"
+    assert reported.confidence == pytest.approx(learnt.probability(PlaceEvidence(0.3, 0.5)))
 
 
 def test_nothing_found_and_nothing_known_are_told_apart() -> None:
@@ -282,8 +286,8 @@ def test_a_filter_that_leaves_no_rival_makes_nobody_sure() -> None:
     everything = ranking((0.5, north(0)), (0.45, north(700)), (0.2, north(3000)))
     filtered = [everything[2]]
     known = calibration(0.01)
-    said = estimate_place(known, filtered, everything, RADIUS_M)
-    assert said.in_map is False
+    reported = estimate_place(known, filtered, everything, RADIUS_M)
+    assert reported.in_map is False
     alone = estimate_place(known, everything[:1], everything, RADIUS_M)
     whole = estimate_place(known, everything, everything, RADIUS_M)
     assert alone.in_map is whole.in_map is True

@@ -48,7 +48,7 @@ def generation(outcome: Outcome | None) -> Generation:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "wanted", "setting", "first", "state", "threshold"),
+    ("outcome", "expected", "setting", "first", "state", "threshold"),
     [
         (Outcome.KEPT, True, True, WEIGHTED, "applied", 0.2),
         (Outcome.KEPT, True, True, None, "applied", 0.2),
@@ -62,16 +62,16 @@ def generation(outcome: Outcome | None) -> Generation:
 )
 def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
     outcome: Outcome | None,
-    wanted: bool,
+    expected: bool,
     setting: bool,
     first: SearchHit | None,
     state: str,
     threshold: float,
 ) -> None:
     settings = Settings(_env_file=None).model_copy(update={"word_weights": setting})
-    chosen = select_ranking_weights(generation(outcome), wanted, settings)
+    chosen = select_ranking_weights(generation(outcome), expected, settings)
     hits = [first] if first else []
-    assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and wanted and setting else ())
+    assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and expected and setting else ())
     assert chosen.state(hits) == state
     judged_by = chosen.calibration(hits)
     assert judged_by is not None

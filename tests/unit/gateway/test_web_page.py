@@ -43,9 +43,9 @@ def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> No
     shown = page.get("/", headers=HTML)
     assert shown.headers["content-type"] == "text/html; charset=utf-8"
     assert "<title>Placewise</title>" in shown.text
-    told = page.get("/", headers={"Accept": "*/*"})
-    assert told.json()["service"] == "Placewise"
-    for answer in (shown, told):
+    reported = page.get("/", headers={"Accept": "*/*"})
+    assert reported.json()["service"] == "Placewise"
+    for answer in (shown, reported):
         assert "Accept" in answer.headers["vary"]
 
 
@@ -107,8 +107,8 @@ def test_the_tile_server_alone_is_added_to_what_may_be_loaded(
     page = served(Settings())
     allowed = policy(page.get("/", headers=HTML))
     assert allowed["img-src"] == "'self' blob: data: https://tiles.example.org"
-    said = page.get("/console/settings.json").json()
-    assert (said["map_tiles"], said["map_attribution"]) == (TILES, "© somebody")
+    body = page.get("/console/settings.json").json()
+    assert (body["map_tiles"], body["map_attribution"]) == (TILES, "© somebody")
 
 
 @pytest.mark.parametrize(
@@ -149,10 +149,10 @@ def test_no_file_of_the_page_names_another_server(path: Path) -> None:
 
 
 def test_every_module_that_is_imported_is_there(page: TestClient) -> None:
-    wanted = set()
+    expected = set()
     for path in PAGE_FOLDER.rglob("*.js"):
         for name in re.findall(r"(?:from|import)\s*\(?\"(\.[^\"]+)\"", path.read_text()):
-            wanted.add((path.parent / name).resolve().relative_to(PAGE_FOLDER).as_posix())
-    assert wanted
-    for name in sorted(wanted):
+            expected.add((path.parent / name).resolve().relative_to(PAGE_FOLDER).as_posix())
+    assert expected
+    for name in sorted(expected):
         assert page.get(f"/console/{name}").status_code == 200, name

@@ -127,9 +127,9 @@ def test_latitude_without_longitude_is_left_out() -> None:
     assert (found.latitude, found.longitude) == (None, None)
 
 
-@pytest.mark.parametrize(("said", "heading"), [(12.5, 12.5), (0, 0), (360, 0), (372.5, 12.5)])
-def test_heading_is_brought_below_360_degrees(said: float, heading: float) -> None:
-    found = header(encoded(exif=exif_with({GPS.GPSImgDirection: said})))
+@pytest.mark.parametrize(("fields", "heading"), [(12.5, 12.5), (0, 0), (360, 0), (372.5, 12.5)])
+def test_heading_is_brought_below_360_degrees(fields: float, heading: float) -> None:
+    found = header(encoded(exif=exif_with({GPS.GPSImgDirection: fields})))
     assert found.heading == pytest.approx(heading)
 
 

@@ -29,13 +29,13 @@ def test_lines_give_the_forms_fields_by_the_photos_names() -> None:
         b'{"path": "in/b.jpg", "place": "h\xc3\xa4ll", "metadata": {"n": [1]}, "heading": null}\r\n'
         b'{"file": "c.jpg", "captured_at": "2026-05-01", "role": "query"}'
     )
-    said = read_jsonl_manifest(data, "the manifest")
-    assert said == [
+    reported = read_jsonl_manifest(data, "the manifest")
+    assert reported == [
         ManifestEntry(1, "a.jpg", {"latitude": "45.5", "longitude": "-7", "tags": "x,y"}),
         ManifestEntry(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}'}),
         ManifestEntry(4, "c.jpg", {"captured_at": "2026-05-01", "role": "query"}),
     ]
-    fields = [read_form_fields(one.fields) for one in said]
+    fields = [read_form_fields(one.fields) for one in reported]
     assert (fields[0].latitude, fields[0].longitude, fields[0].tags) == (45.5, -7, ["x", "y"])
     assert fields[1].metadata == {"n": [1]}
 
@@ -68,9 +68,11 @@ def test_a_bad_line_is_named_with_its_number(line: bytes, why: str) -> None:
 
 
 def test_a_wrong_value_is_no_bad_line_but_the_photos_own_error() -> None:
-    [said] = read_jsonl_manifest(b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest")
+    [reported] = read_jsonl_manifest(
+        b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest"
+    )
     with pytest.raises(PlacewiseError, match="latitude"):
-        read_form_fields(said.fields)
+        read_form_fields(reported.fields)
 
 
 def test_only_the_first_bad_lines_are_named() -> None:

@@ -156,13 +156,13 @@ def test_files_of_a_folder_are_not_copied(tmp_path: Path, folder: Path) -> None:
 def test_only_the_files_of_chunks_that_are_searched_are_kept(tmp_path: Path, folder: Path) -> None:
     store = Bucket(tmp_path / "objects")
     loader = ChunkLoader(store, folder)
-    kept, dropped = (loader.load_rows(written(store, unit_rows(n))) for n in (3, 4))
+    retained, dropped = (loader.load_rows(written(store, unit_rows(n))) for n in (3, 4))
     (folder / "old.partial").touch()
     long_ago = time.time() - 7200
     os.utime(folder / "old.partial", (long_ago, long_ago))
     (folder / "new.partial").touch()
-    loader.evict_except([loaded(kept)])
-    assert {path.name for path in folder.iterdir()} == {f"{kept.sha256}.npy", "new.partial"}
+    loader.evict_except([loaded(retained)])
+    assert {path.name for path in folder.iterdir()} == {f"{retained.sha256}.npy", "new.partial"}
     assert len(dropped.rows) == 4
     other = folder.with_name(str(new_id()))
     other.mkdir()
@@ -225,8 +225,8 @@ def test_damaged_codes_are_made_again_and_the_chunk_is_served(
     if where == "kept here":
         loader = ChunkLoader(store, folder)
         loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
-        (kept,) = folder.glob("*.codes")
-        kept.write_bytes(whole[:-1] + b"?")
+        (retained,) = folder.glob("*.codes")
+        retained.write_bytes(whole[:-1] + b"?")
     else:
         store.put(key, whole[:-1] + b"?")
     loader = ChunkLoader(store, folder)
@@ -258,17 +258,17 @@ def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
 
 
 @given(
-    wanted=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
+    sizes=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
     budget=st.integers(0, 300),
 )
 def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
-    wanted: dict[UUID, list[int]], budget: int
+    sizes: dict[UUID, list[int]], budget: int
 ) -> None:
-    counts = allocate_parts(wanted, budget)
-    left = budget - sum(sum(wanted[key][:count]) for key, count in counts.items())
+    counts = allocate_parts(sizes, budget)
+    left = budget - sum(sum(sizes[key][:count]) for key, count in counts.items())
     assert left >= 0
     for key, count in counts.items():
-        assert count == len(wanted[key]) or wanted[key][count] > left
+        assert count == len(sizes[key]) or sizes[key][count] > left
 
 
 def test_first_parts_of_all_go_before_the_second_part_of_any() -> None:

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.dense_scan import FLOAT32_MARGIN
-from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult, execute_query
+from services.search.executor import SCORE_DECIMALS, SearchOptions, execute_query
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.ids import new_id
 from shared.search_api.photo_filter import NO_FILTER
-from tests.support.photo_facts import facts_of
+from shared.search_api.protocol import SearchResponse
+from tests.unit.search.search_rows import facts_of
 
 Rows = NDArray[np.float32]
 
@@ -87,7 +88,7 @@ def ask(
     query: Rows,
     question: SearchOptions,
     exclude: frozenset[UUID] = frozenset(),
-) -> SearchResult:
+) -> SearchResponse:
     snapshot = Snapshot(new_id(), new_id(), 1, tuple(chunks))
     return execute_query(
         snapshot,
@@ -223,8 +224,9 @@ def test_fewer_rows_than_asked_are_all_answered() -> None:
 
 def test_nothing_loaded_answers_nothing() -> None:
     query = unit_rows(1, 1, 4)[0]
-    nothing = SearchResult((), "exhaustive", 0, 0, 0)
-    assert ask([], query, SearchOptions(5)) == nothing
+    nothing = ask([], query, SearchOptions(5))
+    assert (nothing.hits, nothing.certificate) == ((), "exhaustive")
+    assert (nothing.certified_k, nothing.rows_scanned, nothing.rows_reranked) == (0, 0, 0)
     empty = chunk_of(np.empty((0, 4), dtype=np.float32), [])
     assert ask([empty], query, SearchOptions(5)) == nothing
 

@@ -13,30 +13,32 @@ from hypothesis import strategies as some
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
-from tests.support.photo_facts import facts_of
-from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+from tests.unit.search.search_rows import facts_of
 
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 
 
 def selected(
-    photos: list[PhotoFilterValues], wanted: PhotoFilter, exclude: frozenset[UUID] = frozenset()
+    photos: list[PhotoFilterValues],
+    photo_filter: PhotoFilter,
+    exclude: frozenset[UUID] = frozenset(),
 ) -> list[UUID]:
     columns = PhotoColumns.of(len(photos), enumerate(photos))
-    return list(columns.photo_id[build_row_mask(columns, wanted, exclude)])
+    return list(columns.photo_id[build_row_mask(columns, photo_filter, exclude)])
 
 
 @settings(max_examples=150, deadline=None)
 @given(data=some.data(), count=some.integers(1, 12))
 def test_the_mask_lets_pass_what_the_filter_means(data: some.DataObject, count: int) -> None:
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:count]]
-    wanted = data.draw(photo_filters(photos))
-    found = selected(photos, wanted)
+    photo_filter = data.draw(photo_filters(photos))
+    found = selected(photos, photo_filter)
     for photo in photos:
-        expected = passes(photo, wanted)
+        expected = passes(photo, photo_filter)
         if expected is not None:
             findable = photo.role == PhotoRole.DATABASE
-            assert (photo.photo_id in found) == (expected and findable), (photo, wanted)
+            assert (photo.photo_id in found) == (expected and findable), (photo, photo_filter)
 
 
 @settings(max_examples=50, deadline=None)
@@ -54,7 +56,7 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
 
 
 @pytest.mark.parametrize(
-    ("wanted", "passing"),
+    ("photo_filter", "passing"),
     [
         pytest.param(PhotoFilter(), "west east pole nowhere", id="nothing wanted"),
         pytest.param(PhotoFilter(ids=()), "", id="no ids"),
@@ -95,7 +97,7 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
         ),
     ],
 )
-def test_borders_of_the_globe(wanted: PhotoFilter, passing: str) -> None:
+def test_borders_of_the_globe(photo_filter: PhotoFilter, passing: str) -> None:
     names = {IDS[0]: "west", IDS[1]: "east", IDS[2]: "pole", IDS[3]: "nowhere"}
     photos = [
         facts_of(IDS[0], latitude=0, longitude=-180),
@@ -103,7 +105,7 @@ def test_borders_of_the_globe(wanted: PhotoFilter, passing: str) -> None:
         facts_of(IDS[2], latitude=90, longitude=123),
         facts_of(IDS[3]),
     ]
-    assert [names[photo_id] for photo_id in selected(photos, wanted)] == passing.split()
+    assert [names[photo_id] for photo_id in selected(photos, photo_filter)] == passing.split()
 
 
 def test_bounds_of_the_time_are_inclusive_to_the_microsecond() -> None:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from services.search import executor, gpu
 from services.search import residency as residency_module
@@ -25,10 +24,17 @@ from services.search.residency import GpuResidency, open_search_device
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
 from shared.search_api.protocol import Mode
-from tests.support.search_rows import Case, answer, brute_force, cases, hits_of, places, snapshot_of
+from tests.unit.search.search_rows import (
+    Case,
+    answer,
+    brute_force,
+    cases,
+    hits_of,
+    places,
+    snapshot_of,
+)
 
 DIMENSION = 512
-KINDS = ("float16", "int8")
 
 
 @pytest.fixture(autouse=True)
@@ -40,51 +46,46 @@ def device_with(free_bytes: float = math.inf) -> GpuDevice:
     return GpuDevice(torch.device("cpu"), lambda: free_bytes, 0)
 
 
-def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gpu, "ROW_FORMATS", (kind,))
-        found = GpuResidency(device_with()).update(snapshot)
+def on_device(snapshot: Snapshot) -> Snapshot:
+    found = GpuResidency(device_with()).update(snapshot)
     assert found.gpu_snapshot is not None
-    assert found.gpu_snapshot.row_format == kind
     return found
 
 
 @settings(max_examples=25, deadline=None)
-@given(case=cases(DIMENSION), kind=st.sampled_from(KINDS))
-def test_answers_equal_brute_force_with_order_and_ties(case: Case, kind: str) -> None:
+@given(case=cases(DIMENSION))
+def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     pieces = min(case.pieces, len(case.rows))
-    snapshot = on_device(snapshot_of(case.rows, pieces, "int8"), kind)
-    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score))
+    snapshot = on_device(snapshot_of(case.rows, pieces, "int8"))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score))
     assert hits_of(found) == case.expected
-    if case.asked.any() and case.query.any():
+    if case.selected.any() and case.query.any():
         assert found.certificate == "bound"
-        assert found.rows_scanned == int(case.asked.sum())
+        assert found.rows_scanned == int(case.selected.sum())
 
 
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dimension", [3, 100, 7168, 20_000])
-def test_no_score_is_further_off_than_its_bound(kind: str, dimension: int) -> None:
+def test_no_score_is_further_off_than_its_bound(dimension: int) -> None:
     rows = places(3, 40, dimension)
     rows[0], rows[0, 0] = 0, 1
     rows[1] = 1 / math.sqrt(dimension)
     rows[2] = 0
-    snapshot = on_device(snapshot_of(rows, 2, "int8"), kind)
+    snapshot = on_device(snapshot_of(rows, 2, "int8"))
     resident = snapshot.gpu_snapshot
     assert resident is not None
     queries = np.stack([rows[0], rows[1], rows[5] * np.float32(1e-20), -rows[9]])
     chunks = list(resident.chunks.values())
-    scores, bounds = gpu._score_all_rows(chunks, kind, queries, torch.device("cpu"))
+    scores, bounds = gpu._score_all_rows(chunks, queries, torch.device("cpu"))
     unit = queries.astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     errors = np.abs(scores.numpy() - unit @ rows.astype(np.float64).T)
     assert np.all(errors <= bounds.numpy())
-    assert bounds.max() < (2e-3 if kind == "float16" else 0.04)
+    assert bounds.max() < 2e-3
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_queries_of_a_batch_do_not_see_each_other(kind: str) -> None:
+def test_queries_of_a_batch_do_not_see_each_other() -> None:
     rows = places(5, 120, DIMENSION)
-    snapshot = on_device(snapshot_of(rows, by="int8"), kind)
+    snapshot = on_device(snapshot_of(rows, by="int8"))
     assert snapshot.gpu_snapshot is not None
     rng = np.random.default_rng(1)
     batch = [
@@ -92,11 +93,11 @@ def test_queries_of_a_batch_do_not_see_each_other(kind: str) -> None:
         for number, k, least in ((3, 1, -math.inf), (7, 20, 0.1), (50, 400, -math.inf))
     ]
     together = snapshot.gpu_snapshot.candidates(batch)
-    for asked, found in zip(batch, together, strict=True):
-        (alone,) = snapshot.gpu_snapshot.candidates([asked])
+    for searched, found in zip(batch, together, strict=True):
+        (alone,) = snapshot.gpu_snapshot.candidates([searched])
         np.testing.assert_array_equal(found.rows, alone.rows)
         assert found.floor == pytest.approx(alone.floor, abs=1e-6)
-        assert asked.row_mask[found.rows].all()
+        assert searched.row_mask[found.rows].all()
 
 
 def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,13 +148,6 @@ def test_rows_that_do_not_fit_are_searched_by_the_cpu() -> None:
     found = residency.update(snapshot)
     assert found.gpu_snapshot is None
     assert not residency.needs_update(found), "it is tried again later, not at every look"
-    assert not residency.needs_int8_codes(found)
-    unbounded = replace(snapshot, chunks=tuple(replace(c, int8=None) for c in snapshot.chunks))
-    little = GpuResidency(device_with(90_000))
-    assert little.update(unbounded).gpu_snapshot is None
-    assert little.needs_int8_codes(unbounded), "a byte for each number would fit"
-    assert little.update(snapshot).gpu_snapshot is not None
-    assert not GpuResidency(device_with(1000)).needs_int8_codes(unbounded)
 
 
 def out_of_memory(*_: object, **__: object) -> Any:
@@ -204,7 +198,7 @@ def test_device_out_of_memory_when_loading_is_told_and_tried_again_later(
 
 def test_dense_mode_never_asks_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = places(6, 90, DIMENSION)
-    snapshot = on_device(snapshot_of(rows, by="int8"), "float16")
+    snapshot = on_device(snapshot_of(rows, by="int8"))
     monkeypatch.setattr(gpu, "_score_all_rows", out_of_memory)
     found = answer(snapshot, rows[3], np.ones(90, bool), SearchOptions(7, mode=Mode.DENSE))
     assert found.certificate == "exhaustive"
@@ -223,7 +217,7 @@ def test_device_that_adds_up_carelessly_is_found_out(monkeypatch: pytest.MonkeyP
 
 
 def test_device_failures_are_told_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), by="int8"), "float16")
+    snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), by="int8"))
     assert snapshot.gpu_snapshot is not None
     monkeypatch.setattr(gpu, "_score_all_rows", out_of_memory)
     with pytest.raises(GpuError, match="out of memory"):

@@ -110,14 +110,6 @@ def test_products_of_the_largest_numbers_are_exact() -> None:
     assert INT8_MAX * QUERY_MAX * INT32_SAFE_TERMS < 2**31
 
 
-def test_both_parts_of_a_query_are_bytes() -> None:
-    rng = np.random.default_rng(2)
-    query = Int8Query.from_row(rng.standard_normal(4096).astype(np.float32))
-    for numbers in (query.numbers, np.array([QUERY_MAX, -QUERY_MAX, 0, 1], np.int16)):
-        high, low = Int8Query(numbers, 1.0, 0.0).parts.astype(np.int64)
-        np.testing.assert_array_equal(128 * high + low, numbers)
-
-
 def same(a: Int8Codes, b: Int8Codes) -> bool:
     pairs = ((a.numbers, b.numbers), (a.scales, b.scales), (a.errors, b.errors))
     return all(map(np.array_equal, *zip(*pairs, strict=True))) and np.array_equal(

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.search import executor
-from services.search.executor import SearchOptions, int8_codes_pay_off, needs_int8_codes
-from shared.ids import new_id
+from services.search.executor import SearchOptions, int8_codes_pay_off
 from shared.search_api.protocol import Mode
-from tests.support.search_rows import (
+from tests.unit.search.search_rows import (
     Case,
     answer,
     brute_force,
@@ -37,12 +36,12 @@ def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION), mode=st.sampled_from([Mode.AUTO, Mode.DETERMINISTIC]))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case, mode: Mode) -> None:
     snapshot = snapshot_of(case.rows, case.pieces, "int8")
-    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score, mode))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score, mode))
     assert hits_of(found) == case.expected
-    if case.asked.any():
+    if case.selected.any():
         assert found.certificate == "bound"
         assert found.certified_k == len(found.hits)
-        assert found.rows_scanned == int(case.asked.sum())
+        assert found.rows_scanned == int(case.selected.sum())
         assert found.max_z is None
 
 
@@ -143,18 +142,6 @@ def test_int8_codes_are_used_where_they_are_less_to_read(
 ) -> None:
     monkeypatch.undo()
     assert int8_codes_pay_off(selected, k, dimension) == worth
-
-
-def test_small_maps_need_no_codes_to_leave_nothing_to_chance(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.undo()
-    rows = places(5, 400)
-    few = snapshot_of(rows, by="none")
-    assert not needs_int8_codes(few, np.ones(400, bool), 3)
-    many = replace(few, generation_id=new_id(), chunks=few.chunks * 6)
-    assert needs_int8_codes(many, np.ones(2400, bool), 3)
-    assert not needs_int8_codes(many, np.arange(2400) < 5, 3)
 
 
 @pytest.mark.parametrize("most_rows", [0, 1, 5, 12])

@@ -75,11 +75,11 @@ def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() ->
 
 
 def test_a_message_without_weights_is_one_that_the_release_before_understands() -> None:
-    asked = SearchRequest(
+    searched = SearchRequest(
         map_id=new_id(), generation_id=new_id(), object_key="q", row=0, min_version=0, k=5
     )
-    assert "word_weights" not in asked.as_json()
-    assert SearchRequest.model_validate_json(asked.as_json()) == asked
+    assert "word_weights" not in searched.as_json()
+    assert SearchRequest.model_validate_json(searched.as_json()) == searched
     plain = answer((1, 0.5), missing=("chunks/a",))
     assert "weighted_score" not in plain.as_json()
     assert SearchResponse.model_validate_json(plain.as_json()) == plain
@@ -150,8 +150,8 @@ def test_largest_error_of_an_estimate_is_told_and_none_where_nothing_was_estimat
 
 
 def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:
-    told = answer((1, 0.5)).model_dump(mode="json") | {"of_the_future": 1}
-    assert ranked(SearchResponse.model_validate(told)) == [(1, 0.5)]
+    reported = answer((1, 0.5)).model_dump(mode="json") | {"of_the_future": 1}
+    assert ranked(SearchResponse.model_validate(reported)) == [(1, 0.5)]
 
 
 def test_a_generation_is_there_once_every_shard_has_it() -> None:

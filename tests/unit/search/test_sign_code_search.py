@@ -12,14 +12,15 @@ from hypothesis import given, settings
 
 from services.search import executor, kernels, sign_code_search
 from services.search.chunk_loader import LoadedChunk
-from services.search.executor import SearchOptions, SearchResult
+from services.search.executor import SearchOptions
 from services.search.query_batcher import QueryBatcher
 from services.search.sign_code_search import scan_first_level
 from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
-from shared.search_api.protocol import Mode
-from tests.support.search_rows import (
+from shared.search_api.protocol import Mode, SearchResponse
+from tests.support.servers.handle import wait_until
+from tests.unit.search.search_rows import (
     Case,
     answer,
     brute_force,
@@ -29,7 +30,6 @@ from tests.support.search_rows import (
     places,
     snapshot_of,
 )
-from tests.support.servers.handle import wait_until
 
 DIMENSION = 7168
 
@@ -43,12 +43,12 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)
-    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score))
     assert hits_of(found) == case.expected
-    if case.asked.any():
+    if case.selected.any():
         assert found.certificate == "statistical"
         assert found.certified_k == len(found.hits)
-        assert found.rows_scanned == int(case.asked.sum())
+        assert found.rows_scanned == int(case.selected.sum())
         assert found.max_z is not None
         assert found.max_z < 5.5
 
@@ -97,9 +97,11 @@ def test_dense_mode_compares_every_row() -> None:
 def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     rows = places(4, 300)
-    asked = np.zeros(300, bool)
-    asked[:50] = True
-    assert answer(snapshot_of(rows), rows[0], asked, SearchOptions(3)).certificate == "exhaustive"
+    searched = np.zeros(300, bool)
+    searched[:50] = True
+    assert (
+        answer(snapshot_of(rows), rows[0], searched, SearchOptions(3)).certificate == "exhaustive"
+    )
     everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), SearchOptions(3))
     assert everything.certificate == "statistical"
 
@@ -158,9 +160,9 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
     snapshot = snapshot_of(rows)
     rng = np.random.default_rng(1)
     queries = [rows[row] + np.float32(0.3) * places(row, 1)[0] for row in range(24)]
-    asked = [rng.random(500) < rng.choice([1.0, 0.3]) for _ in queries]
+    requests = [rng.random(500) < rng.choice([1.0, 0.3]) for _ in queries]
     questions = [SearchOptions(int(rng.choice([1, 5, 30]))) for _ in queries]
-    alone = [answer(snapshot, *one) for one in zip(queries, asked, questions, strict=True)]
+    alone = [answer(snapshot, *one) for one in zip(queries, requests, questions, strict=True)]
     glances = QueryBatcher()
 
     def first_waits(*arguments: Any) -> Any:
@@ -170,9 +172,9 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
 
     monkeypatch.setattr(sign_code_search, "scan_first_level", first_waits)
 
-    def ask(number: int) -> SearchResult:
+    def ask(number: int) -> SearchResponse:
         return executor.execute_query(
-            snapshot, queries[number], asked[number], questions[number], glances
+            snapshot, queries[number], requests[number], questions[number], glances
         )
 
     with ThreadPoolExecutor(len(queries)) as threads:

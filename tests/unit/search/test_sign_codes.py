@@ -96,8 +96,8 @@ def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:
     turn = get_rotation(ANYLOC)
     cosines = queries.astype(np.float64) @ rows.T.astype(np.float64)
     apart = np.abs(cosines) < 0.9
-    turned, asked = turn.rotate(rows), turn.rotate(queries)
-    signs, asked_signs = np.sign(turned), np.sign(asked)
+    turned, searched = turn.rotate(rows), turn.rotate(queries)
+    signs, asked_signs = np.sign(turned), np.sign(searched)
     for bits in (4096, 16_384, ANYLOC):
         same = (asked_signs[:, :bits] @ signs[:, :bits].T) / bits  # 1 - 2 h / m
         errors = (np.cos(math.pi * (1 - same) / 2) - cosines)[apart]
@@ -105,7 +105,7 @@ def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:
         assert 0.95 < errors.std() / deviation < 1.05, bits
         assert np.abs(errors).max() / deviation < 5.5, bits
     norms = np.abs(turned).sum(axis=1, dtype=np.float64)
-    errors = (asked @ signs.T / norms - cosines)[apart]
+    errors = (searched @ signs.T / norms - cosines)[apart]
     flat = norms**2 / ANYLOC
     deviations = np.broadcast_to(np.sqrt((1 / flat - 1) / (ANYLOC - 1)), cosines.shape)[apart]
     assert 0.95 < (errors / deviations).std() < 1.05

@@ -64,8 +64,8 @@ def test_queries_on_the_map_have_positives_and_those_outside_are_200_metres_away
 def test_nothing_to_learn_from_lies_within_200_metres_of_a_query_or_the_database(
     plan: CityPlan,
 ) -> None:
-    asked = positions(of_role(plan, "database") + of_role(plan, "query"))
-    found = positives_within(positions(of_role(plan, "train")), asked, within_m=200.0)
+    searched = positions(of_role(plan, "database") + of_role(plan, "query"))
+    found = positives_within(positions(of_role(plan, "train")), searched, within_m=200.0)
     assert not any(len(row) for row in found)
 
 

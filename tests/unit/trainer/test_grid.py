@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from services.trainer import run
 from services.trainer.arguments import build_arguments, save_yaml, to_plain_dict
 from services.trainer.grid import (
     GridPlan,
     PlannedRun,
-    RunFunctions,
     RunState,
     load_grid_plan,
     load_outcome,
@@ -67,7 +67,9 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
         ("bases: {}", "bad_grid", "Did you mean base"),
         ("base: {lr: 1}", "bad_grid", "nothing to train"),
         ("grid: {lrr: [1]}", "unknown_argument", "Did you mean lr"),
-        ("grid: {lr: 1}", "bad_grid", "a list of values"),
+        ("grid: {lr: 1}", "bad_grid", "grid.lr: Input should be a valid list"),
+        ("runs: [{name: a, published: {s/R1: high}}]", "bad_grid", "s/R1: Input should be a"),
+        ("base: [1]", "bad_grid", "base: Input should be a valid dict"),
         ("runs: [{name: a}, {name: a}]", "bad_grid", "several runs are called a"),
         ("runs: [{name: a, run_name: b}]", "bad_grid", "--out"),
         ("runs: [{name: a, loss_name: Best}]", "unknown_loss", "a: There is no loss"),
@@ -136,10 +138,10 @@ class Runs:
         return report
 
     def go(self, plan: GridPlan) -> list[Any]:
-        trainer = RunFunctions(self.begin, self.resume)
-        return run_grid(
-            plan, self.out, trainer, NullDisplay(), StopRequest(), lambda outcomes: None
-        )
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(run, "run", self.begin)
+            patched.setattr(run, "resume", self.resume)
+            return run_grid(plan, self.out, NullDisplay(), StopRequest(), lambda outcomes: None)
 
 
 def report_of(score: float, arguments: Any) -> dict[str, Any]:

@@ -217,8 +217,8 @@ def test_an_anchor_without_negatives_costs_nothing_and_has_a_finite_gradient() -
     loss = make_loss("NTXentLoss")(rows, LABELS, pairs)
     far = math.exp(S[0, 5] / 0.07) + math.exp(S[0, 6] / 0.07)
     near = math.exp(S[0, 1] / 0.07)
-    wanted = -math.log(near / (near + far)) / 2
-    assert float(loss.detach()) == pytest.approx(wanted, rel=1e-5)
+    expected = -math.log(near / (near + far)) / 2
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
     loss.backward()
     assert rows.grad is not None
     assert bool(rows.grad.isfinite().all())

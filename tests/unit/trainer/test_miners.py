@@ -61,9 +61,9 @@ def angle(a: int, p: int, n: int) -> float:
 
 
 def test_angular_keeps_triplets_with_a_wide_angle_at_the_negative() -> None:
-    wanted = [triplet for triplet in TRIPLETS if angle(*triplet) > 20]
-    assert 0 < len(wanted) < len(TRIPLETS)
-    assert list(zip(*mine("AngularMiner"), strict=True)) == wanted
+    expected = [triplet for triplet in TRIPLETS if angle(*triplet) > 20]
+    assert 0 < len(expected) < len(TRIPLETS)
+    assert list(zip(*mine("AngularMiner"), strict=True)) == expected
 
 
 @pytest.mark.parametrize("numbers_at_once", [1, 100, 1 << 22])
@@ -73,10 +73,10 @@ def test_angular_finds_the_librarys_triplets_in_its_order_however_small_its_step
 ) -> None:
     rows = normalise_rows(torch.randn(48, 16, generator=torch.Generator().manual_seed(0)))
     labels = torch.tensor([0, 1, 2, 3, 4, 5] * 8)
-    wanted = miners.AngularMiner(angle=degrees)(rows, labels)
+    expected = miners.AngularMiner(angle=degrees)(rows, labels)
     found = AngularMiner(degrees, numbers_at_once)(rows, labels)
-    assert len(wanted[0])
-    for ours, theirs in zip(found, wanted, strict=True):
+    assert len(expected[0])
+    for ours, theirs in zip(found, expected, strict=True):
         assert torch.equal(ours, theirs)
 
 
@@ -135,9 +135,9 @@ def test_batch_easy_hard_takes_the_nearest_positive_and_the_nearest_negative_bey
 def test_triplet_margin_keeps_semihard_triplets(margin: float) -> None:
     """Schroff et al. 2015, eq. 4: the negative is farther than the positive, but not by more than
     the margin."""
-    wanted = [(a, p, n) for a, p, n in TRIPLETS if 0 < D[a, n] - D[a, p] <= margin]
-    assert 0 < len(wanted) < len(TRIPLETS)
-    assert list(zip(*mine("TripletMarginMiner", margin), strict=True)) == wanted
+    expected = [(a, p, n) for a, p, n in TRIPLETS if 0 < D[a, n] - D[a, p] <= margin]
+    assert 0 < len(expected) < len(TRIPLETS)
+    assert list(zip(*mine("TripletMarginMiner", margin), strict=True)) == expected
 
 
 def test_pair_margin_keeps_positives_below_and_negatives_above_a_cosine() -> None:

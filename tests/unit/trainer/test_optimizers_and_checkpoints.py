@@ -16,40 +16,37 @@ from services.trainer.checkpointing import (
     restore_rng_state,
     rng_state,
 )
-from services.trainer.module import learning_rate, make_optimizer
 from services.trainer.resolve import check_loggers, resolve_device
+from services.trainer.training_loop import learning_rate, make_optimizer
 from shared.errors import InvalidRequest, Misconfigured
 
-
-def rate(step: int, epoch: int, warmup_steps: int = 600) -> float:
-    return learning_rate(
-        step, epoch, lr=2e-4, warmup_steps=warmup_steps, milestones=(5, 10, 15, 25), lr_mult=0.3
-    )
+STEPS_PER_EPOCH = 626
 
 
 @pytest.mark.parametrize(
-    ("step", "epoch", "expected"),
+    ("step", "expected"),
     [
-        (0, 0, 2e-4 / 600),
-        (299, 0, 1e-4),
-        (599, 0, 2e-4),
-        (600, 0, 2e-4),
-        (3000, 4, 2e-4),
-        (3130, 5, 6e-5),
-        (6260, 10, 1.8e-5),
-        (9390, 15, 5.4e-6),
-        (15650, 25, 1.62e-6),
-        (18780, 29, 1.62e-6),
+        (0, 2e-4 / 600),
+        (299, 1e-4),
+        (599, 2e-4),
+        (600, 2e-4),
+        (3129, 2e-4),
+        (3130, 6e-5),
+        (6260, 1.8e-5),
+        (9390, 5.4e-6),
+        (15650, 1.62e-6),
+        (18780, 1.62e-6),
     ],
 )
 def test_the_rate_rises_over_the_warm_up_and_falls_at_milestones(
-    step: int, epoch: int, expected: float
+    step: int, expected: float
 ) -> None:
-    assert rate(step, epoch) == pytest.approx(expected)
+    assert learning_rate(step, STEPS_PER_EPOCH, TrainingArguments()) == pytest.approx(expected)
 
 
 def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
-    assert rate(0, 0, warmup_steps=0) == pytest.approx(2e-4)
+    arguments = TrainingArguments(warmpup_steps=0)
+    assert learning_rate(0, STEPS_PER_EPOCH, arguments) == pytest.approx(2e-4)
 
 
 @pytest.mark.parametrize(

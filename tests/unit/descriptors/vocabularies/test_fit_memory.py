@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.fit_memory import CLUSTERS, PATCHES, WIDTH
+from tests.unit.descriptors.vocabularies.fit_memory import CLUSTERS, PATCHES, WIDTH
 
 REPOSITORY = Path(__file__).parents[4]
 ALL_FEATURES_BYTES = 2000 * PATCHES * WIDTH * 4  # 786 MB
@@ -16,7 +16,7 @@ ALL_FEATURES_BYTES = 2000 * PATCHES * WIDTH * 4  # 786 MB
 
 def fit_in_its_own_process(photos: int) -> dict[str, int]:
     child = subprocess.run(
-        [sys.executable, "-m", "tests.support.fit_memory", str(photos)],
+        [sys.executable, "-m", "tests.unit.descriptors.vocabularies.fit_memory", str(photos)],
         cwd=REPOSITORY,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -24,9 +24,9 @@ def fit_in_its_own_process(photos: int) -> dict[str, int]:
         check=False,
     )
     assert child.returncode == 0, child.stderr
-    said: dict[str, int] = json.loads(child.stdout)
-    assert (said["photos"], said["clusters"]) == (photos, CLUSTERS)
-    return said
+    body: dict[str, int] = json.loads(child.stdout)
+    assert (body["photos"], body["clusters"]) == (photos, CLUSTERS)
+    return body
 
 
 def test_a_fit_on_two_thousand_photos_takes_no_more_memory_than_one_on_five_hundred() -> None:

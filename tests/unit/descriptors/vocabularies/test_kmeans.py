@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shared.descriptors.aggregation import assign_clusters
 from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
-from tests.support.points import unit_points
+from tests.unit.descriptors.vocabularies.points import unit_points
 
 
 def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:

@@ -16,7 +16,7 @@ from shared.descriptors.patches import (
     sample_photos,
 )
 from shared.storage import FolderStore
-from tests.support.points import unit_points
+from tests.unit.descriptors.vocabularies.points import unit_points
 
 WIDTH = 8
 PHOTOS = 10

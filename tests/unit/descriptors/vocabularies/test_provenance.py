@@ -67,8 +67,8 @@ def test_a_vocabulary_of_other_features_is_refused_with_both_specs(
     own = feature_provenance(tiny)
     error = refusal({**own, key: other}, tiny)
     assert error.extra == {"learnt_with": {**own, key: other}, "extractor_makes": own}
-    said = "version 2" if isinstance(other, dict) else str(other)[:12]
-    assert said in error.detail
+    reported = "version 2" if isinstance(other, dict) else str(other)[:12]
+    assert reported in error.detail
     for part in ("test-tiny-vlad", "test-tiny (weights", "layer projection", "square32 version 1"):
         assert part in error.detail
 

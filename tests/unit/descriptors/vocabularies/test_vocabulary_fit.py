@@ -10,12 +10,17 @@ from shared.descriptors import vocabulary_fit as batches_module
 from shared.descriptors.aggregation import assign_clusters
 from shared.descriptors.vocabulary_fit import (
     PATCHES_PER_CLUSTER,
-    InMemoryPoints,
     PointBatches,
     VocabularyFit,
 )
 from shared.errors import Unprocessable
-from tests.support.points import clustered_points, full_kmeans, mean_cosine, unit_points
+from tests.unit.descriptors.vocabularies.points import (
+    InMemoryPoints,
+    clustered_points,
+    full_kmeans,
+    mean_cosine,
+    unit_points,
+)
 
 
 def finish(fit: VocabularyFit) -> torch.Tensor:

@@ -70,8 +70,8 @@ def check(aggregator: Aggregator, formula: Callable[[Array, Weights], Array]) ->
     rows = aggregator(maps, None) if aggregator.takes_token else aggregator(maps)
     assert rows.dtype == torch.float32
     assert rows.shape == (3, aggregator.dimension)
-    wanted = [unit(formula(photo.double().numpy(), weights)) for photo in maps]
-    np.testing.assert_allclose(rows.detach(), np.stack(wanted), atol=2e-6)
+    expected = [unit(formula(photo.double().numpy(), weights)) for photo in maps]
+    np.testing.assert_allclose(rows.detach(), np.stack(expected), atol=2e-6)
 
 
 def test_average_is_the_mean_of_each_channel() -> None:
@@ -92,9 +92,9 @@ def test_gem_takes_another_power_and_learns_it() -> None:
     gem = GeM(CHANNELS, p=4.5)
     maps = some_maps()
     means = np.maximum(maps.double().numpy(), 1e-6) ** 4.5
-    wanted = [unit(photo.mean(axis=(1, 2)) ** (1 / 4.5)) for photo in means]
+    expected = [unit(photo.mean(axis=(1, 2)) ** (1 / 4.5)) for photo in means]
     rows = gem(maps)
-    np.testing.assert_allclose(rows.detach(), wanted, atol=1e-6)
+    np.testing.assert_allclose(rows.detach(), expected, atol=1e-6)
     rows[0, 0].backward()
     assert float(gem.pool.p.grad) != 0  # type: ignore[arg-type]
 
@@ -204,8 +204,8 @@ def test_salad_takes_the_class_token_where_there_is_one() -> None:
     maps, token = some_maps(), torch.randn(3, CHANNELS, generator=torch.Generator().manual_seed(2))
     rows = salad(maps, token).detach()
     for row, photo, one in zip(rows, maps, token, strict=True):
-        wanted = unit(salad_row(photo.double().numpy(), one.double().numpy(), weights, 4))
-        np.testing.assert_allclose(row, wanted, atol=2e-6)
+        expected = unit(salad_row(photo.double().numpy(), one.double().numpy(), weights, 4))
+        np.testing.assert_allclose(row, expected, atol=2e-6)
 
 
 def test_transport_keeps_the_masses() -> None:
@@ -242,10 +242,10 @@ def test_boq_asks_each_blocks_positions_with_learnt_queries() -> None:
             hidden = np.maximum(linear(b, "encoder.linear1", x), 0)
             x = layer_norm(b, "encoder.norm2", x + linear(b, "encoder.linear2", hidden))
             learnt = b["queries"][0]
-            asked = layer_norm(
+            searched = layer_norm(
                 b, "norm_queries", learnt + attention(b, "among_queries", learnt, learnt)
             )
-            found.append(layer_norm(b, "norm_out", attention(b, "to_positions", asked, x)))
+            found.append(layer_norm(b, "norm_out", attention(b, "to_positions", searched, x)))
         return linear(w, "rows", np.concatenate(found).T)  # (width, row_dim)
 
     check(BoQ(CHANNELS, proj_channels=128, num_queries=5, num_layers=2, row_dim=3), formula)

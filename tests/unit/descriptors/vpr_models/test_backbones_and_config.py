@@ -20,7 +20,8 @@ from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
 from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
-from tests.support.vit import PLAIN, plain_forward, random_weights, save
+from tests.support.vit import PLAIN, random_weights, save
+from tests.unit.descriptors.dinov2_reference import plain_forward
 
 CPU = torch.device("cpu")
 
@@ -132,7 +133,7 @@ def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> N
 
 
 @pytest.mark.parametrize(
-    ("changes", "code", "said"),
+    ("changes", "code", "message"),
     [
         ({"backbone_arch": "vgg16"}, "unknown_backbone", "resnet18, resnet34"),
         ({"agg_arch": "fisher"}, "unknown_aggregator", "CosPlace, AVG, GeM"),
@@ -152,9 +153,9 @@ def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> N
     ],
 )
 def test_what_can_not_be_built_is_refused_with_the_reason(
-    changes: dict[str, Any], code: str, said: str
+    changes: dict[str, Any], code: str, message: str
 ) -> None:
-    with pytest.raises(Unprocessable, match=said) as refused:
+    with pytest.raises(Unprocessable, match=message) as refused:
         laid_out(**changes)
     assert refused.value.code == code
 
@@ -173,13 +174,13 @@ def test_mixvpr_and_salad_refuse_photos_of_a_size_that_they_were_not_made_for() 
 def test_cropping_leaves_the_layers_before_as_they_are() -> None:
     torch.manual_seed(0)
     whole = build_backbone(config(), None)
-    wanted: list[torch.Tensor] = []
-    whole.stages[1].register_forward_hook(lambda _m, _i, out: wanted.append(out))
+    expected: list[torch.Tensor] = []
+    whole.stages[1].register_forward_hook(lambda _m, _i, out: expected.append(out))
     torch.manual_seed(0)
     cropped = build_backbone(config(layers_to_crop=[3]), None)
     with torch.inference_mode():
         whole(noise())
-        assert torch.equal(cropped(noise()).maps, wanted[0])
+        assert torch.equal(cropped(noise()).maps, expected[0])
     assert config(layers_to_crop=[3]).stages == config(layers_to_crop=[4, 3]).stages == 2
     assert not any(name.startswith("stages.2") for name in cropped.state_dict())
 
@@ -240,9 +241,9 @@ def test_dinov2_makes_the_tokens_of_a_whole_forward_pass_and_norms_them(tmp_path
     assert maps.shape == (2, PLAIN.width, 4, 5)
     assert token is not None
     assert token.shape == (2, PLAIN.width)
-    wanted = plain_forward(weights, PLAIN, pixels)[-1]["token"]
+    expected = plain_forward(weights, PLAIN, pixels)[-1]["token"]
     features = normalise_features(plain.flatten(2).transpose(1, 2))
-    np.testing.assert_allclose(features, wanted, atol=1e-4)
+    np.testing.assert_allclose(features, expected, atol=1e-4)
     normed = torch.nn.functional.layer_norm(
         plain.permute(0, 2, 3, 1),
         (PLAIN.width,),
@@ -260,9 +261,9 @@ def test_lite0_with_its_published_weights_is_the_embedded_defaults_network() -> 
     photos = normalise_pixels(torch.from_numpy(pixels), IMAGENET_MEAN, IMAGENET_STD)
     with torch.inference_mode():
         maps = build_backbone(chosen, None)(photos).maps
-    wanted = EfficientNetLite0(CPU).features(torch.from_numpy(pixels))
+    expected = EfficientNetLite0(CPU).features(torch.from_numpy(pixels))
     features = normalise_features(maps.flatten(2).transpose(1, 2))
-    np.testing.assert_allclose(features, wanted, atol=1e-4)
+    np.testing.assert_allclose(features, expected, atol=1e-4)
 
 
 @pytest.fixture
@@ -282,14 +283,14 @@ def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_pretrained_weights_come_from_the_cache_or_from_a_file(no_network: Path) -> None:
     torch.manual_seed(5)
     published = torchvision.models.resnet18().state_dict()
-    wanted = published["layer2.1.conv2.weight"]
+    expected = published["layer2.1.conv2.weight"]
     file = no_network / "mine.safetensors"
     save_file(published, file)
     given = build_vpr_model(config(pretrained=True), weights=file)
-    assert torch.equal(given.state_dict()["backbone.stages.1.1.conv2.weight"], wanted)
+    assert torch.equal(given.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
     torch.save(published, no_network / "resnet18-f37072fd.pth")
     cached = build_vpr_model(config(pretrained=True))
-    assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], wanted)
+    assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
 
 
 def test_weights_that_can_not_be_had_are_missing_and_never_random(no_network: Path) -> None:

@@ -22,7 +22,7 @@ from shared.descriptors.vpr_models.checkpoint import (
 from shared.descriptors.vpr_models.config import VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
 from shared.errors import NotFound, Unprocessable
-from tests.support.fit_memory import forget_peak_memory, memory_bytes
+from tests.support.memory import memory_bytes, reset_peak_memory
 
 SWOLLEN_BYTES = 256 << 20
 ZEROS = bytes(4 << 20)
@@ -138,10 +138,10 @@ def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_pat
         "expected (64, 3, 7, 7)": tensors | {stem: torch.zeros(64, 1, 7, 7)},
         "is not a tensor": tensors | {stem: "a word"},
     }
-    for said, changed in faults.items():
+    for reported, changed in faults.items():
         error = refusal(saved(tmp_path / "other.ckpt", state | {"state_dict": changed}))
         assert error.code == "checkpoint_unfit"
-        assert said in error.detail
+        assert reported in error.detail
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_a_hostile_checkpoint_is_refused_before_it_swells(
         swollen = "data/0" if kind == "storage" else "data.pkl"
         file, why = deflated(data, path, swollen), "compressed or overlap"
     assert file.stat().st_size < len(data) + 1_000_000
-    forget_peak_memory()
+    reset_peak_memory()
     before = memory_bytes("VmHWM")
     assert why in refusal(file).detail
     assert memory_bytes("VmHWM") - before < SWOLLEN_BYTES / 4

@@ -1,0 +1,223 @@
+"""Load generator: synthetic JPEGs, an HTTP client with little overhead, counts of described photos.
+
+The client shares the machine with the measured services. Request bodies are therefore built before
+the clock starts, and are sent over persistent connections without a framework.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from http.client import HTTPConnection, HTTPException
+from typing import Any, Self
+from urllib.parse import urlsplit
+from uuid import UUID
+
+import numpy as np
+from PIL import Image
+from sqlalchemy import func, select
+
+from shared.catalog.jobs import UNFINISHED_STATES
+from shared.catalog.session import Catalog
+from shared.jobs import Job, JobKind, JobState
+from shared.storage import ObjectStore
+from tests.support.server import SERVICES_KEY
+
+BOUNDARY = "placewise-bench"
+CONTENT_TYPE = {"Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+AUTH_HEADER = {"Authorization": f"Bearer {SERVICES_KEY}"}
+TIMEOUT_SECONDS = 60.0
+MAX_JPEG_QUALITY, MIN_JPEG_QUALITY = 95, 5  # JPEG qualities
+
+_numbers = itertools.count()
+
+
+@dataclass(frozen=True, slots=True)
+class HttpResponse:
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class HttpCaller:
+    """HTTP client of one server with a persistent connection per thread; a context manager."""
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        assert parts.hostname is not None
+        self.url = url
+        self._address = parts.hostname, parts.port
+        self._own = threading.local()
+        self._connections: list[HTTPConnection] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections; call it after the threads that use them have ended."""
+        for connection in self._connections:
+            connection.close()
+
+    def call(
+        self, method: str, path: str, body: bytes | None = None, **headers: str
+    ) -> HttpResponse:
+        """Return the response of any status; OSError or HTTPException if there is none."""
+        connection: HTTPConnection | None = getattr(self._own, "connection", None)
+        if connection is None:
+            connection = HTTPConnection(*self._address, timeout=TIMEOUT_SECONDS)
+            self._own.connection = connection
+            self._connections.append(connection)
+        try:
+            connection.request(method, path, body, AUTH_HEADER | headers)
+            answer = connection.getresponse()
+            return HttpResponse(answer.status, dict(answer.getheaders()), answer.read())
+        except (OSError, HTTPException):
+            connection.close()
+            raise
+
+    def post_form(self, path: str, form: bytes, **headers: str) -> HttpResponse:
+        return self.call("POST", path, form, **CONTENT_TYPE, **headers)
+
+
+def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
+    """Create JPEGs of about `size_bytes`, each with another texture."""
+    rng = np.random.default_rng(0)
+    return [_make_jpeg(rng, size, size_bytes) for _ in range(count)]
+
+
+def _make_jpeg(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> bytes:
+    """Combine coarse noise (makes photos differ) with fine noise (gives a realistic file size)."""
+    width, height = size
+    coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
+    fine = Image.fromarray(rng.integers(0, 256, (height // 4, width // 4, 3), dtype=np.uint8))
+    image = Image.blend(
+        coarse.resize(size, Image.Resampling.BICUBIC),
+        fine.resize(size, Image.Resampling.BICUBIC),
+        0.35,
+    )
+    rough, sharp = MIN_JPEG_QUALITY, MAX_JPEG_QUALITY
+    while sharp - rough > 1:
+        middle = (rough + sharp) // 2
+        rough, sharp = (
+            (middle, sharp) if len(_encode_jpeg(image, middle)) <= size_bytes else (rough, middle)
+        )
+    return _encode_jpeg(image, rough)
+
+
+def _encode_jpeg(image: Image.Image, quality: int) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
+
+
+def multipart_form(photo: bytes, filename: str = "photo.jpg") -> bytes:
+    """Build a multipart form with the photo as a unique file.
+
+    Bytes after the end of the JPEG change its hash but no pixel.
+    """
+    head = (
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="file"; filename="{filename}"\r\n'
+        "Content-Type: image/jpeg\r\n\r\n"
+    )
+    return b"".join(
+        (
+            head.encode(),
+            photo,
+            f"{next(_numbers):020d}".encode(),
+            f"\r\n--{BOUNDARY}--\r\n".encode(),
+        )
+    )
+
+
+def multipart_forms(photos: Sequence[bytes], count: int) -> list[bytes]:
+    """Build `count` forms; the photos are repeated."""
+    return [multipart_form(photos[number % len(photos)]) for number in range(count)]
+
+
+def upload_all(
+    url: str,
+    forms: Sequence[bytes],
+    clients: int,
+    *,
+    path: str = "/api/v1/upload",
+    on_done: Callable[[], object] = lambda: None,
+) -> list[Any]:
+    """Upload all files with `clients` threads and return the JSON responses.
+
+    Raises:
+        AssertionError: an upload was not accepted.
+    """
+    with HttpCaller(url) as caller:
+
+        def upload(form: bytes) -> Any:
+            answer = caller.post_form(path, form)
+            assert answer.status < 300, answer.body
+            on_done()
+            return answer.json()
+
+        with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
+            return list(pool.map(upload, forms))
+
+
+POLL_SECONDS = 0.2
+MANIFEST_SUFFIX = ".json"
+
+
+def count_descriptions(store: ObjectStore) -> Counter[UUID]:
+    """Count how often each photo was described.
+
+    A worker writes its chunk and a manifest of its photos before it tries to commit. Duplicate work
+    is therefore counted even if only one of two workers could commit. The counts are valid while
+    the steward does not merge chunks (COMPACT_CHUNKS, SLOT_ROWS).
+    """
+    found: Counter[UUID] = Counter()
+    for info in store.list("chunks/"):
+        if info.key.endswith(MANIFEST_SUFFIX):
+            found.update(UUID(name) for name in json.loads(store.get(info.key))["photo_ids"])
+    return found
+
+
+def wait_for_jobs(
+    catalog: Catalog, seconds: float, on_left: Callable[[int], object] = lambda left: None
+) -> None:
+    """Wait until every stored photo is described.
+
+    Raises:
+        AssertionError: a job failed, or the timeout has passed.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        with catalog.read() as session:
+            counts: dict[str, int] = dict(
+                session.execute(
+                    select(Job.state, func.count())
+                    .where(Job.kind == JobKind.INDEX)
+                    .group_by(Job.state)
+                ).all()
+            )
+        assert not counts.get(JobState.FAILED), f"{counts[JobState.FAILED]} photos have failed"
+        left = sum(counts.get(state, 0) for state in UNFINISHED_STATES)
+        on_left(left)
+        if not left:
+            return
+        assert time.monotonic() < deadline, f"{left} photos wait after {seconds:g} s"
+        time.sleep(POLL_SECONDS)
+
+
+def load_jobs(catalog: Catalog, job_ids: Collection[UUID]) -> list[Job]:
+    """Load the current state of jobs."""
+    with catalog.read() as session:
+        return list(session.scalars(select(Job).where(Job.id.in_(job_ids))))

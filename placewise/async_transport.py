@@ -1,0 +1,219 @@
+"""HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
+
+`transport.py` is generated from this file by `make client`. Edit this file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self, TypeVar
+
+import httpx2
+
+from placewise.protocol import (
+    API,
+    CHUNK_BYTES,
+    IDEMPOTENCY_KEY,
+    TIMEOUT_SECONDS,
+    Json,
+    OnWait,
+    RetryPolicy,
+    drop_none,
+    open_file,
+    printable_name,
+    response_error,
+    validate_url,
+)
+from shared.errors import Conflict, TooManyRequests, Unavailable
+from shared.ids import new_id
+
+PAGE_SIZE = 1000  # the server's maximum
+
+Answer = TypeVar("Answer")
+
+
+class AsyncTransport:
+    """Connections to one server and one map; close it, or use it as a context manager."""
+
+    def __init__(
+        self,
+        url: str,
+        map_name: str | None = None,
+        key: str | None = None,
+        *,
+        patience_seconds: float = 0.0,
+        on_wait: OnWait = lambda error, seconds: None,
+        timeout_seconds: float = TIMEOUT_SECONDS,
+    ) -> None:
+        """Create a client. No request is sent yet.
+
+        Args:
+            url: URL of the server.
+            map_name: Name of the map; None for the server's default.
+            key: API key; a server on a loopback address may not require one.
+            patience_seconds: How long calls are retried, with exponential backoff, while the
+                server is unreachable or unavailable (503, 507). A busy server (429) is retried as
+                its Retry-After says, without a limit. 0 disables retries.
+            on_wait: Called before each wait with the error and the number of seconds.
+            timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
+
+        Raises:
+            InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
+        """
+        self.url = validate_url(url, key)
+        self._patience = RetryPolicy(patience_seconds, on_wait)
+        self._timeout_seconds = timeout_seconds
+        self._http = httpx2.AsyncClient(
+            base_url=self.url,
+            timeout=timeout_seconds,
+            params={"map": map_name} if map_name else None,
+            headers={"Authorization": f"Bearer {key}"} if key else None,
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.aclose()
+
+    async def aclose(self) -> None:
+        """Close all connections."""
+        await self._http.aclose()
+
+    def with_patience(self, patience_seconds: float, on_wait: OnWait) -> Self:
+        """Return a client that shares the connections and retries calls for another period.
+
+        Args:
+            patience_seconds: How long calls are retried; see `connect`.
+            on_wait: Called before each wait with the error and the number of seconds.
+        """
+        other = copy.copy(self)
+        other._patience = RetryPolicy(patience_seconds, on_wait)
+        return other
+
+    async def _send_file(
+        self, path: str, file: Path, filename: str | None = None, **options: Any
+    ) -> Any:
+        """POST a file as the form field `file`, streamed."""
+        with open_file(file) as stream:
+            files = {"file": (filename or printable_name(file), stream)}
+            return await self._call("POST", path, files=files, **options)
+
+    async def _call(self, method: str, path: str, **options: Any) -> Any:
+        """Send a request with retries and return the JSON of its response.
+
+        `options` are those of the HTTP library, which rewinds `files` before each attempt. All
+        attempts of a POST have the same Idempotency-Key.
+        """
+        if method == "POST" and self._patience.seconds:
+            key = {IDEMPOTENCY_KEY: str(new_id())}
+            options["headers"] = {**options.get("headers", {}), **key}
+
+        async def attempt() -> Any:
+            return (await self._request(self._http, method, f"{API}{path}", **options)).json()
+
+        return await self._retry(attempt)
+
+    async def _get_bytes(self, path: str) -> bytes:
+        """GET a response that is not JSON."""
+
+        async def attempt() -> bytes:
+            return (await self._request(self._http, "GET", f"{API}{path}")).content
+
+        return await self._retry(attempt)
+
+    async def _iterate(self, path: str, field: str, **params: Any) -> AsyncIterator[Json]:
+        """Iterate over all records of a paginated list; pages are fetched on demand."""
+        cursor: str | None = None
+        while True:
+            page_params = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
+            page = await self._call("GET", path, params=page_params)
+            for record in page[field]:
+                yield record
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return
+
+    async def _download(
+        self, path: str, file: BinaryIO, on_received: Callable[[int], object]
+    ) -> None:
+        """Stream a response into a file, which is truncated before each attempt."""
+
+        async def attempt() -> None:
+            file.seek(0)
+            file.truncate()
+            received = 0
+            try:
+                async with self._http.stream("GET", f"{API}{path}") as response:
+                    if not response.is_success:
+                        await response.aread()
+                        raise response_error(response)
+                    async for chunk in response.aiter_bytes(CHUNK_BYTES):
+                        file.write(chunk)
+                        received += len(chunk)
+                        on_received(received)
+            except httpx2.TransportError as error:
+                raise self._unreachable("/", error) from error
+
+        await self._retry(attempt)
+
+    async def _put_presigned(self, upload: Json, file: BinaryIO) -> None:
+        """Send a file to a presigned URL, without the API key."""
+
+        async def attempt() -> None:
+            file.seek(0)
+            async with httpx2.AsyncClient(timeout=self._timeout_seconds) as http:
+                await self._request(
+                    http,
+                    upload["method"],
+                    upload["url"],
+                    content=_iter_chunks(file),
+                    headers=upload["headers"],
+                )
+
+        await self._retry(attempt)
+
+    async def _request(
+        self, http: httpx2.AsyncClient, method: str, url: str, **options: Any
+    ) -> httpx2.Response:
+        """Send one request; an error response is raised as the matching PlacewiseError."""
+        try:
+            response = await http.request(method, url, **options)
+        except httpx2.TransportError as error:
+            raise self._unreachable(url, error) from error
+        if response.is_success:
+            return response
+        raise response_error(response)
+
+    def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
+        host = self.url if url.startswith("/") else httpx2.URL(url).host
+        return Unavailable(
+            "server_unreachable",
+            f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
+        )
+
+    async def _retry(self, call: Callable[[], Awaitable[Answer]]) -> Answer:
+        deadline = time.monotonic() + self._patience.seconds
+        attempt = 0
+        while True:
+            try:
+                return await call()
+            except (Unavailable, TooManyRequests, Conflict) as error:
+                is_late = time.monotonic() >= deadline
+                await asyncio.sleep(self._patience.wait_seconds(error, attempt, is_late))
+                attempt += 1
+
+
+async def _iter_chunks(file: BinaryIO) -> AsyncIterator[bytes]:
+    while chunk := file.read(CHUNK_BYTES):
+        yield chunk

@@ -1,0 +1,166 @@
+"""What both forms of the client share: retry policy, error responses and request bodies."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import httpx2
+
+from shared.errors import (
+    Conflict,
+    InvalidRequest,
+    PlacewiseError,
+    TooManyRequests,
+    error_from_response,
+)
+
+API = "/api/v1"
+IDEMPOTENCY_KEY = "Idempotency-Key"
+POLL_SECONDS = 20.0  # duration of a long poll
+TIMEOUT_SECONDS = 90.0  # per call; exceeds the longest long poll that a server allows
+CHUNK_BYTES = 256 * 1024
+INITIAL_BACKOFF_SECONDS = 0.5  # doubles with each attempt, without Retry-After
+MAX_BACKOFF_SECONDS = 8.0
+MAX_RETRY_AFTER_SECONDS = 300.0  # upper limit for Retry-After
+
+Json = dict[str, Any]
+OnWait = Callable[[PlacewiseError, float], object]
+"""Called before each wait with the error and the number of seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetryPolicy:
+    """How long calls are retried (`seconds`; 0 disables retries), and a callback for waits."""
+
+    seconds: float = 0.0
+    on_wait: OnWait = lambda error, seconds: None
+
+    def wait_seconds(self, error: PlacewiseError, attempt: int, deadline_passed: bool) -> float:
+        """Compute the wait before the next attempt, with exponential backoff and jitter.
+
+        Args:
+            error: The error of the failed attempt.
+            attempt: Number of the failed attempt, from 0.
+            deadline_passed: Whether the retry period is over.
+
+        Returns:
+            Seconds to wait.
+
+        Raises:
+            PlacewiseError: `error` itself, if it is not retryable or the retry period is over.
+        """
+        if not self.seconds or not _is_retryable(error, deadline_passed):
+            raise error
+        retry_after = error.extra.get("retry_after_seconds")
+        if retry_after is None:
+            # Jitter of up to a quarter keeps clients from retrying at the same time.
+            backoff = min(INITIAL_BACKOFF_SECONDS * 2.0**attempt, MAX_BACKOFF_SECONDS)
+            seconds = backoff * random.uniform(1, 1.25)  # noqa: S311
+        else:
+            seconds = min(max(float(retry_after), INITIAL_BACKOFF_SECONDS), MAX_RETRY_AFTER_SECONDS)
+        self.on_wait(error, seconds)
+        return seconds
+
+
+def _is_retryable(error: PlacewiseError, deadline_passed: bool) -> bool:
+    """Whether a retry may succeed."""
+    if isinstance(error, TooManyRequests):
+        return True
+    if isinstance(error, Conflict):  # our earlier attempt, whose response was lost, still runs
+        return error.code == "idempotency_key_in_use" and not deadline_passed
+    return not deadline_passed
+
+
+def validate_url(url: str, key: str | None) -> str:
+    """Validate a server's URL and API key; returns the URL without a trailing slash.
+
+    Raises:
+        InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
+    """
+    if key is not None and not (key.isascii() and key.isprintable()):
+        raise InvalidRequest("bad_key", "An API key must consist of printable ASCII characters.")
+    if not url.startswith(("http://", "https://")):
+        raise InvalidRequest(
+            "bad_address", f"{url!r} is not a valid URL such as http://127.0.0.1:8000."
+        )
+    return url.rstrip("/")
+
+
+def response_error(response: httpx2.Response) -> PlacewiseError:
+    """Convert an error response to a PlacewiseError."""
+    error = error_from_response(response.status_code, response.text)
+    retry_after = response.headers.get("retry-after", "")
+    if retry_after.isdigit():  # may also come from a proxy, without a problem document
+        error.extra.setdefault("retry_after_seconds", int(retry_after))
+    return error
+
+
+@contextlib.contextmanager
+def open_file(file: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading; InvalidRequest (`unreadable_file`) if that fails."""
+    try:
+        with file.open("rb") as stream:
+            yield stream
+    except OSError as error:
+        raise unreadable_file_error(file, error) from error
+
+
+def unreadable_file_error(file: Path, error: OSError) -> InvalidRequest:
+    """The error of a file that can't be read."""
+    return InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}")
+
+
+def printable_name(file: Path) -> str:
+    """The file's name as text; bytes that are not UTF-8 are replaced."""
+    return os.fsencode(file.name).decode("utf-8", "replace")
+
+
+def size_and_sha256(file: BinaryIO) -> tuple[int, str]:
+    """Size in bytes and hexadecimal SHA-256 of a file."""
+    sha256 = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+    return file.tell(), sha256
+
+
+def drop_none(**params: Any) -> Json:
+    """The keyword arguments that are not None."""
+    return {name: value for name, value in params.items() if value is not None}
+
+
+def to_jsonl(objects: Sequence[Json]) -> bytes:
+    """Encode objects as JSONL."""
+    return b"".join(json.dumps(item).encode() + b"\n" for item in objects)
+
+
+class ReadProgressFile(io.BufferedIOBase):
+    """A file wrapper that reports the position after each read."""
+
+    def __init__(self, file: BinaryIO, on_read: Callable[[int], object]) -> None:
+        self._file = file
+        self._on_read = on_read
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = self._file.read(-1 if size is None else size)
+        self._on_read(self._file.tell())
+        return data
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

@@ -1,0 +1,112 @@
+"""The journal of `placewise index --journal FILE`: the uploads that a server has acknowledged."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from services.cli.ingest.geotags import LocalPhoto
+from services.cli.output import printable_path
+from shared.errors import InvalidRequest, Misconfigured
+
+JOURNAL_FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """A photo whose upload the server has acknowledged."""
+
+    file_id: str
+    job_id: str | None
+
+
+class UploadJournal:
+    """A JSONL file with one line per photo, appended when the server acknowledges the upload.
+
+    A photo counts as uploaded while its file's size and modification time and its metadata are
+    unchanged. An incomplete last line, left by a killed process, is ignored. A journal belongs to
+    one server and one map.
+
+    Raises:
+        InvalidRequest: `bad_journal` if the file is not a journal of this server and map.
+        Misconfigured: `out_unwritable` if the file can't be read or written.
+    """
+
+    def __init__(self, path: Path, url: str, map_name: str | None) -> None:
+        self._path = path
+        self._done: dict[str, dict[str, Any]] = {}
+        header = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
+        try:
+            text = path.read_text() if path.exists() else ""
+            self._read(text, header)
+            self._file = path.open("a")
+            if not text:
+                self._write(header)
+            elif not text.endswith("\n"):
+                self._file.write("\n")  # ends an incomplete last line
+        except (OSError, UnicodeDecodeError) as error:
+            raise Misconfigured(
+                "out_unwritable", f"Can't use the journal {printable_path(path)}: {error}."
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def done(self, photo: LocalPhoto) -> JournalEntry | None:
+        """The recorded upload of the photo, or None if it is new or has changed."""
+        line = self._done.get(printable_path(photo.path))
+        if line is None or line["state"] != _file_state(photo):
+            return None  # a missing file is reported by the upload itself
+        return JournalEntry(line["file_id"], line["job_id"])
+
+    def add(self, photo: LocalPhoto, entry: JournalEntry) -> None:
+        """Record an acknowledged upload."""
+        self._write(
+            {
+                "path": printable_path(photo.path),
+                "state": _file_state(photo),
+                "file_id": entry.file_id,
+                "job_id": entry.job_id,
+            }
+        )
+
+    def _write(self, line: dict[str, Any]) -> None:
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+
+    def _read(self, text: str, header: dict[str, Any]) -> None:
+        lines = []
+        for line in text.splitlines():
+            try:
+                lines.append(json.loads(line))
+            except ValueError:
+                continue  # incomplete: the process was killed while writing it
+        if not text:
+            return
+        if not lines or lines[0] != header:
+            raise InvalidRequest(
+                "bad_journal",
+                f"{printable_path(self._path)} is not a journal of this server and map. Use "
+                "another file.",
+            )
+        self._done = {line["path"]: line for line in lines[1:]}
+
+
+def _file_state(photo: LocalPhoto) -> list[Any]:
+    """The file attributes and metadata whose change requires a new upload, as JSON."""
+    try:
+        stat = photo.path.stat()
+    except OSError:
+        return []
+    return [stat.st_size, stat.st_mtime_ns, photo.name, dict(sorted(photo.fields.items()))]

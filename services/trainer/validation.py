@@ -1,0 +1,107 @@
+"""Validation: recall@k of a network on evaluation sets, by the code of `placewise evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from services.trainer.arguments import TrainingArguments
+from services.trainer.model_describer import ModelDescriber
+from services.trainer.run_control import StopRequest
+from shared.datasets.dataset import EvaluationSet
+from shared.evaluation.ranking import Recalls, evaluate_recall
+
+BATCH_PHOTOS = 32
+
+ProgressCallback = Callable[[str, int, int], None]
+
+
+class Validator:
+    """Computes the recalls of a network on evaluation sets.
+
+    Validation photos are resized to `image_size`, test photos to `test_image_size`.
+    """
+
+    def __init__(
+        self,
+        arguments: TrainingArguments,
+        device: torch.device,
+        on_progress: ProgressCallback,
+        stop: StopRequest,
+    ) -> None:
+        self._arguments = arguments
+        self._device = device
+        self._on_progress = on_progress
+        self._stop = stop
+
+    def measure(
+        self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
+    ) -> dict[str, Recalls]:
+        """Evaluate the network on each set.
+
+        Args:
+            model: (B, 3, H, W) float32 -> (B, D); its training mode is restored afterwards.
+            sets: the evaluation sets.
+            for_tests: use `test_image_size` instead of `image_size`.
+
+        Returns:
+            Recalls by set name.
+
+        Raises:
+            RunStopped: a stop was requested; also raises what describing and searching raise.
+        """
+        size = self._test_size() if for_tests else self._arguments.image_size
+        describe = ModelDescriber(
+            model, self._device, size, batch_photos=1 if size is None else BATCH_PHOTOS
+        )
+        recalls = {}
+        for each in sets:
+
+            def on_progress(what: str, done: int, total: int, name: str = each.name) -> None:
+                self._stop.check()
+                self._on_progress(f"{name}: {what}", done, total)
+
+            result = evaluate_recall(
+                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=on_progress
+            )
+            recalls[each.name] = result.recalls
+        return recalls
+
+    def sanity_check(
+        self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int
+    ) -> None:
+        """Evaluate the first `batches` of each set (-1: all), to find errors before training."""
+        limit = batches * BATCH_PHOTOS if batches >= 0 else None
+        truncated = [
+            replace(
+                each,
+                database=each.database[:limit],
+                queries=each.queries[:limit],
+                positives=tuple(
+                    rows if limit is None else rows[rows < limit] for rows in each.positives[:limit]
+                ),
+            )
+            for each in sets
+        ]
+        if batches:
+            self.measure(model, truncated)
+
+    def _test_size(self) -> tuple[int, int] | None:
+        size = self._arguments.test_image_size
+        if size == "same":
+            return self._arguments.image_size
+        return None if size == "native" else size
+
+
+def flatten_recalls(recalls_by_set: dict[str, Recalls]) -> dict[str, float]:
+    """Return recalls as metrics `SET/R1`, `SET/R5` ..., from 0 to 1.
+
+    A query without a positive counts as a miss.
+    """
+    return {
+        f"{name}/R{k}": recall
+        for name, recalls in recalls_by_set.items()
+        for k, recall in recalls.recall_all.items()
+    }

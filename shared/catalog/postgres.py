@@ -1,0 +1,102 @@
+"""PostgreSQL engine: connections that detect an unresponsive server, and transaction timeouts.
+
+Timeouts are set inside the transaction (`SET LOCAL`) and no statements are prepared on the server,
+so that PgBouncer in transaction mode works. Without prepared statements the planner also sees the
+values: a plan that is good for a map with a million photos is bad for one with ten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import psycopg
+from psycopg.abc import RV, PQGen
+from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy.engine import URL
+
+from shared.catalog.session import PoolConfig, TransactionTimeouts
+
+# Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
+ANSWER_MARGIN_SECONDS = 2.0
+PING_TIMEOUT_SECONDS = 2.0
+
+# Detects a peer that disappeared without closing the connection (lost network or machine).
+TCP_KEEPALIVE_OPTIONS = {
+    "keepalives": 1,
+    "keepalives_idle": 10,  # seconds
+    "keepalives_interval": 3,  # seconds
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,  # milliseconds that sent bytes may stay unacknowledged
+}
+
+
+class TimeoutConnection(psycopg.Connection[Any]):
+    """A connection with a client-side timeout for responses.
+
+    The server's own timeouts need a working server: one that is frozen, or whose disk hangs, keeps
+    its connections open and does not respond.
+    """
+
+    answer_seconds: float | None = PING_TIMEOUT_SECONDS
+    """Response timeout; None for no timeout."""
+
+    def wait(self, gen: PQGen[RV], interval: float = 0.1, timeout: float | None = None) -> RV:
+        try:
+            return super().wait(gen, interval, self.answer_seconds if timeout is None else timeout)
+        except psycopg.OperationalError:
+            if self.pgconn.transaction_status == psycopg.pq.TransactionStatus.ACTIVE:
+                self.pgconn.finish()  # a late response must not be read as that of another query
+            raise
+
+
+def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
+    """Create the engine.
+
+    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions.
+    """
+    engine = create_engine(
+        url,
+        pool_size=pool.size,
+        max_overflow=pool.overflow,
+        pool_timeout=pool.wait_seconds,
+        pool_pre_ping=True,
+        creator=_connector(url, pool),
+    )
+    event.listen(engine, "begin", _set_timeouts)
+    event.listen(engine, "checkin", _limit_ping)
+    return engine
+
+
+def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
+    arguments: dict[str, Any] = {
+        "application_name": pool.name,
+        # psycopg accepts whole seconds from 2 on.
+        "connect_timeout": max(2, round(pool.connect_seconds)),
+        **TCP_KEEPALIVE_OPTIONS,
+        **url.translate_connect_args(username="user", database="dbname"),
+        **url.query,  # the operator's options override the others
+    }
+
+    def connect() -> TimeoutConnection:
+        return TimeoutConnection.connect(prepare_threshold=None, **arguments)
+
+    return connect
+
+
+def _set_timeouts(connection: Connection) -> None:
+    limits: TransactionTimeouts | None = connection.get_execution_options().get("placewise_limits")
+    driver = connection.connection.driver_connection
+    assert isinstance(driver, TimeoutConnection)
+    driver.answer_seconds = None
+    if limits is None:
+        return
+    if limits.statement_seconds:
+        driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
+    if not driver.autocommit:  # SET LOCAL needs a transaction
+        connection.exec_driver_sql(limits.sql())
+
+
+def _limit_ping(connection: TimeoutConnection | None, _record: object) -> None:
+    if connection is not None:  # None: the connection was invalidated
+        connection.answer_seconds = PING_TIMEOUT_SECONDS

@@ -1,0 +1,298 @@
+"""Job runner: claims jobs, renews their lease, and decides what happens when a job fails.
+
+The extractor and the steward run their jobs through it, so this is the one place where a job is
+retried:
+
+| failure | what happens to the job |
+|---|---|
+| dependency unavailable (`Unavailable`, `OSError`, database) | requeued; no attempt is counted |
+| `PlacewiseError` on a stored photo | requeued with the error, until an operator has acted |
+| `PlacewiseError` on any other job | failed with the error |
+| lease lost, or the worker stops (`JobInterrupted`) | requeued; no attempt is counted |
+| other exception, or the worker died | retried alone, then failed after MAX_ATTEMPTS |
+
+A worker that raises updates its own jobs. The jobs of a worker that died are found by
+`reclaim_expired_leases` once their lease has expired.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, TypeVar
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now
+from shared.catalog.batch_items import has_batch_items
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.jobs import Job, JobKind, JobState
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.errors import PlacewiseError, Unavailable
+from shared.jobs.claim import claim_jobs, has_claimable_jobs
+from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
+from shared.jobs.model_changes import abandon_generation
+from shared.jobs.trace_context import job_trace_context
+from shared.jobs.transitions import cancel_batch_items, fail_job, release_job
+
+log = logging.getLogger(__name__)
+
+IDLE_POLL_SECONDS = 0.5  # the delay that a lost wakeup costs
+UNAVAILABLE_RETRY_SECONDS = 2.0  # while the store, the search tier or the catalog is unavailable
+REFUSED_RETRY_SECONDS = 15.0  # retry delay of photos that need an operator (say, missing weights)
+
+Result = TypeVar("Result")
+
+
+class JobInterrupted(Exception):
+    """The job lost its lease (cancelled or taken over), or the worker is shutting down."""
+
+
+class StepOutcome(StrEnum):
+    """How a step of claimed jobs ended."""
+
+    DONE = "done"
+    INTERRUPTED = "stopped"
+    PAUSED = "paused"
+    FAILED = "failed"
+    CRASHED = "crashed"
+
+
+@dataclass(slots=True)
+class ClaimedJobs:
+    """Jobs claimed under one token, and the lease that is renewed until it is closed."""
+
+    jobs: list[Job]
+    lease: contextlib.ExitStack
+    failed: int = 0
+    """Number of jobs that a step has failed because of a PlacewiseError."""
+
+    @property
+    def token(self) -> UUID:
+        return get_lease_token(self.jobs[0])
+
+    @property
+    def kind(self) -> JobKind:
+        return JobKind(self.jobs[0].kind)
+
+
+@dataclass
+class JobRunner:
+    """Runs the jobs of one worker.
+
+    Attributes:
+        catalog: The catalog.
+        settings: LEASE_SECONDS and MAX_ATTEMPTS.
+        worker: Name of the worker, stored with its jobs.
+        kinds: Kinds of jobs that the worker runs.
+        on_outcome: Called with kind, outcome and number of jobs after each step, for metrics.
+    """
+
+    catalog: Catalog
+    settings: Settings
+    worker: str
+    kinds: Sequence[JobKind]
+    on_outcome: Callable[[JobKind, StepOutcome, int], object]
+
+    def __post_init__(self) -> None:
+        self._outage = OutageLog(f"worker {self.worker}")
+
+    def run(
+        self,
+        work: Callable[[], bool],
+        stop: threading.Event,
+        wait: Callable[[float], object],
+    ) -> None:
+        """Repeat `work`, which returns whether there were jobs, until `stop` is set.
+
+        Without jobs, `wait` waits for new ones, at most the given seconds.
+        """
+        while not stop.is_set():
+            if self.run_once(work, stop) is False:
+                wait(IDLE_POLL_SECONDS)
+
+    def run_once(self, work: Callable[[], Result], stop: threading.Event) -> Result | None:
+        """Run `work`; pause and return None if the catalog was unavailable.
+
+        Jobs that are still claimed then are requeued when their lease expires.
+        """
+        try:
+            result = work()
+        except SQLAlchemyError as error:
+            self._outage.record_error(error)
+            stop.wait(UNAVAILABLE_RETRY_SECONDS)
+            return None
+        self._outage.record_success()
+        return result
+
+    def run_next(self, handler: Callable[[Job], None]) -> bool:
+        """Claim the next job and run it, or a slice of it, with `handler`.
+
+        The handler completes the job or releases it until its next slice. Returns False if there
+        was no job.
+        """
+        claimed = self.claim()
+        if claimed is None:
+            return False
+        job = claimed.jobs[0]
+        with claimed.lease, self.step(claimed, job.kind):
+            handler(job)
+            log.info("step of %s job: done", job.kind, extra={"job_id": str(job.id)})
+        return True
+
+    def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
+        """Return whether `claim` with the same arguments would find a job."""
+        with self.catalog.read() as session:
+            return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
+
+    def claim(
+        self,
+        limit: int = 1,
+        min_priority: int | None = None,
+        *,
+        alone: bool = True,
+        started: bool = True,
+    ) -> ClaimedJobs | None:
+        """Claim jobs and begin to renew their lease; see `claim_jobs`. None if there are none."""
+        lease_seconds = self.settings.lease_seconds
+        with self.catalog.write() as session:
+            jobs = claim_jobs(
+                session,
+                worker=self.worker,
+                limit=limit,
+                lease_seconds=lease_seconds,
+                kinds=self.kinds,
+                min_priority=min_priority,
+                alone=alone,
+                started=started,
+            )
+        if not jobs:
+            return None
+        claimed = ClaimedJobs(jobs, contextlib.ExitStack())
+        claimed.lease.enter_context(maintain_lease(self.catalog, claimed.token, lease_seconds))
+        return claimed
+
+    def release(self, claimed: ClaimedJobs) -> None:
+        """Return the jobs to the queue because the worker stops, without counting an attempt."""
+        self._update(claimed, lambda _session, job: release_job(job))
+        self.on_outcome(claimed.kind, StepOutcome.INTERRUPTED, len(claimed.jobs))
+
+    @contextlib.contextmanager
+    def step(self, claimed: ClaimedJobs, name: str) -> Iterator[None]:
+        """Context manager that traces a step of the jobs and handles its exceptions.
+
+        The jobs are updated as the module's table says. Only an error of that update is raised.
+        """
+        outcome, together = StepOutcome.DONE, len(claimed.jobs)
+        jobs = f"{together} {claimed.kind} jobs (first: {claimed.jobs[0].id})"
+        with job_trace_context(claimed.jobs, name):
+            try:
+                yield
+            except JobInterrupted:
+                outcome = StepOutcome.INTERRUPTED
+                log.info("%s: interrupted", jobs)
+                self._update(claimed, lambda _session, job: release_job(job))
+            except (Unavailable, OSError, SQLAlchemyError) as error:
+                outcome, delay = StepOutcome.PAUSED, UNAVAILABLE_RETRY_SECONDS
+                log.warning("%s: retried in %g s: %s", jobs, delay, error)
+                problem = error.as_problem() if isinstance(error, PlacewiseError) else None
+                self._update(
+                    claimed,
+                    lambda _session, job: release_job(job, after_seconds=delay, problem=problem),
+                )
+            except PlacewiseError as error:
+                outcome, refusal = StepOutcome.FAILED, error.as_problem()
+                log.error("%s: %s", jobs, error.detail)
+                updated = self._update(
+                    claimed, lambda session, job: _fail_or_defer(session, job, refusal)
+                )
+                claimed.failed = sum(job.state == JobState.FAILED for job in updated)
+            except Exception as error:
+                outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
+                log.exception("%s: crashed", jobs)
+                max_attempts = self.settings.max_attempts
+                self._update(
+                    claimed,
+                    lambda session, job: _retry_after_crash(
+                        session, job, max_attempts, together, event
+                    ),
+                )
+            self.on_outcome(claimed.kind, outcome, together)
+
+    def _update(
+        self, claimed: ClaimedJobs, transition: Callable[[Session, Job], None]
+    ) -> list[Job]:
+        """Apply the transition to the jobs that are still under the lease, and return them."""
+        with self.catalog.write() as session:
+            jobs = lock_leased_jobs(session, claimed.token, claimed.jobs)
+            for job in jobs:
+                transition(session, job)
+        return jobs
+
+
+def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: bool = False) -> int:
+    """Return the jobs of dead workers to the queue, or fail them after `max_attempts`.
+
+    Args:
+        session: The session of a write transaction.
+        max_attempts: Number of crashes after which a job that ran alone fails. A job that was in a
+            batch of several is marked `alone` instead, because another one may be the cause.
+        all_leases: Reclaim also leases that have not expired, for a process that knows that no
+            other worker runs.
+
+    Returns:
+        The number of jobs reclaimed.
+    """
+    expired = select(Job).where(Job.lease_token.is_not(None))
+    if not all_leases:
+        expired = expired.where(Job.lease_until < db_now())
+    jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
+    for job in jobs:
+        _retry_after_crash(session, job, max_attempts, job.claimed_together, "died")
+    return len(jobs)
+
+
+def _retry_after_crash(
+    session: Session, job: Job, max_attempts: int, together: int, event: str
+) -> None:
+    """Retry or fail a job whose worker died or raised an exception (`event`).
+
+    A job that ran `together` with others is retried alone without counting an attempt, to isolate
+    the job that crashed the worker. A job that ran alone fails after `max_attempts`. A job that had
+    not started (0) can't be the cause.
+    """
+    job.attempts += together == 1
+    # An upload batch continues without the photo that may be the cause: see BatchWorker.
+    if together == 1 and job.attempts >= max_attempts and not has_batch_items(job):
+        error = PlacewiseError(
+            "worker_fell",
+            f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "
+            "If the photo is valid, check the worker's log and memory, then retry the job.",
+        )
+        _fail_for_good(session, job, error.as_problem())
+        return
+    job.alone = job.alone or together > 1
+    release_job(job)
+
+
+def _fail_or_defer(session: Session, job: Job, problem: dict[str, Any]) -> None:
+    """Fail the job; a stored photo is retried instead, because an operator can remove the cause."""
+    if job.kind in (JobKind.INDEX, JobKind.REINDEX):
+        release_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
+    else:
+        _fail_for_good(session, job, problem)
+
+
+def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
+    """Fail the job, and end what depends on it: its generation, or the items of its batch."""
+    fail_job(job, problem)
+    abandon_generation(session, job)
+    cancel_batch_items(session, job)

@@ -1,0 +1,145 @@
+"""Map versions, default map, model registry, deleted photos and slots, on both databases."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from uuid import UUID
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from sqlalchemy import select
+
+from shared.catalog.chunks import allocate_slot
+from shared.catalog.generations import (
+    Generation,
+)
+from shared.catalog.maps import (
+    DEFAULT_MAP,
+    Map,
+    get_map,
+    get_or_create_default_map,
+    increment_map_version,
+)
+from shared.catalog.models import Model, get_or_create_model
+from shared.catalog.photo_search import MetadataFilter, search_photos
+from shared.catalog.photos import (
+    count_live_photos,
+    find_photo_by_sha256,
+    get_live_photos,
+    get_photo,
+    list_photos_changed_since,
+)
+from shared.catalog.session import Catalog
+from shared.errors import NotFound
+from tests.support.catalog_rows import add_map, add_photo, delete
+
+
+def test_versions_are_strictly_increasing_under_concurrent_bumps(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    threads, each = 6, 12
+
+    def bump() -> list[int]:
+        seen = []
+        for _ in range(each):
+            with catalog.write() as session:
+                seen.append(increment_map_version(session, map_id))
+        return seen
+
+    with ThreadPoolExecutor(threads) as pool:
+        by_thread = [future.result() for future in [pool.submit(bump) for _ in range(threads)]]
+    assert all(seen == sorted(seen) for seen in by_thread)
+    assert sorted(version for seen in by_thread for version in seen) == list(
+        range(1, threads * each + 1)
+    )
+    with catalog.read() as session:
+        assert session.get_one(Map, map_id).version == threads * each
+
+
+def test_a_rolled_back_bump_leaves_no_gap(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        assert increment_map_version(session, map_id) == 1
+        session.rollback()
+    with catalog.write() as session:
+        assert increment_map_version(session, map_id) == 1
+
+
+def test_the_default_map_is_made_once_by_many_at_once(catalog: Catalog) -> None:
+    together = threading.Barrier(4)
+
+    def ensure() -> UUID:
+        together.wait()
+        with catalog.write() as session:
+            return get_or_create_default_map(session, "test-tiny-avg").id
+
+    with ThreadPoolExecutor(4) as pool:
+        found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
+    assert len(found) == 1
+    with catalog.read() as session:
+        assert {get_map(session, DEFAULT_MAP).id} == found
+
+
+def test_a_model_is_registered_once_by_many_at_once(catalog: Catalog) -> None:
+    together = threading.Barrier(4)
+
+    def ensure() -> UUID:
+        together.wait()
+        with catalog.write() as session:
+            return get_or_create_model(session, "net", "f" * 64, "MIT", {"made": "here"}).id
+
+    with ThreadPoolExecutor(4) as pool:
+        found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
+    with catalog.read() as session:
+        assert set(session.scalars(select(Model.id))) == found
+    assert len(found) == 1
+
+
+def test_an_unknown_map_is_not_found(catalog: Catalog) -> None:
+    with catalog.read() as session, pytest.raises(NotFound, match="nowhere"):
+        get_map(session, "nowhere")
+
+
+def test_a_deleted_photo_shows_in_no_query(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        stays = add_photo(session, map_id).id
+        goes = add_photo(session, map_id, sha256="b" * 64).id
+        version = session.get_one(Map, map_id).version
+    delete(catalog, map_id, goes)
+    with catalog.read() as session:
+        with pytest.raises(NotFound):
+            get_photo(session, map_id, goes)
+        assert list(get_live_photos(session, [stays, goes])) == [stays]
+        assert find_photo_by_sha256(session, map_id, "b" * 64) is None
+        assert count_live_photos(session, map_id) == 1
+        page, total = search_photos(session, map_id, MetadataFilter(), 10, None)
+        assert ([photo.id for photo in page], total) == ([stays], 1)
+        changed = list_photos_changed_since(session, map_id, version)
+        assert [(facts.photo_id, facts.findable) for facts in changed] == [(goes, False)]
+        assert list_photos_changed_since(session, map_id, version + 1) == []
+
+
+def test_a_photo_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+        photo_id = add_photo(session, other).id
+    with catalog.read() as session, pytest.raises(NotFound):
+        get_photo(session, map_id, photo_id)
+
+
+@given(data=some.data(), slot_rows=some.integers(2, 60))
+def test_take_slot_never_lets_a_slot_exceed_its_rows(data: some.DataObject, slot_rows: int) -> None:
+    batches = data.draw(some.lists(some.integers(1, slot_rows), max_size=40))
+    generation = Generation(open_slot=0, open_slot_rows=0)
+    held: dict[int, int] = {}
+    slots = []
+    for rows in batches:
+        slot = allocate_slot(generation, rows, slot_rows)
+        held[slot] = held.get(slot, 0) + rows
+        slots.append(slot)
+    assert all(rows <= slot_rows for rows in held.values())
+    assert slots == sorted(slots)  # a slot that was left is never opened again
+    assert sorted(held) == list(range(len(held)))
+    if held:
+        assert generation.open_slot_rows == held[generation.open_slot]

@@ -1,0 +1,215 @@
+"""Metadata search: filters, cursors and totals, on both databases."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from datetime import timedelta, timezone
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import text
+
+from shared.catalog.photo_search import MetadataFilter, search_photos
+from shared.catalog.photos import (
+    Photo,
+)
+from shared.catalog.session import Catalog
+from shared.search_api.photo_filter import PhotoFilter
+from tests.contract.catalog.test_session import MOMENT
+from tests.support.catalog_rows import add_job, add_map, add_photo
+
+
+def found(catalog: Catalog, map_id: UUID, **params: Any) -> set[str]:
+    """The names of all photos that match, with the total checked against them."""
+    about = {name: params.pop(name) for name in PhotoFilter.model_fields if name in params}
+    params["photos"] = PhotoFilter(**about)
+    with catalog.read() as session:
+        page, total = search_photos(session, map_id, MetadataFilter(**params), 1000, None)
+    assert total == len(page)
+    return {photo.filename for photo in page}
+
+
+def test_a_file_name_is_found_by_a_part_of_it_in_any_case(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        for name in ("Market-Street.JPG", "market hall.png", "harbour.jpg"):
+            add_photo(session, map_id, filename=name)
+    assert found(catalog, map_id, filename="MARKET") == {"Market-Street.JPG", "market hall.png"}
+    assert found(catalog, map_id, filename="street.jpg") == {"Market-Street.JPG"}
+    assert found(catalog, map_id, filename="square") == set()
+    assert found(catalog, map_id) == {"Market-Street.JPG", "market hall.png", "harbour.jpg"}
+
+
+def test_wildcards_in_a_file_name_are_ordinary_characters(catalog: Catalog, map_id: UUID) -> None:
+    specials = ["%", "_", "/", "\\", "'", '"', "[a-z]", "*", "?"]
+    with catalog.write() as session:
+        for special in specials:
+            add_photo(session, map_id, filename=f"a{special}b.jpg")
+        add_photo(session, map_id, filename="axb.jpg")
+        add_photo(session, map_id, filename="ab.jpg")
+    for special in specials:
+        assert found(catalog, map_id, filename=special) == {f"a{special}b.jpg"}
+        assert found(catalog, map_id, filename=f"a{special}b") == {f"a{special}b.jpg"}
+
+
+def test_bounds_of_time_are_inclusive(catalog: Catalog, map_id: UUID) -> None:
+    step = timedelta(microseconds=1)
+    with catalog.write() as session:
+        for name, at in (("early", -1), ("exact", 0), ("late", 1)):
+            add_photo(session, map_id, filename=name, uploaded_at=MOMENT + at * step)
+    assert found(catalog, map_id, upload_after=MOMENT) == {"exact", "late"}
+    assert found(catalog, map_id, upload_before=MOMENT) == {"early", "exact"}
+    assert found(catalog, map_id, upload_after=MOMENT, upload_before=MOMENT) == {"exact"}
+    elsewhere = MOMENT.astimezone(timezone(timedelta(hours=-7)))
+    assert found(catalog, map_id, upload_after=elsewhere, upload_before=elsewhere) == {"exact"}
+
+
+def test_whole_seconds_compare_with_fractions_of_one(catalog: Catalog, map_id: UUID) -> None:
+    whole = MOMENT.replace(microsecond=0)
+    with catalog.write() as session:
+        add_photo(session, map_id, filename="whole", uploaded_at=whole)
+        add_photo(session, map_id, filename="after", uploaded_at=MOMENT)
+    assert found(catalog, map_id, upload_before=whole) == {"whole"}
+    assert found(catalog, map_id, upload_after=whole) == {"whole", "after"}
+
+
+def test_bounds_of_size_are_inclusive_and_large(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        for size in (0, 999, 1000, 2**40):
+            add_photo(session, map_id, filename=str(size), size_bytes=size)
+    assert found(catalog, map_id, min_file_size=999) == {"999", "1000", str(2**40)}
+    assert found(catalog, map_id, max_file_size=999) == {"0", "999"}
+    assert found(catalog, map_id, min_file_size=0, max_file_size=0) == {"0"}
+    assert found(catalog, map_id, min_file_size=2**40) == {str(2**40)}
+
+
+TAGS = ["night", "it's", 'the "old" one', "日本", "naïve", "a\\b", "50%", "🏠", "[1]", "1", "null"]
+
+
+def test_a_tag_is_matched_exactly(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        for tag in TAGS:
+            add_photo(session, map_id, filename=tag, tags=["common", tag])
+            add_photo(session, map_id, filename="longer", tags=[f"{tag}x", f"x{tag}"])
+        add_photo(session, map_id, filename="none", tags=[])
+    for tag in TAGS:
+        assert found(catalog, map_id, tags=(tag,)) == {tag}
+    assert found(catalog, map_id, tags=("common",)) == set(TAGS)
+
+
+def test_a_tags_case_matters_and_parts_do_not_match(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        add_photo(session, map_id, tags=["Night", "nightly"])
+    assert found(catalog, map_id, tags=("night",)) == set()
+
+
+def test_all_tags_are_wanted(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        add_photo(session, map_id, filename="both", tags=["wet", "night"])
+        add_photo(session, map_id, filename="one", tags=["night"])
+    assert found(catalog, map_id, tags=("night", "wet")) == {"both"}
+    assert found(catalog, map_id, tags=("night",)) == {"both", "one"}
+
+
+def test_filters_work_together_and_in_one_map(catalog: Catalog, map_id: UUID) -> None:
+    params = {"filename": "x.jpg", "tags": ["t"], "size_bytes": 5, "uploaded_at": MOMENT}
+    later = MOMENT + timedelta(days=1)
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+        right = add_photo(session, map_id, **params).id
+        add_photo(session, other, **params)
+        for wrong in (
+            {"filename": "y.jpg"},
+            {"tags": ["u"]},
+            {"size_bytes": 6},
+            {"uploaded_at": later},
+        ):
+            add_photo(session, map_id, **{**params, **wrong})
+        conditions = MetadataFilter(
+            filename="x", upload_before=MOMENT, max_file_size=5, photos=PhotoFilter(tags=("t",))
+        )
+        page, total = search_photos(session, map_id, conditions, 10, None)
+    assert ([photo.id for photo in page], total) == ([right], 1)
+
+
+def pages(
+    catalog: Catalog, map_id: UUID, limit: int, between: Callable[[], None] = lambda: None
+) -> list[Photo]:
+    """All photos that the pages show, in their order."""
+    seen: list[Photo] = []
+    while True:
+        after = (seen[-1].uploaded_at, seen[-1].id) if seen else None
+        with catalog.read() as session:
+            page, _ = search_photos(session, map_id, MetadataFilter(), limit, after)
+        if not page:
+            return seen
+        assert len(page) <= limit
+        seen += page
+        between()
+
+
+def test_the_cursor_pages_through_everything_exactly_once(catalog: Catalog, map_id: UUID) -> None:
+    chance = random.Random(7)
+    with catalog.write() as session:
+        # Three upload times for 13 photos, in no order: most pages end inside a tie.
+        ids = {
+            add_photo(
+                session,
+                map_id,
+                uploaded_at=MOMENT + timedelta(microseconds=chance.randrange(3)),
+            ).id
+            for _ in range(13)
+        }
+    for limit in (1, 4, 100):
+        seen = pages(catalog, map_id, limit)
+        assert len(seen) == 13
+        assert {photo.id for photo in seen} == ids
+        order = [(photo.uploaded_at, photo.id) for photo in seen]
+        assert order == sorted(order, reverse=True)
+
+
+def test_a_photo_that_arrives_while_someone_pages_moves_no_other(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    with catalog.write() as session:
+        ids = [add_photo(session, map_id, uploaded_at=MOMENT).id for _ in range(6)]
+
+    def arrive() -> None:
+        with catalog.write() as session:
+            add_photo(session, map_id)  # newer than all
+
+    seen = pages(catalog, map_id, 2, arrive)
+    assert sorted(photo.id for photo in seen) == sorted(ids)
+
+
+def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        for number in range(7):
+            add_photo(session, map_id, tags=["odd"] if number % 2 else [], uploaded_at=MOMENT)
+    with catalog.read() as session:
+        first, total = search_photos(
+            session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, None
+        )
+        assert (len(first), total) == (2, 3)
+        after = (first[-1].uploaded_at, first[-1].id)
+        rest, total = search_photos(
+            session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, after
+        )
+        assert (len(rest), total) == (1, 3)
+
+
+def test_metadata_comes_back_as_it_was(catalog: Catalog, map_id: UUID) -> None:
+    fields = {"camera": "x'y", "nested": {"list": [1, 2.5, None, True, "日本"]}, "empty": {}}
+    with catalog.write() as session:
+        photo_id = add_photo(session, map_id, attributes=fields, tags=TAGS).id
+    with catalog.read() as session:
+        photo = session.get_one(Photo, photo_id)
+        assert photo.attributes == fields
+        assert photo.tags == TAGS
+
+
+def test_a_missing_json_value_is_null_for_the_database(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        add_job(session, map_id, error=None)
+        add_job(session, map_id, error={})
+        assert session.scalar(text("SELECT count(*) FROM jobs WHERE error IS NULL")) == 1

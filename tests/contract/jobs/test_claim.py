@@ -1,0 +1,245 @@
+"""Claiming jobs: order, batches, concurrency, on SQLite and on PostgreSQL."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.generations import GenerationState
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
+from shared.catalog.schema import migrate
+from shared.catalog.session import Catalog
+from shared.errors import NotFound
+from shared.jobs import (
+    Job,
+    JobKind,
+    JobState,
+    claim_jobs,
+)
+from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.model_changes import (
+    wake_vocabulary_waiters,
+)
+from shared.jobs.transitions import (
+    release_job,
+)
+from tests.contract.jobs.jobs import ids, queue, token_of
+from tests.support.catalog_rows import (
+    add_generation,
+    add_map,
+    set_columns,
+    take,
+)
+from tests.support.servers import PostgresServer
+
+
+def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID) -> None:
+    expected = [
+        (JobKind.REINDEX, 4),
+        (JobKind.INDEX, 2),
+        (JobKind.FIT, 3),
+        (JobKind.INDEX, 2),
+        (JobKind.DESCRIBE, 1),
+        (JobKind.COMPARE, 1),
+    ]
+    made = [(place, queue(catalog, map_id, kind=kind)[0]) for kind, place in expected]
+    order = [job_id for _, job_id in sorted(made, key=lambda pair: pair[0])]
+    assert [job_id for _ in expected for job_id in ids(take(catalog, limit=1))] == order
+    assert take(catalog) == []
+
+
+def test_a_batch_holds_the_oldest_up_to_its_limit(catalog: Catalog, map_id: UUID) -> None:
+    waiting = queue(catalog, map_id, 5)
+    assert ids(take(catalog, limit=3)) == waiting[:3]
+    assert ids(take(catalog, limit=3)) == waiting[3:]
+    assert take(catalog, limit=3) == []
+
+
+def test_comparisons_are_claimed_one_at_a_time(catalog: Catalog, map_id: UUID) -> None:
+    first, second = queue(catalog, map_id, 2, kind=JobKind.COMPARE)
+    assert ids(take(catalog, limit=10)) == [first]
+    assert ids(take(catalog, limit=10)) == [second]
+
+
+def test_a_claim_says_who_has_the_jobs_and_until_when(catalog: Catalog, map_id: UUID) -> None:
+    queue(catalog, map_id, 2)
+    jobs = take(catalog, worker="gpu-1", lease_seconds=30)
+    token_of(jobs)
+    with catalog.read() as session:
+        now = session.execute(select(db_now())).scalar_one()
+        for job in session.scalars(select(Job)):
+            assert (job.state, job.worker, job.claimed_together) == (JobState.RUNNING, "gpu-1", 2)
+            assert job.started_at is not None
+            assert job.lease_until is not None
+            assert 0 < (job.lease_until - now).total_seconds() <= 30
+
+
+def test_a_batch_is_of_one_kind_one_map_and_one_generation(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+        old = add_generation(session, map_id, GenerationState.RETIRED).id
+        new = add_generation(session, map_id, GenerationState.BUILDING).id
+    groups = [
+        {"map_id": map_id, "kind": JobKind.INDEX},
+        {"map_id": other, "kind": JobKind.INDEX},
+        {"map_id": map_id, "kind": JobKind.DESCRIBE},
+        {"map_id": map_id, "kind": JobKind.REINDEX, "generation_id": old},
+        {"map_id": map_id, "kind": JobKind.REINDEX, "generation_id": new},
+    ]
+    expected: list[set[UUID]] = [set() for _ in groups]
+    for _ in range(3):  # interleaved, and all of the same priority
+        for group, members in zip(groups, expected, strict=True):
+            members.update(queue(catalog, priority=1, **group))  # type: ignore[arg-type]
+    batches = [set(ids(take(catalog, limit=10))) for _ in groups]
+    assert sorted(batches, key=min) == sorted(expected, key=min)
+    assert take(catalog) == []
+
+
+def test_a_job_marked_alone_comes_alone(catalog: Catalog, map_id: UUID) -> None:
+    first = queue(catalog, map_id, 2)
+    lonely = queue(catalog, map_id, alone=True)
+    last = queue(catalog, map_id, 2)
+    assert ids(take(catalog)) == first + last
+    jobs = take(catalog)
+    assert ids(jobs) == lonely
+    assert jobs[0].claimed_together == 1
+    oldest = queue(catalog, map_id, alone=True)
+    queue(catalog, map_id, 2)
+    assert ids(take(catalog)) == oldest
+
+
+def test_a_model_change_comes_alone(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+    changes = [queue(catalog, of, kind=k)[0] for of in (map_id, other) for k in MODEL_CHANGE_JOBS]
+    changes += queue(catalog, map_id, 2, kind=JobKind.FIT)  # not even with one of its kind
+    taken = [take(catalog, limit=10) for _ in changes]
+    assert [len(jobs) for jobs in taken] == [1] * len(changes)
+    assert sorted(job.id for jobs in taken for job in jobs) == sorted(changes)
+
+
+def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: UUID) -> None:
+    waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)
+    ready = queue(catalog, map_id)
+    assert ids(take(catalog)) == ready
+    assert take(catalog) == []
+    with catalog.write() as session:
+        wake_vocabulary_waiters(session, map_id)
+    assert ids(take(catalog)) == waiting
+
+
+def test_waiters_of_another_map_and_for_something_else_stay(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+    queue(catalog, other, waiting_for=WaitingFor.VOCABULARY)
+    queue(catalog, map_id, kind=JobKind.FIT, waiting_for=WaitingFor.DESCRIPTORS)
+    with catalog.write() as session:
+        wake_vocabulary_waiters(session, map_id)
+    assert take(catalog) == []
+
+
+def test_a_job_whose_time_has_not_come_is_held_back(catalog: Catalog, map_id: UUID) -> None:
+    later = queue(catalog, map_id, run_after=db_now_plus(3600))
+    due = queue(catalog, map_id, run_after=db_now_plus(-0.5))
+    jobs = take(catalog)
+    assert ids(jobs) == due
+    assert jobs[0].run_after is None
+    assert take(catalog) == []
+    set_columns(catalog, later[0], run_after=db_now_plus(-1))
+    assert ids(take(catalog)) == later
+
+
+def test_finished_jobs_are_not_claimed(catalog: Catalog, map_id: UUID) -> None:
+    for state in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED):
+        queue(catalog, map_id, state=state)
+    assert take(catalog) == []
+
+
+def test_below_the_least_priority_nothing_is_claimed(catalog: Catalog, map_id: UUID) -> None:
+    bulk = queue(catalog, map_id, 2)
+    assert take(catalog, least_priority=Priority.QUERY) == []
+    query = queue(catalog, map_id, kind=JobKind.DESCRIBE)
+    assert ids(take(catalog, least_priority=Priority.QUERY)) == query
+    assert ids(take(catalog)) == bulk
+
+
+def test_every_claim_has_a_fresh_token(catalog: Catalog, map_id: UUID) -> None:
+    queue(catalog, map_id, 2)
+    tokens = set()
+    for _ in range(4):
+        jobs = take(catalog)
+        assert len(jobs) == 2
+        tokens.add(token_of(jobs))
+        with catalog.write() as session:
+            for job in lock_leased_jobs(session, token_of(jobs), jobs):
+                release_job(job)
+    assert len(tokens) == 4
+
+
+def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map_id: UUID) -> None:
+    waiting = queue(catalog, map_id, 200) + queue(catalog, map_id, 50, alone=True)
+    workers = 4
+    together = threading.Barrier(workers)
+
+    def work(name: str) -> list[tuple[UUID, UUID]]:
+        # A catalog of its own, as another process has it: no lock in memory is shared.
+        mine = Catalog(catalog.url.render_as_string(hide_password=False))
+        got = []
+        together.wait()
+        while jobs := take(mine, limit=7, worker=name):
+            got += [(job.id, token_of(jobs)) for job in jobs]
+        mine.close()
+        return got
+
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(work, f"worker-{number}") for number in range(workers)]
+        taken = [pair for future in futures for pair in future.result()]
+    assert len(taken) == len(waiting)
+    assert {job_id for job_id, _ in taken} == set(waiting)
+    with catalog.read() as session:
+        stored = {(job.id, job.lease_token) for job in session.scalars(select(Job))}
+    assert stored == set(taken)
+
+
+def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresServer) -> None:
+    """PostgreSQL alone: SQLite's one writer makes the second worker wait its turn."""
+    catalog = Catalog(postgres.new_database())
+    migrate(catalog)
+    with catalog.write() as session:
+        map_id = add_map(session).id
+    waiting = queue(catalog, map_id, 6)
+    with catalog.write() as first:
+        one = claim_jobs(first, worker="one", limit=2, lease_seconds=60)
+        # Without SKIP LOCKED this would wait for the first one's commit, and never end.
+        two = take(catalog, limit=3, worker="two")
+    assert ids(one) == waiting[:2]
+    assert ids(two) == waiting[2:5]
+    catalog.close()
+
+
+def test_jobs_are_listed_newest_first_and_by_what_is_wanted(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+    queue(catalog, other)
+    old, new = queue(catalog, map_id, 2)
+    (failed,) = queue(catalog, map_id, kind=JobKind.DESCRIBE, state=JobState.FAILED)
+    (reindex,) = queue(catalog, map_id, kind=JobKind.REINDEX)
+    with catalog.read() as session:
+        assert ids(list_jobs(session, map_id, [], [], 10, None)) == [failed, new, old]
+        assert ids(list_jobs(session, map_id, [], [], 2, None)) == [failed, new]
+        assert ids(list_jobs(session, map_id, [], [], 10, new)) == [old]
+        assert ids(list_jobs(session, map_id, [JobState.FAILED], [], 10, None)) == [failed]
+        assert ids(list_jobs(session, map_id, [], [JobKind.REINDEX], 10, None)) == [reindex]
+
+
+def test_a_job_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+    (job_id,) = queue(catalog, other)
+    with catalog.read() as session, pytest.raises(NotFound):
+        get_job(session, map_id, job_id)

@@ -1,0 +1,136 @@
+"""Jobs that create a generation: one at a time in each map, cancellation, activation."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select
+
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job
+from shared.catalog.session import Catalog
+from shared.errors import Conflict
+from shared.jobs import (
+    JobKind,
+    JobState,
+)
+from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.model_changes import (
+    cancel_model_change,
+    create_generation,
+    get_unfinished_model_change,
+    start_model_change,
+)
+from tests.contract.jobs.jobs import end, ids, queue, token_of
+from tests.support.catalog_rows import (
+    add_generation,
+    add_map,
+    read_job,
+    states,
+    take,
+)
+
+
+def test_a_second_model_change_is_refused_and_names_the_first(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+        first = start_model_change(session, map_id, JobKind.FIT, {"seed": 0}).id
+        start_model_change(session, other, JobKind.FIT, {"seed": 0})  # each map has its own
+    for kind in MODEL_CHANGE_JOBS:
+        with pytest.raises(Conflict, match=str(first)) as refused, catalog.write() as session:
+            start_model_change(session, map_id, kind, {})
+        assert refused.value.code == "model_change_running"
+        assert refused.value.extra == {"job_id": str(first)}
+    with catalog.write() as session:
+        cancel_model_change(session, get_job(session, map_id, first, lock=True))
+        assert get_unfinished_model_change(session, map_id) is None
+        start_model_change(session, map_id, JobKind.IMPORT, {})
+
+
+def test_of_model_changes_that_start_at_once_one_wins(catalog: Catalog, map_id: UUID) -> None:
+    together = threading.Barrier(4)
+
+    def start() -> UUID | str:
+        together.wait()
+        try:
+            with catalog.write() as session:
+                return start_model_change(session, map_id, JobKind.FIT, {}).id
+        except Conflict as error:
+            return str(error.extra["job_id"])
+
+    with ThreadPoolExecutor(4) as pool:
+        outcomes = [future.result() for future in [pool.submit(start) for _ in range(4)]]
+    (winner,) = [outcome for outcome in outcomes if isinstance(outcome, UUID)]
+    assert outcomes.count(str(winner)) == 3
+
+
+def test_the_first_generation_of_a_map_answers_at_once_and_releases_who_waited(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)
+    job_id = _begin(catalog, map_id)
+    with catalog.read() as session:
+        generation = session.scalars(select(Generation)).one()
+    assert generation.state == GenerationState.ACTIVE
+    assert generation.activated_at is not None
+    job = read_job(catalog, job_id)
+    assert (job.state, job.waiting_for) == (JobState.RUNNING, WaitingFor.DESCRIPTORS)
+    assert (job.generation_id, job.lease_token) == (generation.id, None)
+    assert ids(take(catalog)) == waiting
+
+
+def test_a_cancelled_model_change_abandons_what_it_was_building(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    with catalog.write() as session:
+        active = add_generation(session, map_id).id
+    job_id = _begin(catalog, map_id)
+    building = read_job(catalog, job_id).generation_id
+    first, second = queue(catalog, map_id, 2, kind=JobKind.REINDEX, generation_id=building)
+    done = queue(
+        catalog, map_id, kind=JobKind.REINDEX, generation_id=building, state=JobState.FAILED
+    )
+    uploads = queue(catalog, map_id)
+    (running,) = take(catalog, limit=1)  # the upload: higher
+    jobs = take(catalog, limit=1)
+    assert (running.id, ids(jobs)) == (uploads[0], [first])
+    with catalog.write() as session:
+        cancel_model_change(session, get_job(session, map_id, job_id, lock=True))
+    assert states(catalog, [job_id, first, second]) == [JobState.CANCELLED] * 3
+    assert states(catalog, [*done, *uploads]) == [JobState.FAILED, JobState.RUNNING]
+    assert end(catalog, jobs) == []  # the worker that has one computes in vain
+    with catalog.read() as session:
+        assert session.get_one(Generation, active).state == GenerationState.ACTIVE
+        assert session.get_one(Generation, building).state == GenerationState.ABANDONED
+    _begin(catalog, map_id)  # there is room for the next
+
+
+def test_cancelling_leaves_a_generation_that_already_answers(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    job_id = _begin(catalog, map_id)
+    with catalog.write() as session:
+        cancel_model_change(session, get_job(session, map_id, job_id, lock=True))
+    with catalog.read() as session:
+        assert session.scalars(select(Generation.state)).all() == [GenerationState.ACTIVE]
+
+
+def _begin(catalog: Catalog, map_id: UUID) -> UUID:
+    """A model change up to where it waits for descriptors; its job."""
+    with catalog.write() as session:
+        template = add_generation(session, map_id, GenerationState.RETIRED)
+        job_id = start_model_change(session, map_id, JobKind.FIT, {}).id
+    jobs = take(catalog, least_priority=Priority.MODEL_CHANGE)
+    while jobs[0].id != job_id:
+        jobs = take(catalog, least_priority=Priority.MODEL_CHANGE)
+    columns = ("extractor", "spec", "spec_fingerprint", "dimension", "model_id")
+    with catalog.write() as session:
+        (mine,) = lock_leased_jobs(session, token_of(jobs), jobs)
+        create_generation(session, mine, **{name: getattr(template, name) for name in columns})
+        session.delete(session.get_one(Generation, template.id))
+    return job_id

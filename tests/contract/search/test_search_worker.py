@@ -1,0 +1,238 @@
+"""The search worker keeps the contract with each method: dense, sign codes, int8, GPU."""
+
+from __future__ import annotations
+
+import os
+from typing import BinaryIO
+
+import pytest
+import torch
+
+from services.search import executor, gpu
+from services.search import worker as worker_module
+from services.search.metrics import MeteredSearch
+from services.search.worker import SearchWorker
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.config.shards import SINGLE_SHARD
+from shared.search_api.protocol import SearchBackend
+from shared.storage import FolderStore, read_retries
+from tests.contract.search.search_methods import always_by_codes, always_by_int8
+from tests.contract.search.test_search_backend import (
+    OpenPort,
+    SearchPortContract,
+    whatever_the_catalog,
+)
+from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
+
+
+class TestSearchWorker(SearchPortContract):
+    @pytest.fixture
+    def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
+        def open_port(**changes: object) -> SearchBackend:
+            return SearchWorker(catalog, store, settings.model_copy(update=changes))
+
+        return open_port
+
+    def test_repaired_chunk_is_served_again_without_a_new_version(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        (key,) = places.chunk_keys()
+        whole = store.get(key)
+        store.put(key, damaged(whole, "flipped"))
+        worker = SearchWorker(catalog, store, settings)
+        worker.sync()
+        assert worker.status().missing == (key,)
+        store.put(key, whole)
+        worker.sync()
+        assert worker.status().missing == ()
+        assert worker.status().rows == 5
+
+    def test_damaged_chunk_is_not_read_again_with_every_look_and_every_new_version(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        (key,) = places.chunk_keys()
+        store.put(key, damaged(store.get(key), "flipped"))
+        opened: list[str] = []
+        open_object = store.open
+
+        def counted(key: str) -> BinaryIO:
+            opened.append(key)
+            return open_object(key)
+
+        monkeypatch.setattr(store, "open", counted)
+        worker = SearchWorker(catalog, store, settings)
+        for seed in (2, 3):
+            worker.sync()
+            worker.sync()
+            places.add(unit_rows(seed, 5))
+            request = places.request(places.query(unit_rows(seed, 1)[0]), k=20)
+            assert worker.search(request).missing == (key,)
+        assert opened.count(key) == 1
+
+    def test_chunk_that_is_truncated_while_it_is_mapped_is_left_out(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """Reading such a mapping would end the process. A deleted file is read on."""
+        monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+        monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        retained = places.reference(places.add(unit_rows(2, 5))[0])[0]
+        (key,) = set(places.chunk_keys()) - {retained}
+        worker = SearchWorker(
+            catalog, store, settings.model_copy(update={"search_memory_bytes": 0})
+        )
+        worker.sync()
+        assert worker.status().rows == 10
+        whole = store.get(key)
+        os.truncate(store.path(key), 200)
+        store.delete(retained)
+        worker.sync()
+        assert (worker.status().missing, worker.status().rows) == ((key,), 5)
+        store.put(key, whole)
+        worker.sync()
+        assert (worker.status().missing, worker.status().rows) == ((), 10)
+
+    def test_following_forgets_what_is_no_longer_searched(
+        self, catalog: Catalog, store: FolderStore, settings: Settings
+    ) -> None:
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        worker = SearchWorker(catalog, store, settings)
+        worker.sync()
+        assert worker.status().versions == {places.generation_id: places.version}
+        with catalog.write() as session:
+            session.get_one(Generation, places.generation_id).state = GenerationState.RETIRED
+        worker.sync()
+        assert worker.status().versions == {}
+        assert worker.status().resident_bytes == 0
+
+    def test_followed_versions_reuse_the_chunks_that_are_loaded(
+        self, catalog: Catalog, store: FolderStore, settings: Settings
+    ) -> None:
+        places = SmallMap(catalog, store)
+        first = places.add(unit_rows(1, 5))
+        worker = SearchWorker(catalog, store, settings)
+        worker.sync()
+        store.delete(places.reference(first[0])[0])
+        places.add(unit_rows(2, 5))
+        worker.sync()
+        assert worker.status().missing == (), "a loaded chunk was read again"
+        assert worker.status().rows == 10
+
+
+@whatever_the_catalog
+class TestSearchWorkerByCodes(TestSearchWorker):
+    """The same promises where rows are told apart by their codes first."""
+
+    certificate = "statistical"
+
+    @pytest.fixture(autouse=True)
+    def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always_by_codes(monkeypatch)
+
+
+@whatever_the_catalog
+class TestSearchWorkerByInt8(TestSearchWorker):
+    """The same promises where rows of middle length are told apart by their int8 codes."""
+
+    certificate = "bound"
+
+    @pytest.fixture(autouse=True)
+    def by_int8(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always_by_int8(monkeypatch)
+
+    @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+    def test_codes_that_are_damaged_or_gone_are_made_again(
+        self, places: SmallMap, port: OpenPort, settings: Settings, damage: str
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        vector = unit_rows(2, 1)[0]
+        first = port().search(places.request(places.query(vector)))
+        (path,) = settings.search_cache_folder(SINGLE_SHARD).rglob("*.int8")
+        whole = path.read_bytes()
+        path.unlink()
+        if damage != "gone":
+            path.write_bytes(damaged(whole, damage))
+        again = port().search(places.request(places.query(vector)))
+        assert again == first
+        assert path.read_bytes() == whole
+
+    def test_without_room_for_codes_every_row_is_compared(
+        self, places: SmallMap, port: OpenPort, settings: Settings
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        settings.search_cache_folder(SINGLE_SHARD).parent.mkdir(parents=True, exist_ok=True)
+        settings.search_cache_folder(SINGLE_SHARD).write_text("no folder can be here")
+        vector = unit_rows(2, 1)[0]
+        response = port().search(places.request(places.query(vector)))
+        assert_answers(response, places.brute_force(vector))
+        assert response.certificate == "exhaustive"
+
+
+@whatever_the_catalog
+class TestSearchWorkerOnADevice(TestSearchWorker):
+    """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
+
+    certificate = "bound"
+
+    @pytest.fixture
+    def port(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> OpenPort:
+        monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
+
+        def open_port(**changes: object) -> SearchBackend:
+            device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)
+            worker = SearchWorker(
+                catalog, store, settings.model_copy(update=changes), device=device
+            )
+            worker.sync()
+            return worker
+
+        return open_port
+
+    def test_status_tells_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+        places.add(unit_rows(1, 40))
+        search = port()
+        (device,) = search.status().devices
+        assert device.name == "cpu"
+        assert list(device.generations) == [places.generation_id]
+        before = device.resident_bytes
+        places.add(unit_rows(2, 40))
+        response = search.search(places.request(places.query(unit_rows(3, 1)[0])))
+        assert response.certificate == "bound", "a new chunk is on the device at once"
+        assert search.status().devices[0].resident_bytes == 2 * before
+        assert search.status().devices[0].failure is None
+
+    def test_metrics_tell_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+        places.add(unit_rows(1, 40))
+        search = port()
+        assert isinstance(search, SearchWorker)
+        text = MeteredSearch(search).render().decode()
+        bytes_there = search.status().devices[0].resident_bytes
+        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in text
+        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text

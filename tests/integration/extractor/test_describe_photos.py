@@ -1,0 +1,352 @@
+"""The extractor describes photos and queries, with real decoder processes, on both databases."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import func, select
+
+from services.extractor import worker as worker_module
+from services.extractor.generation_resolver import resolve_generation
+from services.extractor.model_changes import ModelChangeRunner
+from services.extractor.worker import ExtractorWorker
+from services.steward.tasks.model_changes import auto_fit_vocabularies
+from shared.catalog.chunks import Chunk, list_live_chunks
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import WaitingFor
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import decode_centres
+from shared.imaging.preprocessing import Pixels
+from shared.jobs import Job, JobKind, JobState
+from shared.storage.chunks import decode_rows, manifest_key
+from shared.storage.keys import query_vector_key, thumbnail_key
+from tests.integration.extractor.conftest import Hook
+from tests.integration.workplace import Workplace, expected_row, once, same
+from tests.support.catalog_rows import set_columns
+from tests.support.photos import encoded, photo_bytes, photo_image
+
+
+def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> None:
+    photo_ids = averages.upload(*range(9))  # three batches
+    result = averages.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (9, 9, 0)
+    assert result.maps == {str(averages.map_id)}
+    assert {"read", "decode", "describe", "publish"} <= result.seconds.keys()
+    rows = averages.rows()
+    assert set(rows) == set(photo_ids)
+    for number, photo_id in enumerate(photo_ids):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
+        job = averages.job_of(photo_id)
+        assert job.state == JobState.SUCCEEDED
+        assert job.result == {
+            "file_id": str(photo_id),
+            "generation_id": str(averages.active().id),
+        }
+        assert averages.store.head(thumbnail_key(photo_id)) is not None
+    with averages.catalog.read() as session:
+        chunks = list_live_chunks(session, averages.active().id)
+        assert [chunk.rows for chunk in chunks] == [4, 4, 1]
+        # The first generation, then three batches: each is something new to find.
+        assert session.get_one(Map, averages.map_id).version == 4
+    for chunk in chunks:
+        manifest = json.loads(averages.store.get(manifest_key(chunk.object_key)))
+        assert manifest["sha256"] == chunk.sha256
+        assert manifest["spec"] == averages.active().spec
+    assert averages.drain().claimed == 0
+
+
+def test_a_query_leaves_its_row_beside_its_bytes_and_none_in_the_map(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    data = photo_bytes(2)
+    job_id = averages.ask(data)
+    assert averages.drain().succeeded == 1
+    reference = {
+        "generation_id": str(averages.active().id),
+        "object_key": query_vector_key(job_id),
+        "row": 0,
+    }
+    assert averages.job(job_id).result == reference
+    rows = decode_rows(averages.store.get(query_vector_key(job_id)))
+    assert rows.shape == (1, 16)
+    assert same(rows[0], expected_row("test-tiny-avg", data))
+    assert len(averages.rows()) == 1
+
+
+def test_a_query_comes_first_in_an_empty_map(averages: Workplace) -> None:
+    job_id = averages.ask(photo_bytes(2))
+    averages.drain()
+    assert averages.job(job_id).state == JobState.SUCCEEDED
+    assert averages.active().dimension == 16
+
+
+def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
+    good = averages.upload(1, 2)
+    _, undecodable = averages.upload_bytes(b"\xff\xd8\xff\xe0 this is no JPEG")
+    lost_photo, lost = averages.upload_bytes(photo_bytes(4))
+    query = averages.ask(photo_bytes(5)[:500])
+    with averages.catalog.read() as session:
+        averages.store.delete(session.get_one(Photo, lost_photo).object_key)
+    result = averages.drain()
+    assert (result.succeeded, result.failed) == (2, 3)
+    assert set(averages.rows()) == set(good)
+    for job_id, code in (
+        (undecodable, "undecodable_photo"),
+        (lost, "object_not_found"),
+        (query, "undecodable_photo"),
+    ):
+        job = averages.job(job_id)
+        assert (job.state, job.progress_failed) == (JobState.FAILED, 1)
+        assert job.error is not None
+        assert job.error["code"] == code
+        assert job.error["detail"]
+
+
+def test_two_workers_at_once_describe_each_photo_once(
+    averages: Workplace, make_worker: Callable[[], ExtractorWorker]
+) -> None:
+    photo_ids = averages.upload(*range(16))
+    workers = [make_worker(), make_worker()]
+    threads = [threading.Thread(target=w.drain, args=[threading.Event()]) for w in workers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(averages.rows()) == set(photo_ids)
+    with averages.catalog.read() as session:
+        assert session.scalar(select(func.sum(Chunk.rows))) == 16
+        assert session.scalar(select(func.count()).select_from(Generation)) == 1
+
+
+def test_of_two_workers_that_begin_a_maps_first_generation_one_wins(
+    averages: Workplace,
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (other,) = averages.upload(1)
+    first, second = make_worker(), make_worker()
+    query = averages.ask(photo_bytes(2))
+    # While the first one is about to make the generation, the second one does.
+    real = Extractor.shipped_vocabulary
+    meanwhile = once(lambda: _drain(second))
+
+    def shipped(self: Extractor) -> Any:
+        meanwhile()
+        return real(self)
+
+    monkeypatch.setattr(Extractor, "shipped_vocabulary", shipped)
+    _drain(first)
+    assert set(averages.rows()) == {other}
+    assert averages.job(query).state == JobState.SUCCEEDED
+    with averages.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(Generation)) == 1
+
+
+def _drain(worker: ExtractorWorker) -> None:
+    worker.drain(threading.Event())
+
+
+def test_photos_of_different_sizes_are_described_in_one_batch(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    extractor = "test-tiny-vlad:aggregator=gem,preprocessing=demo1024"
+    place = workplace_of(extractor)
+    sizes = [(64, 48), (48, 64), (1500, 900), (64, 48), (10, 10)]
+    photos = [encoded(photo_image(n, *size), "PNG") for n, size in enumerate(sizes)]
+    photo_ids = [place.upload_bytes(photo)[0] for photo in photos]
+    result = place.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (5, 4, 1)
+    rows = place.rows()
+    for photo, photo_id in zip(photos[:4], photo_ids[:4], strict=True):
+        assert same(rows[photo_id], expected_row(extractor, photo))
+    too_small = place.job_of(photo_ids[4])
+    assert too_small.error is not None
+    assert too_small.error["code"] == "photo_too_small"
+    spec = place.active().spec
+    assert spec["preprocessing"] == {"name": "demo1024", "version": 1}
+    assert (spec["aggregator"], spec["dimension"]) == ("gem", 16)
+
+
+def test_vocabulary_is_fitted_on_photos_of_different_sizes(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    place = workplace_of("test-tiny-vlad:aggregator=soft-vlad,clusters=2,preprocessing=round14")
+    for number, size in enumerate([(64, 48), (48, 64), (90, 90)]):
+        place.upload_bytes(encoded(photo_image(number, *size), "PNG"))
+    place.fit(clusters=2)
+    generation = place.active()
+    assert (generation.dimension, generation.spec["temperature"]) == (32, 1.0)
+    assert len(place.rows()) == 3
+
+
+def test_a_query_waits_for_one_batch_at_most(averages: Workplace, before_describing: Hook) -> None:
+    averages.upload(0)
+    averages.drain()
+    photo_ids = averages.upload(*range(1, 17))  # four batches
+    asked: list[UUID] = []
+    done_before: list[tuple[int, JobState]] = []
+
+    def watch(pixels: list[Pixels]) -> None:
+        if asked:
+            done_before.append((len(pixels), JobState(averages.job(asked[0]).state)))
+        else:  # in the first batch, when the second one is claimed and decoded already
+            asked.append(averages.ask(photo_bytes(99)))
+
+    before_describing(watch)
+    averages.drain()
+    assert done_before[0] == (1, JobState.RUNNING)  # the next forward pass is the query's
+    assert done_before[1:] == [(4, JobState.SUCCEEDED)] * 3
+    assert len(averages.rows()) == len(photo_ids) + 1
+
+
+def test_a_query_does_not_even_wait_for_the_batch_that_is_being_described(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    averages.upload(0)
+    averages.drain()
+    averages.upload(*range(1, 5))
+    answered: list[JobState] = []
+
+    def ask_and_wait(pixels: list[Pixels]) -> None:
+        if len(pixels) > 1:  # the bulk batch, which goes on only when the query is answered
+            job_id = averages.ask(photo_bytes(99))
+            answered.append(averages.await_end(job_id))
+
+    before_describing(ask_and_wait)
+    averages.drain()
+    assert answered == [JobState.SUCCEEDED]
+    assert len(averages.rows()) == 5
+
+
+def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    photo_id, job_id = averages.upload_bytes(photo_bytes(0))
+    set_columns(averages.catalog, job_id, alone=True)
+    during: list[JobState] = []
+    asked: list[UUID] = []
+
+    def ask(_: NDArray[np.uint8]) -> None:
+        if not asked:
+            asked.append(averages.ask(photo_bytes(99)))
+            time.sleep(3 * worker_module.QUERY_POLL_SECONDS)
+            during.append(JobState(averages.job(asked[0]).state))
+
+    before_describing(ask)
+    averages.drain()
+    assert during == [JobState.QUEUED]
+    assert averages.job(asked[0]).state == JobState.SUCCEEDED
+    assert set(averages.rows()) == {photo_id}
+
+
+def test_a_query_goes_between_the_slices_of_a_fit(
+    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vlads.upload(*range(8))
+    vlads.fit()
+    job_id = vlads.start(JobKind.FIT, clusters=8, sample=100, seed=1)
+    asked: list[UUID] = []
+    stages: list[tuple[str | None, JobState]] = []
+    real = ModelChangeRunner.run_step
+
+    def watch(self: ModelChangeRunner, job: Job) -> None:
+        if asked:
+            stages.append((job.stage, JobState(vlads.job(asked[-1]).state)))
+        asked.append(vlads.ask(photo_bytes(50 + len(asked))))
+        real(self, job)
+
+    monkeypatch.setattr(ModelChangeRunner, "run_step", watch)
+    vlads.drain()
+    assert [stage for stage, _ in stages] == ["sample", "sample", "cluster"]
+    assert {state for _, state in stages} == {JobState.SUCCEEDED}
+    assert vlads.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
+
+
+def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
+    vlads: Workplace,
+) -> None:
+    photo_ids = vlads.upload(1, 2, 3)
+    query = vlads.ask(photo_bytes(9))
+    vlads.drain()
+    for photo_id in photo_ids:
+        job = vlads.job_of(photo_id)
+        assert (job.state, job.waiting_for) == (JobState.QUEUED, WaitingFor.VOCABULARY)
+        assert job.attempts == 0
+    refused = vlads.job(query)
+    assert refused.state == JobState.FAILED
+    assert refused.error is not None
+    assert refused.error["code"] == "no_vocabulary"
+
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # AUTO_FIT_PHOTOS
+    assert not vlads.hints.wait(0)
+    photo_ids += vlads.upload(4)
+    vlads.drain()
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)
+    assert vlads.hints.wait(0)
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # once is enough
+    with vlads.catalog.read() as session:
+        job_id = session.scalars(select(Job.id).where(Job.kind == JobKind.FIT)).one()
+    fit = vlads.finish(job_id)
+    assert fit.state == JobState.SUCCEEDED
+    assert fit.result is not None
+    assert (fit.result["photos"], fit.result["failed"]) == (4, 0)
+    generation = vlads.active()
+    vocabulary = vlads.vocabulary(generation.vocabulary_id)
+    centres = decode_centres(vlads.store.get(vocabulary.object_key))
+    rows = vlads.rows()
+    assert set(rows) == set(photo_ids)
+    for number, photo_id in enumerate(photo_ids, start=1):
+        assert same(rows[photo_id], expected_row("test-tiny-vlad", photo_bytes(number), centres))
+        assert vlads.job_of(photo_id).state == JobState.SUCCEEDED
+    query = vlads.ask(photo_bytes(9))
+    vlads.drain()
+    assert vlads.job(query).state == JobState.SUCCEEDED
+
+
+def test_no_vocabulary_is_fitted_by_itself_after_a_fit_was_cancelled(vlads: Workplace) -> None:
+    vlads.upload(1, 2)
+    vlads.drain()
+    vlads.cancel(vlads.start(JobKind.FIT, clusters=8, sample=100, seed=0))
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 1)
+    with vlads.catalog.read() as session:
+        assert session.scalar(select(func.count()).where(Job.kind == JobKind.FIT)) == 1
+
+
+def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
+    vlads: Workplace,
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vlads.upload(1, 2)
+    slow, quick = make_worker(), make_worker()
+    late: list[UUID] = []
+
+    def find_or_fit(*arguments: Any) -> Any:
+        found = resolve_generation(*arguments)
+        if late and found is None and vlads.job_of(late[0]).worker == "worker-0":
+            fit()
+        return found
+
+    fit = once(lambda: _fit_with(vlads, quick))
+    _drain(slow)
+    late += vlads.upload(3)
+    monkeypatch.setattr(worker_module, "resolve_generation", find_or_fit)
+    _drain(slow)  # sees no vocabulary; before it says so, the other worker has fitted one
+    assert vlads.job_of(late[0]).state == JobState.SUCCEEDED
+    assert set(vlads.rows()) >= set(late)
+
+
+def _fit_with(workplace: Workplace, worker: ExtractorWorker) -> None:
+    workplace.start(JobKind.FIT, clusters=8, sample=100, seed=0)
+    _drain(worker)
+    assert workplace.active().state == GenerationState.ACTIVE

@@ -1,0 +1,296 @@
+"""The extractor when photos crash, leases expire, photos are deleted or servers are away."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sqlalchemy import func, select
+from sqlalchemy.exc import OperationalError
+
+from services.extractor import publish as publish_module
+from services.extractor.worker import ExtractorWorker
+from services.steward.tasks.maintenance import release_expired_leases
+from services.steward.tasks.orphans import collect_orphans
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.photos import Photo, mark_photo_deleted
+from shared.descriptors.backbones.synthetic import TinyBackbone
+from shared.descriptors.extractor import Extractor
+from shared.imaging.preprocessing import Pixels
+from shared.jobs import Job, JobState, claim_jobs
+from shared.jobs.transitions import requeue_job
+from shared.storage import FolderStore
+from tests.integration.extractor.conftest import Hook
+from tests.integration.extractor.test_describe_photos import _drain
+from tests.integration.workplace import Workplace, expected_row, once, pixels_of, same
+from tests.support.catalog_rows import end_pauses, expire_lease, states
+from tests.support.photos import photo_bytes
+
+DAY_SECONDS = 86_400.0
+
+
+def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    poison = pixels_of(photo_bytes(2))
+    batches: list[int] = []
+
+    def crash(pixels: list[Pixels]) -> None:
+        if any(np.array_equal(one, poison) for one in pixels):
+            batches.append(len(pixels))
+            raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+    before_describing(crash)
+    photo_ids = averages.upload(1, 2, 3)
+    averages.drain()
+    # Once with the others, then alone as often as a photo may.
+    assert batches == [3] + [1] * averages.settings.max_attempts
+    poisonous = averages.job_of(photo_ids[1])
+    assert (poisonous.state, poisonous.attempts) == (JobState.FAILED, 3)
+    assert poisonous.error is not None
+    assert poisonous.error["code"] == "worker_fell"
+    assert "RuntimeError" in poisonous.error["detail"]
+    for photo_id in (photo_ids[0], photo_ids[2]):
+        job = averages.job_of(photo_id)
+        assert (job.state, job.alone, job.attempts) == (JobState.SUCCEEDED, True, 0)
+    assert set(averages.rows()) == {photo_ids[0], photo_ids[2]}
+
+
+def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poison = pixels_of(photo_bytes(2))
+    real = TinyBackbone.features
+
+    def overflow(self: TinyBackbone, pixels: torch.Tensor) -> torch.Tensor:
+        features = real(self, pixels).clone()
+        for photo, found in zip(pixels.numpy(), features, strict=True):
+            if np.array_equal(photo, poison):
+                found[3, 5] = np.inf  # one number of one patch
+        return features
+
+    monkeypatch.setattr(TinyBackbone, "features", overflow)
+    photo_ids = averages.upload(1, 2, 3)
+    result = averages.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
+    refused = averages.job_of(photo_ids[1])
+    assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
+    assert refused.error is not None
+    assert refused.error["code"] == "features_not_finite"
+    rows = averages.rows()
+    assert set(rows) == {photo_ids[0], photo_ids[2]}
+    for number, photo_id in ((1, photo_ids[0]), (3, photo_ids[2])):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
+
+
+def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
+    averages: Workplace,
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Killed(BaseException):
+        """Nothing in the worker may catch this, as nothing catches SIGKILL."""
+
+    def die(*_: Any) -> None:
+        raise Killed
+
+    photo_ids = averages.upload(1, 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(publish_module, "lock_map", die)
+        with pytest.raises(Killed):
+            averages.drain()
+    orphans = averages.keys("chunks/")
+    assert len(orphans) == 2  # rows and manifest
+    assert averages.rows() == {}
+    assert release_expired_leases(averages.catalog, 3) == 0  # the lease has to expire first
+    expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
+    assert release_expired_leases(averages.catalog, 3) == 2
+    _drain(make_worker())
+    assert set(averages.rows()) == set(photo_ids)
+    live = averages.keys("")
+    assert collect_orphans(averages.catalog, averages.store, DAY_SECONDS) == 0  # too young
+    for key in live:
+        _age(averages.store, key, 2 * DAY_SECONDS)
+    assert collect_orphans(averages.catalog, averages.store, DAY_SECONDS) == 2
+    assert averages.keys("") == live - orphans
+    assert set(averages.rows()) == set(photo_ids)
+
+
+def _age(store: FolderStore, key: str, seconds: float) -> None:
+    then = time.time() - seconds
+    os.utime(store.path(key), (then, then))
+
+
+def test_a_stopping_worker_gives_back_what_it_took_ahead(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    stop = threading.Event()
+    before_describing(lambda _: stop.set())
+    photo_ids = averages.upload(*range(8))
+    result = averages.worker.drain(stop)
+    assert (result.claimed, result.succeeded) == (8, 4)
+    ahead = [averages.job_of(photo_id) for photo_id in photo_ids[4:]]
+    assert all(job.state == JobState.QUEUED and job.lease_token is None for job in ahead)
+    assert all(job.attempts == 0 and not job.alone for job in ahead)
+
+
+def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo_ids = averages.upload(*range(8))
+    calls = iter(range(10))
+
+    def claim_or_fail(*arguments: Any, **options: Any) -> list[Job]:
+        if next(calls) == 2:  # a batch is done, the next one is taken and being decoded
+            raise OperationalError("the catalog is away", None, Exception())
+        return claim_jobs(*arguments, **options)
+
+    monkeypatch.setattr("shared.jobs.runner.claim_jobs", claim_or_fail)
+    with pytest.raises(OperationalError):
+        averages.drain()
+    gc.collect()
+    leases = [t.name for t in threading.enumerate() if t.name.startswith("lease-")]
+    assert leases == []
+    monkeypatch.undo()
+    assert len(averages.rows()) == 4
+    expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
+    release_expired_leases(averages.catalog, 3)
+    averages.drain()
+    assert set(averages.rows()) == set(photo_ids)
+
+
+def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
+    averages: Workplace,
+    make_worker: Callable[[], ExtractorWorker],
+    before_describing: Hook,
+) -> None:
+    photo_ids = averages.upload(1, 2, 3)
+    slow, quick = make_worker(), make_worker()
+    seen: list[set[str]] = []
+
+    def take_over() -> None:
+        jobs = [averages.job_of(photo_id).id for photo_id in photo_ids]
+        expire_lease(averages.catalog, *jobs)
+        assert release_expired_leases(averages.catalog, 3) == 3
+        _drain(quick)
+        seen.append(averages.keys("chunks/"))
+
+    before_describing(once(take_over))
+    _drain(slow)
+    assert set(averages.rows()) == set(photo_ids)
+    with averages.catalog.read() as session:
+        known = set(session.scalars(select(Chunk.object_key)))
+        assert session.scalar(select(func.count()).select_from(Descriptor)) == 3
+    assert known <= seen[0]  # all that the catalog knows was there before the slow one came
+    assert averages.keys("chunks/") - seen[0]  # its chunk is an orphan
+    assert {averages.job_of(photo_id).worker for photo_id in photo_ids} == {"worker-1"}
+
+
+def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    photo_ids = averages.upload(1, 2, 3)
+    lost = averages.job_of(photo_ids[1]).id
+
+    def start_anew() -> None:
+        with averages.catalog.write() as session:
+            requeue_job(session.get_one(Job, lost))
+
+    before_describing(once(start_anew))
+    averages.drain()
+    rows = averages.rows()
+    for number, photo_id in enumerate(photo_ids, start=1):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
+    with averages.catalog.read() as session:
+        found = session.execute(
+            select(Chunk.rows, func.count(Descriptor.photo_id))
+            .join(Descriptor, Descriptor.chunk_id == Chunk.id)
+            .group_by(Chunk.id, Chunk.rows)
+            .order_by(Chunk.id)
+        )
+        assert [tuple(pair) for pair in found] == [(3, 2), (1, 1)]
+
+
+def test_a_photo_deleted_while_it_is_described_is_not_in_the_generation(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    photo_ids = averages.upload(1, 2, 3)
+    goes = averages.job_of(photo_ids[1]).id
+    left = averages.job_of(photo_ids[2]).id
+
+    def vanish() -> None:
+        averages.delete(photo_ids[1])
+        with averages.catalog.write() as session:  # without ending its job
+            mark_photo_deleted(session, session.get_one(Photo, photo_ids[2]), 1)
+
+    before_describing(once(vanish))
+    assert averages.drain().succeeded == 1
+    assert set(averages.rows()) == {photo_ids[0]}
+    assert states(averages.catalog, [goes, left]) == [JobState.CANCELLED, JobState.CANCELLED]
+
+
+def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) -> None:
+    photo_ids = averages.upload(1, 2)
+    job_id = averages.job_of(photo_ids[0]).id
+    averages.delete(photo_ids[0])
+    with averages.catalog.write() as session:  # the worker had claimed it just before
+        requeue_job(session.get_one(Job, job_id))
+    averages.drain()
+    assert set(averages.rows()) == {photo_ids[1]}
+    assert averages.job(job_id).state == JobState.CANCELLED
+
+
+@pytest.mark.parametrize("failing", ["open", "writer"])
+def test_jobs_pause_while_the_object_store_is_away_and_no_attempt_is_counted(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    photo_ids = averages.upload(1, 2)
+    query = averages.ask(photo_bytes(3))
+    jobs = [*(averages.job_of(photo_id).id for photo_id in photo_ids), query]
+
+    def away(*_: Any) -> None:
+        raise OSError("the disk is not there")
+
+    for _ in range(averages.settings.max_attempts + 1):
+        with monkeypatch.context() as patched:
+            patched.setattr(FolderStore, failing, away)
+            result = averages.drain()
+        assert (result.claimed, result.succeeded, result.failed) == (3, 0, 0)
+        for job_id in jobs:
+            job = averages.job(job_id)
+            assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
+            assert job.run_after is not None
+        assert averages.drain().claimed == 0  # they pause
+        end_pauses(averages.catalog)
+    averages.drain()
+    assert states(averages.catalog, jobs) == [JobState.SUCCEEDED] * 3
+    assert set(averages.rows()) == set(photo_ids)
+
+
+def test_photos_wait_for_a_worker_that_reproduces_the_generation(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    averages.upload(1)
+    averages.drain()
+    real = Extractor.spec
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            Extractor, "spec", lambda self, *made_with: {**real(self, *made_with), "layer": "other"}
+        )
+        (photo_id,) = averages.upload(2)
+        averages.drain()
+    job = averages.job_of(photo_id)
+    assert (job.state, job.attempts) == (JobState.QUEUED, 0)
+    assert job.error is not None
+    assert job.error["code"] == "spec_differs"
+    end_pauses(averages.catalog)
+    averages.drain()
+    job = averages.job_of(photo_id)
+    assert (job.state, job.error) == (JobState.SUCCEEDED, None)

@@ -1,0 +1,227 @@
+"""Model changes: cancellation, vocabulary imports and switches between extractors."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+
+from services.extractor.model_changes import ModelChangeRunner
+from services.steward.tasks.garbage_collection import collect_model_change_files
+from shared.catalog.generations import GenerationState
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import decode_centres
+from shared.errors import Conflict
+from shared.jobs import Job, JobKind, JobState
+from tests.integration.extractor.model_changes import (
+    PHOTOS,
+    WIDTH,
+    do_one_step_a_slice,
+    import_file,
+    npy,
+    photo_ids,
+    some_centres,
+)
+from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.support.photos import photo_bytes
+
+
+@pytest.mark.parametrize("in_the_slice", [False, True])
+def test_a_fit_can_be_cancelled_in_each_stage(
+    fitted: Workplace,
+    monkeypatch: pytest.MonkeyPatch,
+    in_the_slice: bool,
+) -> None:
+    do_one_step_a_slice(monkeypatch)
+    old = fitted.active().id
+    real = ModelChangeRunner.run_step
+    for stage in (None, "sample", "cluster"):
+        job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+        stop = threading.Event()
+
+        def cancel_there(
+            self: ModelChangeRunner,
+            job: Job,
+            *,
+            stage: str | None = stage,
+            job_id: UUID = job_id,
+            stop: threading.Event = stop,
+        ) -> None:
+            if job.stage == stage:
+                fitted.cancel(job_id)
+                stop.set()
+            if job.stage != stage or in_the_slice:
+                real(self, job)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(ModelChangeRunner, "run_step", cancel_there)
+            fitted.worker.drain(stop)
+        assert fitted.job(job_id).state == JobState.CANCELLED
+        assert fitted.building() is None
+        assert fitted.drain().claimed == 0
+        assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+        collect_model_change_files(fitted.catalog, fitted.store)
+        assert fitted.keys("work/") == set()
+    assert fitted.fit(seed=1).state == JobState.SUCCEEDED
+    assert fitted.active().id != old
+
+
+def test_a_fit_can_be_cancelled_while_photos_are_described(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    for when in ("before", "in between", "in a batch"):
+        job_id, new = fitted.build(seed=1)
+        fitted.advance()
+        stop = threading.Event()
+        if when == "in between":
+            with monkeypatch.context() as patched:
+                patched.setattr(Extractor, "describe", _first(Extractor.describe, stop.set))
+                fitted.worker.drain(stop)
+            assert 0 < len(fitted.rows(new)) < PHOTOS
+        if when == "in a batch":
+            with monkeypatch.context() as patched:
+                patched.setattr(
+                    Extractor,
+                    "describe",
+                    _first(Extractor.describe, functools.partial(fitted.cancel, job_id)),
+                )
+                fitted.drain()
+            assert fitted.rows(new) == {}
+        else:
+            fitted.cancel(job_id)
+        assert fitted.job(job_id).state == JobState.CANCELLED
+        assert fitted.generation(new).state == GenerationState.ABANDONED
+        assert fitted.drain().claimed == 0
+        fitted.advance()
+        assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+        assert not [j for j in fitted.reindex_jobs(new) if j.state == JobState.QUEUED]
+    assert fitted.fit(seed=1).state == JobState.SUCCEEDED
+
+
+def _first(real: Callable[..., Any], do: Callable[[], None]) -> Callable[..., Any]:
+    """`real`, with something done at its first call."""
+    calls = iter([do])
+
+    def wrapped(*arguments: Any) -> Any:
+        for act in calls:
+            act()
+            break
+        return real(*arguments)
+
+    return wrapped
+
+
+def test_a_second_model_change_waits_until_the_first_has_ended(fitted: Workplace) -> None:
+    job_id, _ = fitted.build(seed=1)
+    with pytest.raises(Conflict, match=str(job_id)):
+        fitted.start(JobKind.FIT, **FIT)
+    fitted.finish(job_id)
+    assert fitted.fit(seed=2).state == JobState.SUCCEEDED
+
+
+def test_an_imported_vocabulary_describes_the_map(vlads: Workplace) -> None:
+    ids = vlads.upload(1, 2)
+    vlads.drain()  # they wait
+    centres = some_centres(5)
+    job = vlads.finish(import_file(vlads, npy(centres), "mine.npy"))
+    assert job.state == JobState.SUCCEEDED
+    vocabulary = vlads.vocabulary(vlads.active().vocabulary_id)
+    assert (vocabulary.origin, vocabulary.standing) == ("imported", "foreign")
+    assert (vocabulary.clusters, vocabulary.dimension) == (5, WIDTH)
+    assert vocabulary.provenance["imported_from"] == "mine.npy"
+    stored = decode_centres(vlads.store.get(vocabulary.object_key))
+    assert np.array_equal(stored.array, centres)
+    rows = vlads.rows()
+    assert set(rows) == set(ids)
+    assert same(rows[ids[0]], expected_row("test-tiny-vlad", photo_bytes(1), stored))
+
+
+def test_an_unfit_vocabulary_is_refused_with_the_reason_and_changes_nothing(
+    fitted: Workplace,
+) -> None:
+    old = fitted.active().id
+    good = some_centres(4)
+    broken = good.copy()
+    broken[2, 3] = np.nan
+    unfit = {
+        "not a NumPy": b"no vocabulary at all",
+        "16": npy(some_centres(4)[:, :8]),  # eight dimensions, and 16 are needed
+        "NaN": npy(broken),
+        "distinct": npy(np.concatenate([good, good[:1]])),
+        "zero": npy(np.concatenate([good, np.zeros((1, WIDTH), np.float32)])),
+        "shape": npy(good[0]),
+        "floating": npy(good.astype(np.int64)),
+        "pickle": npy(np.array([{"a": 1}])),
+    }
+    for reason, data in unfit.items():
+        job = fitted.finish(import_file(fitted, data))
+        assert job.state == JobState.FAILED, reason
+        assert job.error is not None
+        assert job.error["code"] == "vocabulary_unfit"
+        assert reason in job.error["detail"]
+    assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+    assert fitted.building() is None
+
+
+def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: Workplace) -> None:
+    first, before = fitted.active(), fitted.rows()
+    fitted.fit(seed=1)
+    assert not any(same(before[photo_id], row) for photo_id, row in fitted.rows().items())
+    job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=str(first.vocabulary_id)))
+    assert job.state == JobState.SUCCEEDED
+    again = fitted.active()
+    assert again.id != first.id  # a generation of its own
+    assert again.vocabulary_id == first.vocabulary_id
+    assert again.spec == first.spec
+    rows = fitted.rows()
+    assert set(rows) == set(before)
+    assert all(same(before[photo_id], row) for photo_id, row in rows.items())
+
+
+def test_a_switch_that_can_not_be_fails_with_the_reason(
+    fitted: Workplace, workplace_of: Callable[[str], Workplace]
+) -> None:
+    old = fitted.active()
+    elsewhere = workplace_of("test-tiny-vlad")
+    elsewhere.upload(1)
+    foreign = elsewhere.fit().result
+    assert foreign is not None
+    for vocabulary_id, code in (
+        (foreign["vocabulary_id"], "vocabulary_not_found"),  # of another map
+        (None, "vocabulary_unfit"),  # the extractor needs one
+    ):
+        job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=vocabulary_id))
+        assert job.state == JobState.FAILED
+        assert job.error is not None
+        assert job.error["code"] == code
+    assert fitted.active().id == old.id
+
+
+def test_a_map_without_vocabulary_is_described_anew_by_a_switch(averages: Workplace) -> None:
+    ids = averages.upload(1, 2)
+    averages.drain()
+    old = averages.active().id
+    job = averages.finish(averages.start(JobKind.SWITCH, vocabulary_id=None))
+    assert job.state == JobState.SUCCEEDED
+    assert averages.active().id != old
+    assert set(averages.rows()) == set(ids)
+
+
+def test_progress_is_never_negative_and_never_falls(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    (photo_id,) = photo_ids(averages)
+    averages.delete(photo_id)
+    job_id = averages.start(JobKind.SWITCH, vocabulary_id=None)
+    averages.drain()  # nothing to describe: its total is 0
+    averages.upload(2)
+    averages.drain()
+    averages.advance()
+    assert averages.job(job_id).progress_done >= 0
+    assert averages.finish(job_id).state == JobState.SUCCEEDED

@@ -1,0 +1,334 @@
+"""Model changes that fit a vocabulary, and what happens in the map meanwhile."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+from uuid import UUID
+
+import pytest
+
+from services.extractor import checkpointed_steps
+from services.extractor.model_changes import VocabularyFitJob
+from services.extractor.worker import ExtractorWorker
+from shared.catalog.generations import GenerationState
+from shared.catalog.jobs import WaitingFor
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import decode_centres
+from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.transitions import cancel_job, requeue_job, retry_job
+from tests.integration.extractor.model_changes import (
+    PHOTOS,
+    WIDTH,
+    do_one_step_a_slice,
+    do_slices,
+    import_file,
+    npy,
+    photo_ids,
+    some_centres,
+)
+from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.support.photos import photo_bytes
+
+
+def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:
+    old, before = fitted.active(), fitted.rows()
+    version = _version(fitted)
+    job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+    answering: list[tuple[UUID, int]] = []
+
+    job = fitted.finish(job_id, lambda: answering.append((fitted.active().id, fitted.searchable())))
+
+    new = fitted.active()
+    assert new.id != old.id
+    assert {count for _, count in answering} == {PHOTOS}  # at no moment fewer
+    assert [generation for generation, _ in itertools.groupby(a for a, _ in answering)] == [
+        old.id,
+        new.id,
+    ]
+    retired = fitted.generation(old.id)
+    assert (retired.state, new.state) == (GenerationState.RETIRED, GenerationState.ACTIVE)
+    assert retired.ended_at is not None
+    assert new.activated_at is not None
+    assert fitted.building() is None
+    assert job.result == {
+        "generation_id": str(new.id),
+        "vocabulary_id": str(new.vocabulary_id),
+        "clusters": 7,  # 6 photos of 64 patches, 50 for each
+        "dimension": 7 * WIDTH,
+        "pca": None,
+        "photos": PHOTOS,
+        "failed": 0,
+    }
+    assert (
+        job.progress_done
+        == job.progress_total
+        == 2 * PHOTOS + checkpointed_steps.FIT_PROGRESS_UNITS
+    )
+    assert _version(fitted) > version
+
+    vocabulary = fitted.vocabulary(new.vocabulary_id)
+    assert (vocabulary.origin, vocabulary.standing) == ("fitted", "own")
+    centres = decode_centres(fitted.store.get(vocabulary.object_key))
+    assert vocabulary.sha256 == centres.sha256 == new.spec["vocabulary_sha256"]
+    rows = fitted.rows()
+    for number, photo_id in enumerate(photo_ids(fitted)):
+        expected = expected_row("test-tiny-vlad", photo_bytes(number), centres)
+        assert same(rows[photo_id], expected)
+        assert not same(before[photo_id], expected)
+        assert fitted.job_of(photo_id).state == JobState.SUCCEEDED
+    assert fitted.reindex_jobs(new.id) == []
+
+
+def _version(workplace: Workplace) -> int:
+    with workplace.catalog.read() as session:
+        return session.get_one(Map, workplace.map_id).version
+
+
+def test_few_photos_bear_few_clusters(vlads: Workplace) -> None:
+    vlads.upload(1, 2, 3)
+    job = vlads.fit(clusters=64)
+    assert job.result is not None
+    assert job.result["clusters"] == 3 * 64 // PATCHES_PER_CLUSTER == 3
+    generation = vlads.active()
+    assert (generation.dimension, generation.spec["clusters"]) == (3 * WIDTH, 3)
+    provenance = vlads.vocabulary(generation.vocabulary_id).provenance
+    assert (provenance["clusters_asked"], provenance["patches"]) == (64, 3 * 64)
+    assert (provenance["photos"], provenance["seed"]) == (3, 0)
+
+
+def test_a_fit_that_names_no_number_makes_as_many_clusters_as_the_extractors_name_says(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    workplace = workplace_of("test-tiny-vlad:clusters=2")
+    workplace.upload(1, 2, 3)
+    job = workplace.fit(clusters=None)
+    assert job.state == JobState.SUCCEEDED
+    generation = workplace.active()
+    assert (generation.extractor, generation.spec["clusters"]) == ("test-tiny-vlad:clusters=2", 2)
+    assert workplace.vocabulary(generation.vocabulary_id).provenance["clusters_asked"] == 2
+    assert workplace.fit(clusters=3, seed=1).result is not None
+    assert workplace.active().spec["clusters"] == 3, "what a fit says goes before the name"
+
+
+def test_a_fit_without_photos_fails_with_the_reason(vlads: Workplace) -> None:
+    job = vlads.fit()
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "no_photos"
+
+
+def test_a_fit_on_photos_that_no_one_can_decode_fails_with_the_reason(vlads: Workplace) -> None:
+    vlads.upload_bytes(b"nothing")
+    job = vlads.fit()
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "no_photos"
+
+
+def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    generation = averages.active().id
+    for job in (averages.fit(), averages.finish(import_file(averages, npy(some_centres(3))))):
+        assert job.state == JobState.FAILED
+        assert job.error is not None
+        assert job.error["code"] == "vocabulary_unfit"
+    assert averages.active().id == generation
+
+
+def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
+    vlads: Workplace,
+    workplace_of: Callable[[str], Workplace],
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    params = {"clusters": 4, "sample": 5, "seed": 7}
+    vlads.upload(*range(PHOTOS))
+    whole = vlads.fit(**params)  # its clusters are found in one slice
+
+    do_one_step_a_slice(monkeypatch)
+    torn = workplace_of("test-tiny-vlad")
+    torn.upload(*range(PHOTOS))
+    job_id = torn.start(JobKind.FIT, **params)
+    progress = []
+    while torn.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
+        do_slices(monkeypatch, make_worker())  # each slice by a worker that knows nothing
+        progress.append((torn.job(job_id).progress_done, torn.job(job_id).progress_total))
+        assert len(progress) < 120
+    assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
+    done, totals = zip(*progress, strict=True)
+    assert set(totals) == {5 + checkpointed_steps.FIT_PROGRESS_UNITS + PHOTOS}, (
+        "what there is to do does not change"
+    )
+    assert list(done) == sorted(set(done)), "each slice is seen"
+    assert (done[2], done[-1]) == (5, 5 + checkpointed_steps.FIT_PROGRESS_UNITS)
+    again = torn.finish(job_id)
+    assert again.progress_done == totals[0]
+
+    other = workplace_of("test-tiny-vlad")
+    other.upload(*range(PHOTOS))
+    another = other.fit(**{**params, "seed": 8})
+
+    fingerprints = []
+    for workplace, job in ((vlads, whole), (torn, again), (other, another)):
+        assert job.result is not None
+        fingerprints.append(workplace.vocabulary(job.result["vocabulary_id"]).sha256)
+    assert fingerprints[0] == fingerprints[1] != fingerprints[2]
+    provenances = [
+        p.vocabulary(p.active().vocabulary_id).provenance["passes"] for p in (vlads, torn)
+    ]
+    assert provenances[0] == provenances[1] > 1
+
+
+def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    crashes = itertools.count(1)
+
+    def crash(*_: Any) -> None:
+        next(crashes)
+        raise RuntimeError("out of memory")
+
+    job_id = fitted.start(JobKind.FIT, **FIT)
+    monkeypatch.setattr(VocabularyFitJob, "_cluster", crash)
+    fitted.drain()
+    job = fitted.job(job_id)
+    assert (job.state, job.stage) == (JobState.FAILED, "cluster")
+    assert next(crashes) == fitted.settings.max_attempts + 1
+    assert job.error is not None
+    assert job.error["code"] == "worker_fell"
+    monkeypatch.undo()
+    assert fitted.active().id == old
+
+
+def test_photos_that_arrive_meanwhile_are_in_both_generations(fitted: Workplace) -> None:
+    old = fitted.active().id
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()  # reindex jobs for what is there now
+    late = fitted.upload(101, 102)
+    fitted.drain()
+    assert set(late) <= fitted.rows(old).keys()  # searchable at once
+    assert not set(late) & fitted.rows(new).keys()
+    fitted.advance()
+    fitted.drain()
+    assert fitted.active().id == old
+    assert set(late) <= fitted.rows(new).keys()
+    fitted.advance()
+    assert fitted.active().id == new
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert set(fitted.rows(new)) == set(photo_ids(fitted))
+
+
+def test_a_photo_that_is_being_described_at_the_switch_ends_up_in_the_new_generation(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    fitted.drain()  # complete, not switched yet
+    (late,) = fitted.upload(101)
+    real = Extractor.describe
+    switched: list[UUID] = []
+
+    def describe(self: Extractor, *arguments: Any) -> Any:
+        if not switched:
+            fitted.advance()
+            switched.append(fitted.active().id)
+        return real(self, *arguments)
+
+    monkeypatch.setattr(Extractor, "describe", describe)
+    fitted.drain()
+    assert switched == [new]
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert late not in fitted.rows(old)
+    assert late in fitted.rows(new)
+    assert fitted.job_of(late).state == JobState.SUCCEEDED
+    assert fitted.job_of(late).attempts == 0
+
+
+def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    before, after, *rest = photo_ids(fitted)
+    fitted.delete(before)  # before it was queued for the new generation
+    fitted.advance()
+    fitted.delete(after)  # queued, not described
+    fitted.drain()
+    fitted.delete(rest[0])  # described
+    fitted.advance()
+    job = fitted.job(job_id)
+    assert job.state == JobState.SUCCEEDED
+    assert job.result is not None
+    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 3, 0)
+    assert fitted.active().id == new
+    assert set(fitted.rows(new)) == set(rest)
+
+
+def test_all_photos_deleted_meanwhile_leave_an_empty_generation(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    for photo_id in photo_ids(fitted):
+        fitted.delete(photo_id)
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert fitted.active().id == new
+    assert fitted.searchable() == 0
+
+
+def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing(
+    fitted: Workplace,
+) -> None:
+    job_id, new = fitted.build(seed=1)
+    bad, *good = photo_ids(fitted)
+    with fitted.catalog.read() as session:
+        key = session.get_one(Photo, bad).object_key
+    fitted.store.put(key, b"the disk has rotted")
+    job = fitted.finish(job_id)
+    assert job.state == JobState.SUCCEEDED
+    assert job.result is not None
+    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 1, 1)
+    assert (job.progress_failed, job.progress_done) == (1, job.progress_total - 1)
+    assert fitted.active().id == new
+    assert set(fitted.rows()) == set(good)
+    (failed,) = fitted.reindex_jobs(new)
+    assert (failed.state, failed.photo_id) == (JobState.FAILED, bad)
+    assert failed.error is not None
+    assert failed.error["code"] == "undecodable_photo"
+    assert fitted.job_of(bad).id == failed.id  # the photo says so itself
+    assert all(fitted.job_of(photo_id).state == JobState.SUCCEEDED for photo_id in good)
+
+
+@pytest.mark.parametrize("later_changes", [0, 1])
+def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_again(
+    fitted: Workplace, later_changes: int
+) -> None:
+    bad = photo_ids(fitted)[0]
+    with fitted.catalog.read() as session:
+        key = session.get_one(Photo, bad).object_key
+    fitted.store.put(key, b"the disk has rotted")
+    for seed in range(1, later_changes + 2):
+        fitted.fit(seed=seed)
+    assert bad not in fitted.rows()
+    fitted.store.put(key, photo_bytes(0))  # restored from a backup
+    job_id = fitted.job_of(bad).id
+    with fitted.catalog.write() as session:
+        job = session.get_one(Job, job_id)
+        # Uploading the same bytes again queues the job as it is; POST /jobs/{id}/retry asks.
+        retry_job(session, job) if later_changes else requeue_job(job)
+    fitted.drain()
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert bad in fitted.rows()
+
+
+def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    first = fitted.reindex_jobs(new)[0]
+    with fitted.catalog.write() as session:
+        cancel_job(session.get_one(Job, first.id))
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert set(fitted.rows(new)) == set(photo_ids(fitted))

@@ -1,0 +1,41 @@
+"""Query parameters that no endpoint has."""
+
+from __future__ import annotations
+
+import re
+from uuid import UUID
+
+import pytest
+
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.storage import FolderStore
+from tests.integration.api_with_keys import ADMIN, Door
+
+API = "/api/v1"
+
+
+@pytest.fixture
+def door(sqlite_catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
+    return Door(sqlite_catalog, store, settings)
+
+
+def test_every_endpoint_refuses_an_unknown_parameter_by_its_name(door: Door) -> None:
+    calls = [
+        (method.upper(), path.removeprefix(API))
+        for path, methods in door.app.openapi()["paths"].items()
+        for method in methods
+        if path.startswith(API)
+    ]
+    assert len(calls) > 40
+    for method, template in calls:
+        path = re.sub(r"{\w+}", str(UUID(int=1)), template)
+        response = door(ADMIN, method, path, params={"misspelt": "1"})
+        refusal = response.json()
+        assert (response.status_code, refusal["code"]) == (422, "invalid_field"), (method, path)
+        assert {"field": "misspelt", "detail": "is unknown"} in refusal["errors"], (method, path)
+
+
+def test_every_endpoint_that_does_not_use_a_map_accepts_the_parameter(door: Door) -> None:
+    for path in ("/maps", "/models", "/keys", "/webhooks", "/health"):
+        assert door(ADMIN, "GET", path, params={"map": "default"}).status_code == 200, path

@@ -1,0 +1,95 @@
+"""A map whose chunks and objects a test lays out."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import select, update
+
+from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
+from shared.catalog.maps import Map
+from shared.catalog.session import Catalog
+from shared.storage import FolderStore
+from shared.storage.keys import (
+    TRASH,
+)
+from tests.integration.workplace import same
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_generation,
+    add_map,
+    add_photo,
+    delete,
+    row_of,
+    stored_rows,
+)
+
+HOUR_SECONDS = 3600.0
+DAY_SECONDS = 86_400.0
+MANY = 100  # chunks that an open slot may have before it is worth merging
+
+
+class ChunkMap:
+    """A map with an active generation whose chunks the test lays out."""
+
+    def __init__(self, catalog: Catalog, store: FolderStore) -> None:
+        self.catalog, self.store = catalog, store
+        with catalog.write() as session:
+            self.map_id = add_map(session).id
+            self.generation_id = add_generation(session, self.map_id).id
+
+    def photos(self, count: int) -> list[UUID]:
+        with self.catalog.write() as session:
+            return [add_photo(session, self.map_id).id for _ in range(count)]
+
+    def chunks(self, *sizes: int, slot_rows: int = 1000) -> list[list[UUID]]:
+        """Publish chunks of these many photos; the photos of each."""
+        made = [self.photos(size) for size in sizes]
+        for photo_ids in made:
+            add_chunk(self.catalog, self.store, self.generation_id, photo_ids, slot_rows)
+        return made
+
+    def delete(self, *photo_ids: UUID) -> None:
+        for photo_id in photo_ids:
+            delete(self.catalog, self.map_id, photo_id)
+
+    def live(self) -> list[tuple[int, int]]:
+        """(slot, rows) of the live chunks."""
+        with self.catalog.read() as session:
+            return [(c.slot, c.rows) for c in list_live_chunks(session, self.generation_id)]
+
+    def check_rows(self, expected: list[UUID]) -> None:
+        """The generation holds these photos, each with its own descriptor, and no others."""
+        rows = stored_rows(self.catalog, self.store, self.generation_id)
+        assert set(rows) == set(expected)
+        assert all(same(row, row_of(photo_id)) for photo_id, row in rows.items())
+        with self.catalog.read() as session:
+            assert count_searchable(session, self.generation_id) == len(expected)
+            pointed_at = set(session.scalars(select(Descriptor.chunk_id)))
+            assert pointed_at <= {c.id for c in list_live_chunks(session, self.generation_id)}
+
+    def version(self) -> int:
+        with self.catalog.read() as session:
+            return session.get_one(Map, self.map_id).version
+
+    def change(self, table: type[Any], row_id: UUID, **columns: Any) -> None:
+        with self.catalog.write() as session:
+            session.execute(
+                update(table)
+                .where(table.id == row_id)
+                .values(**columns)
+                .execution_options(synchronize_session=False)
+            )
+
+    def objects(self, prefix: str = "") -> set[str]:
+        return {
+            info.key for info in self.store.list(prefix) if prefix or not info.key.startswith(TRASH)
+        }
+
+    def age(self, keys: set[str], seconds: float) -> None:
+        then = time.time() - seconds
+        for key in keys:
+            os.utime(self.store.path(key), (then, then))

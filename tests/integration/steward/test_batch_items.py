@@ -1,0 +1,280 @@
+"""Items of batches: errors of single items, backpressure, cancel, retry."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from uuid import UUID
+
+import pytest
+from sqlalchemy import func, select
+
+from services.steward.batches import worker as worker_module
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import collect_job_files
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.session import Catalog
+from shared.jobs import Job, JobKind, JobState
+from shared.storage.keys import ARCHIVES
+from tests.integration.in_process_api import Service
+from tests.integration.steward.batches import ROUNDS, Batches, codes, counts, files, lines
+from tests.support.archives import zip_of
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+
+# tests/e2e/test_batches.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_each_bad_member_has_its_reason_and_the_others_come_in(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    members = [
+        ("good.jpg", photo_bytes(1)),
+        ("text.jpg", b"not a photo at all, by its content"),
+        ("cut.jpg", b"\xff\xd8\xff" + bytes(1000)),
+        ("inner.zip", zip_of({"a.jpg": photo_bytes(9)})),
+        ("far.jpg", photo_bytes(2)),
+        ("twice.jpg", photo_bytes(3)),
+        ("twice.jpg", photo_bytes(4)),
+        ("../../up.jpg", photo_bytes(5)),
+        ("empty.jpg", b""),
+        ("large.jpg", b"\xff\xd8\xff" + bytes(300_000)),
+        ("same.jpg", photo_bytes(1)),
+        ("__MACOSX/._good.jpg", b"resources"),
+        (".hidden.jpg", photo_bytes(6)),
+        ("folder.jpg/", b""),
+        ("photos.csv", b"file,latitude,longitude\nfar.jpg,95,7\ntwice.jpg,1,2\n"),
+    ]
+    job_id = batches.start(archive=zip_of(members))
+    worker = batches.new_worker(max_file_size=100_000)
+    job = batches.finish(job_id, worker)
+    assert job["state"] == "succeeded"
+    assert counts(job) == (3, 11, 8)
+    assert job["result"]["ignored"] == 3
+    items = batches.items(job_id)
+    assert codes(items) == [
+        None,
+        "unsupported_photo",
+        "undecodable_photo",
+        "nested_archive",
+        "invalid_field",
+        "ambiguous_name",
+        "ambiguous_name",
+        None,
+        "empty_file",
+        "file_too_large",
+        None,
+    ]
+    assert items[4]["error"]["line"] == 2
+    assert items[4]["error"]["detail"].startswith("Line 2: latitude: ")
+    assert items[10]["already_there"]
+    assert items[10]["file_id"] == items[0]["file_id"]
+    assert [photo.filename for photo in batches.photos()] == ["good.jpg", "up.jpg"]
+    assert len(batches.keys("originals/")) == 2, "what is refused leaves no bytes"
+    assert codes(batches.items(job_id, state="failed")) == [c for c in codes(items) if c]
+
+
+def test_uploaded_files_are_refused_one_by_one_and_leave_no_bytes(batches: Batches) -> None:
+    job_id = batches.start(
+        ("text.jpg", b"no photo"),
+        *files(1),
+        ("cut.jpg", b"\xff\xd8\xff" + bytes(1000)),
+        ("empty.jpg", b""),
+        *files(1),
+    )
+    job = batches.finish(job_id)
+    assert counts(job) == (2, 5, 3)
+    assert codes(batches.items(job_id)) == [
+        "unsupported_photo",
+        None,
+        "undecodable_photo",
+        "empty_file",
+        None,
+    ]
+    assert len(batches.keys("originals/")) == 1
+
+
+def test_items_come_in_pages(batches: Batches) -> None:
+    job_id = batches.start(*files(*range(5)))
+    found: list[int] = []
+    cursor: str | None = None
+    while True:
+        page = batches.service.json(
+            "GET",
+            f"/jobs/{job_id}/items",
+            params={"limit": 2, **({"cursor": cursor} if cursor else {})},
+        )
+        found += [item["number"] for item in page["items"]]
+        cursor = page["next_cursor"]
+        if cursor is None:
+            break
+    assert found == [1, 2, 3, 4, 5]
+    for wrong in ("x", "-1", "9" * 30):
+        answer = batches.service("GET", f"/jobs/{job_id}/items", params={"cursor": wrong})
+        problem(answer, 422, "invalid_field")
+
+
+def test_other_jobs_have_no_items(batches: Batches) -> None:
+    job_id = batches.service.upload(photo_bytes(1))["job_id"]
+    problem(batches.service("GET", f"/jobs/{job_id}/items"), 409, "no_items")
+    problem(batches.service("GET", f"/jobs/{UUID(int=1)}/items"), 404, "job_not_found")
+
+
+def test_the_same_bytes_of_which_something_else_is_said_are_refused(batches: Batches) -> None:
+    batches.service.indexed(1, place="hall")
+    manifest = lines({"filename": "1.jpg", "place": "yard"})
+    job_id = batches.start(*files(1), manifest=manifest)
+    batches.finish(job_id)
+    assert codes(batches.items(job_id)) == ["photo_differs"]
+    assert len(batches.keys("originals/")) == 1
+
+
+def test_a_photo_that_can_not_be_decoded_fails_its_item(batches: Batches) -> None:
+    whole = photo_bytes(1)
+    header = whole[: whole.index(b"\xff\xda")] + bytes(2)
+    job_id = batches.start(("torn.jpg", header), *files(2))
+    job = batches.finish(job_id)
+    assert (job["state"], counts(job)) == ("succeeded", (1, 2, 1))
+    [failed] = batches.items(job_id, state="failed")
+    assert failed["error"]["code"] == "undecodable_photo"
+    assert failed["file_id"]
+
+
+def queued_photos(catalog: Catalog) -> int:
+    with catalog.read() as session:
+        return (
+            session.scalar(
+                select(func.count())
+                .select_from(Job)
+                .where(Job.kind == JobKind.INDEX, Job.state == JobState.QUEUED)
+            )
+            or 0
+        )
+
+
+def test_a_batch_brings_in_no_more_than_the_extractors_have_room_for(batches: Batches) -> None:
+    job_id = batches.start(archive=zip_of(dict(files(*range(10)))))
+    worker = batches.new_worker(batch_ahead_photos=4)
+    for _ in range(3):
+        batches.work(worker)
+    assert queued_photos(batches.catalog) == 4
+    assert Counter(batches.states(job_id)) == {"running": 4, "queued": 6}
+    batches.service.drain()
+    batches.work(worker)
+    assert Counter(batches.states(job_id)) == {"succeeded": 4, "running": 4, "queued": 2}
+    assert counts(batches.finish(job_id, worker)) == (10, 10, 0)
+
+
+def test_an_upload_goes_before_the_photos_of_a_batch(batches: Batches) -> None:
+    batches.start(*files(*range(4)))
+    batches.work()
+    upload = batches.service.upload(photo_bytes(9))
+    with batches.catalog.read() as session:
+        first = session.scalar(select(Job.id).order_by(Job.priority.desc(), Job.id).limit(1))
+    assert str(first) == upload["job_id"]
+
+
+def test_batches_take_turns(batches: Batches, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_module, "SLICE_SECONDS", 0.0)
+    jobs = [batches.start(*files(*range(begin, begin + 3))) for begin in (0, 10)]
+    monkeypatch.setattr(worker_module, "YIELD_SECONDS", 60.0)
+    for _ in range(2):
+        assert batches.worker.run_next(threading.Event())
+    assert [batches.job(job_id)["state"] for job_id in jobs] == ["running", "running"]
+
+
+def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
+    batches.service.indexed(0)
+    job_id = batches.start(archive=zip_of(dict(files(*range(8)))))
+    worker = batches.new_worker(batch_ahead_photos=3)
+    batches.work(worker)
+    batches.service.drain()
+    batches.work(worker)
+    cancelled = batches.service.json("POST", f"/jobs/{job_id}/cancel")
+    assert cancelled["state"] == "cancelled"
+    states = Counter(batches.states(job_id))
+    assert states["succeeded"] == 4, "the one that was there, and three described"
+    assert set(states) == {"succeeded", "cancelled"}
+    assert queued_photos(batches.catalog) == 0
+    assert not batches.work()
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    assert batches.keys("archives/") == set()
+    problem(batches.service("POST", f"/jobs/{job_id}/cancel"), 409, "job_finished")
+
+
+def test_retry_queues_the_failed_items_again_whose_bytes_are_there(batches: Batches) -> None:
+    batches.store.put("imports/1.jpg", photo_bytes(1))
+    manifest = lines({"key": "imports/1.jpg"}, {"key": "imports/2.jpg"})
+    started = batches.service.json(
+        "POST",
+        "/upload/batch",
+        202,
+        content=manifest,
+        headers={"Content-Type": "application/x-ndjson"},
+    )
+    job_id = UUID(started["job_id"])
+    problem(batches.service("POST", f"/jobs/{job_id}/retry"), 409, "job_not_retryable")
+    assert counts(batches.finish(job_id)) == (1, 2, 1)
+    batches.store.put("imports/2.jpg", photo_bytes(2))
+    again = batches.service.json("POST", f"/jobs/{job_id}/retry")
+    assert again["state"] == "queued"
+    assert Counter(batches.states(job_id)) == {"succeeded": 1, "queued": 1}
+    assert counts(batches.finish(job_id)) == (2, 2, 0)
+    problem(batches.service("POST", f"/jobs/{job_id}/retry"), 409, "job_not_retryable")
+
+
+def test_retry_describes_the_photos_of_a_cancelled_batch(batches: Batches) -> None:
+    job_id = batches.start(archive=zip_of(dict(files(*range(6)))))
+    batches.work(batches.new_worker(batch_ahead_photos=4))
+    batches.service.json("POST", f"/jobs/{job_id}/cancel")
+    assert set(batches.states(job_id)) == {"cancelled"}
+    batches.service.json("POST", f"/jobs/{job_id}/retry")
+    job = batches.finish(job_id)
+    assert (job["state"], job["result"]["succeeded"], job["result"]["cancelled"]) == (
+        "succeeded",
+        4,
+        2,
+    )
+
+
+def test_a_photo_that_is_deleted_meanwhile_ends_its_item(batches: Batches) -> None:
+    job_id = batches.start(*files(1, 2))
+    batches.work()
+    item = batches.items(job_id)[0]
+    batches.service.json("DELETE", f"/uploads/{item['file_id']}")
+    job = batches.finish(job_id)
+    assert (job["state"], batches.states(job_id)) == ("succeeded", ["cancelled", "succeeded"])
+    assert counts(job) == (1, 2, 0)
+
+
+def test_a_map_that_is_deleted_takes_its_batch_along(batches: Batches) -> None:
+    batches.start(archive=zip_of(dict(files(*range(6)))))
+    batches.start(*files(7, 8))
+    batches.work(batches.new_worker(batch_ahead_photos=3))
+    batches.service.json("DELETE", "/maps/default")
+    for _ in range(ROUNDS):
+        purge_deleted_maps(batches.catalog, batches.store)
+    assert batches.keys("originals/") | batches.keys("archives/") == set()
+    with batches.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
+
+
+def test_a_batch_waits_with_its_photos_for_a_vocabulary(batches: Batches, service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "vlad", "extractor": "test-tiny-vlad"})
+    sent = [("file", file) for file in files(1, 2)]
+    started = service.json("POST", "/upload/batch", 202, params={"map": "vlad"}, files=sent)
+    for _ in range(3):
+        batches.work()
+        service.drain()
+    path = f"/jobs/{started['job_id']}"
+    job = service.json("GET", path, params={"map": "vlad"})
+    assert (job["state"], job["waiting_for"]) == ("running", "vocabulary")
+    assert not batches.work()
+    service.json("POST", "/vocabularies", 202, params={"map": "vlad"}, json={"clusters": 2})
+    for _ in range(6):
+        service.drain()
+        batches.work()
+    job = service.json("GET", path, params={"map": "vlad"})
+    assert (job["state"], counts(job)) == ("succeeded", (2, 2, 0))

@@ -1,0 +1,257 @@
+"""Batches whose steward is killed at any step, or whose store is away or full."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID
+
+import pytest
+from sqlalchemy import func, select
+
+from services.steward.batches import worker as bring_in_module
+from services.steward.batches.worker import resume_batches
+from services.steward.tasks.garbage_collection import collect_job_files
+from services.steward.tasks.orphans import collect_orphans
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.photos import Photo
+from shared.errors import StorageFull, Unavailable
+from shared.ingest import store_photo as store_photo_module
+from shared.ingest import validation as incoming_module
+from shared.jobs import Job, JobKind, JobState
+from shared.storage import FolderStore, ObjectStore
+from shared.storage.keys import ARCHIVES
+from tests.integration.steward.batches import Batches, Killed, codes, counts, files, lines, restart
+from tests.support.archives import PACKED, zip_of
+from tests.support.catalog_rows import read_job
+
+# tests/e2e/test_batches.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
+
+def assert_each_is_there_once(batches: Batches, job_id: UUID, photos: int) -> None:
+    job = batches.finish(job_id)
+    assert (job["state"], counts(job)) == ("succeeded", (photos, photos, 0))
+    assert len(batches.photos()) == photos
+    with batches.catalog.read() as session:
+        jobs = session.scalars(select(Job).where(Job.kind == JobKind.INDEX)).all()
+    assert len(jobs) == photos
+    stored = {photo.object_key for photo in batches.photos()}
+    assert stored <= batches.keys("originals/")
+    collect_orphans(batches.catalog, batches.store, age_seconds=-60)
+    assert batches.keys("originals/") == stored
+
+
+@pytest.mark.parametrize("step", ["writer", "read_range", "open", "head", "delete"])
+@pytest.mark.parametrize("source", ["zip", "tar.gz", "files", "keys"])
+def test_a_steward_killed_at_any_step_leaves_each_photo_once(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch, source: str, step: str
+) -> None:
+    """Each life ends at its nth step of a kind with the object store; the next life is longer."""
+    photos = files(*range(6))
+    if source == "files":
+        job_id = batches.start(*photos)
+    elif source == "keys":
+        for name, data in photos:
+            batches.store.put(f"imports/{name}", data)
+        job_id = batches.start(manifest=lines(*({"key": f"imports/{n}"} for n, _ in photos)))
+    else:
+        job_id = batches.start(archive=PACKED[source](photos))
+    real: Any = getattr(FolderStore, step)
+    for life in (1, 3, 7):  # an archive that kills three while it is looked through is given up
+        left = [life]
+
+        def die(self: FolderStore, *arguments: Any, left: list[int] = left) -> Any:
+            left[0] -= 1
+            if left[0] == 0:
+                raise Killed
+            return real(self, *arguments)
+
+        monkeypatch.setattr(FolderStore, step, die)
+        try:
+            batches.work()
+        except Killed:
+            monkeypatch.setattr(FolderStore, step, real)
+            batches.worker = restart(batches, job_id)
+        monkeypatch.setattr(FolderStore, step, real)
+    assert_each_is_there_once(batches, job_id, len(photos))
+
+
+def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(*range(5))))
+    real = store_photo_module.insert_photo
+
+    def put_then_die(*arguments: Any) -> Any:
+        real(*arguments)
+        raise Killed
+
+    for life in range(2):
+        monkeypatch.setattr(bring_in_module, "insert_photo", put_then_die)
+        with pytest.raises(Killed):
+            batches.work()
+        monkeypatch.setattr(bring_in_module, "insert_photo", real)
+        assert batches.photos() == [], life
+        batches.worker = restart(batches, job_id)
+    assert len(batches.keys("originals/")) == 2, "orphans of the two lives"
+    batches.work(batches.new_worker(max_attempts=100))
+    assert_each_is_there_once(batches, job_id, 5)
+
+
+def test_a_steward_whose_lease_was_taken_over_commits_nothing(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(*range(4))))
+    real: Any = FolderStore.writer
+    slow = batches.worker
+
+    def be_slow(self: FolderStore, key: str) -> Any:
+        monkeypatch.setattr(FolderStore, "writer", real)
+        other = restart(batches, job_id)
+        assert batches.work(other)
+        return real(self, key)
+
+    monkeypatch.setattr(FolderStore, "writer", be_slow)
+    assert batches.work(slow)
+    assert_each_is_there_once(batches, job_id, 4)
+
+
+def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(*range(4))))
+    real = incoming_module.validate_photo
+
+    def die_of_one(store: ObjectStore, received: Any, *rest: Any, **fields: Any) -> Any:
+        if received.filename == "2.jpg":
+            raise Killed
+        return real(store, received, *rest, **fields)
+
+    monkeypatch.setattr(bring_in_module, "validate_photo", die_of_one)
+    for _ in range(3):
+        with pytest.raises(Killed):
+            batches.work()
+        batches.worker = restart(batches, job_id)
+    job = batches.finish(job_id)
+    assert (job["state"], counts(job)) == ("succeeded", (3, 4, 1))
+    assert codes(batches.items(job_id)) == [None, None, "worker_fell", None]
+
+
+def test_a_batch_pauses_while_the_store_is_away(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(1, 2)))
+    real: Any = FolderStore.writer
+
+    def away(self: FolderStore, key: str) -> Any:
+        raise Unavailable("object_store_unavailable", "gone for lunch")
+
+    monkeypatch.setattr(FolderStore, "writer", away)
+    assert batches.work()
+    job = read_job(batches.catalog, job_id)
+    assert (job.state, job.attempts) == (JobState.RUNNING, 0)
+    assert job.run_after is not None
+    monkeypatch.setattr(FolderStore, "writer", real)
+    assert_each_is_there_once(batches, job_id, 2)
+
+
+def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(1, 2)))
+    free = SimpleNamespace(free=batches.settings.min_free_bytes - 1)
+    monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
+    assert batches.work()
+    for _ in range(2):
+        resume_batches(batches.catalog, batches.settings)
+        assert not batches.work(), "nothing is taken while it waits"
+    job = batches.job(job_id)
+    assert (job["state"], job["waiting_for"]) == ("running", "disk_space")
+    assert (job["stage"], counts(job), batches.photos()) == ("store", (0, 2, 0), [])
+    free.free += 1
+    resume_batches(batches.catalog, batches.settings)
+    assert_each_is_there_once(batches, job_id, 2)
+
+
+def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(1, 2)))
+    real: Any = FolderStore.writer
+
+    def full(self: FolderStore, key: str) -> Any:
+        raise StorageFull("object_store_full", "no room")
+
+    monkeypatch.setattr(FolderStore, "writer", full)
+    assert batches.work()
+    assert batches.job(job_id)["waiting_for"] == "disk_space"
+    monkeypatch.setattr(FolderStore, "writer", real)
+    resume_batches(batches.catalog, batches.settings)
+    assert_each_is_there_once(batches, job_id, 2)
+
+
+def test_an_archive_that_was_removed_fails_its_batch(batches: Batches) -> None:
+    job_id = batches.start(archive=zip_of(files(1)))
+    [key] = batches.keys("archives/")
+    batches.store.delete(key)
+    job = batches.finish(job_id)
+    assert (job["state"], job["error"]["code"]) == ("failed", "archive_gone")
+
+
+def test_bytes_that_wait_in_a_batch_are_no_orphans(batches: Batches) -> None:
+    job_id = batches.start(*files(1, 2))
+    archive_id = batches.start(archive=zip_of(files(3)))
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_orphans(batches.catalog, batches.store, age_seconds=-60)
+    assert counts(batches.finish(job_id)) == (2, 2, 0)
+    assert counts(batches.finish(archive_id)) == (1, 1, 0)
+    batches.store.put(f"archives/{UUID(int=7)}", b"of a gateway that was killed")
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    assert f"archives/{UUID(int=7)}" in batches.keys("archives/")
+    collect_orphans(batches.catalog, batches.store, age_seconds=-60)
+    assert batches.keys("archives/") == set()
+
+
+def test_a_forgotten_batch_takes_its_items_along(batches: Batches) -> None:
+    job_id = batches.start(*files(1))
+    batches.finish(job_id)
+    with batches.catalog.write() as session:
+        session.delete(session.get_one(Job, job_id))
+    with batches.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
+        assert session.scalar(select(func.count()).select_from(Photo)) == 1
+
+
+@pytest.mark.parametrize("source", ["zip", "tar", "tar.gz", "files", "keys"])
+def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
+    on_s3: Batches, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    photos = files(*range(5))
+    if source == "files":
+        job_id = on_s3.start(*photos)
+    elif source == "keys":
+        for name, data in photos:
+            on_s3.store.put(f"imports/{name}", data)
+        job_id = on_s3.start(manifest=lines(*({"key": f"imports/{n}"} for n, _ in photos)))
+    else:
+        job_id = on_s3.start(archive=PACKED[source](photos))
+    real = incoming_module.validate_photo
+    left = [3]
+
+    def die_at_the_third(*arguments: Any) -> Any:
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+        return real(*arguments)
+
+    monkeypatch.setattr(bring_in_module, "validate_photo", die_at_the_third)
+    with pytest.raises(Killed):
+        on_s3.work()
+    on_s3.worker = restart(on_s3, job_id)
+    on_s3.work()
+    assert on_s3.states(job_id) == ["running"] * 5
+    stored = on_s3.photos()
+    assert [photo.filename for photo in stored] == [name for name, _ in photos]
+    for photo, (_, data) in zip(stored, photos, strict=True):
+        assert on_s3.store.get(photo.object_key) == data

@@ -1,0 +1,219 @@
+"""Compaction: small chunks of a slot are merged, whatever changes meanwhile."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+from uuid import UUID
+
+import pytest
+
+from services.steward.tasks import compaction as compact_module
+from services.steward.tasks.compaction import merge_slot, merge_small_chunks
+from services.steward.tasks.garbage_collection import (
+    collect_deleted_photos,
+)
+from shared.catalog.base import db_now_plus
+from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.photos import Photo
+from shared.storage.chunks import read_chunk, write_chunk
+from shared.storage.read_retries import ReadRetries
+from tests.integration.steward.chunk_map import HOUR_SECONDS, MANY, ChunkMap
+from tests.integration.workplace import same
+from tests.support.catalog_rows import (
+    row_of,
+    stored_rows,
+)
+
+
+def test_small_chunks_of_a_slot_become_one(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(2, 3, 1))
+    version = chunk_map.version()
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 1
+    assert chunk_map.live() == [(0, 6)]
+    chunk_map.check_rows(photo_ids)
+    assert chunk_map.version() == version + 1  # search workers look again
+    assert (
+        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 0
+    )  # nothing is left to do
+
+
+def sum_of(parts: list[list[UUID]]) -> list[UUID]:
+    return [photo_id for part in parts for photo_id in part]
+
+
+def test_few_chunks_of_an_open_slot_are_left(chunk_map: ChunkMap) -> None:
+    chunk_map.chunks(2, 3)
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 0
+    assert chunk_map.live() == [(0, 2), (0, 3)]
+
+
+def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(3, 4, 3, 5, 5, 9, 1, slot_rows=10))
+    assert chunk_map.live() == [(0, 3), (0, 4), (0, 3), (1, 5), (1, 5), (2, 9), (2, 1)]
+    # The full slots alone: the open one (2) is no worse than it may be.
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 2
+    assert chunk_map.live() == [(0, 10), (1, 10), (2, 9), (2, 1)]
+    with chunk_map.catalog.read() as session:
+        sealed = [chunk.sealed for chunk in list_live_chunks(session, chunk_map.generation_id)]
+    assert sealed == [True, True, False, False]
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 1
+    assert chunk_map.live() == [(0, 10), (1, 10), (2, 10)]
+    chunk_map.check_rows(photo_ids)
+
+
+def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
+    first, second = chunk_map.chunks(5, 5)
+    chunk_map.delete(first[0], first[4])
+    assert (
+        merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 0
+    )  # a fifth is not worth it
+    chunk_map.delete(second[2])
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.live() == [(0, 7)]
+    chunk_map.check_rows([*first[1:4], *second[:2], *second[3:]])
+
+
+def test_a_slot_of_deleted_photos_is_left_without_a_chunk(chunk_map: ChunkMap) -> None:
+    (photo_ids,) = chunk_map.chunks(3)
+    chunk_map.delete(*photo_ids)
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.live() == []
+    chunk_map.check_rows([])
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 0
+
+
+def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
+    (photo_ids,) = chunk_map.chunks(4)
+    with chunk_map.catalog.write() as session:  # two jobs of the batch were taken over
+        for photo_id in photo_ids[:2]:
+            session.delete(session.get_one(Descriptor, (chunk_map.generation_id, photo_id)))
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.live() == [(0, 2)]
+    chunk_map.check_rows(photo_ids[2:])
+
+
+def test_merging_twice_at_once_merges_once(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo_ids = sum_of(chunk_map.chunks(2, 3))
+    together = threading.Barrier(2)
+
+    def read_together(*arguments: Any) -> Any:
+        if arguments[1] in first_keys:
+            together.wait(timeout=30)  # both have looked at the catalog before one commits
+        return read_chunk(*arguments)
+
+    with chunk_map.catalog.read() as session:
+        first_keys = {list_live_chunks(session, chunk_map.generation_id)[0].object_key}
+    monkeypatch.setattr(compact_module, "read_chunk", read_together)
+    with ThreadPoolExecutor(2) as pool:
+        merges = [
+            pool.submit(merge_slot, chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+            for _ in range(2)
+        ]
+        assert sorted(merge.result() for merge in merges) == [False, True]
+    assert chunk_map.live() == [(0, 5)]
+    chunk_map.check_rows(photo_ids)
+
+
+@pytest.fixture
+def while_merging(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], None]:
+    """Has something done after the merge has looked at the catalog, before it commits."""
+
+    def meanwhile(do: Callable[[], object]) -> None:
+        calls = iter([do])
+
+        def write(*arguments: Any, **options: Any) -> Any:
+            written = write_chunk(*arguments, **options)
+            for act in calls:
+                act()
+                break
+            return written
+
+        monkeypatch.setattr(compact_module, "write_chunk", write)
+
+    return meanwhile
+
+
+Meanwhile = Callable[[Callable[[], object]], None]
+
+
+def test_a_photo_deleted_while_merging_does_not_come_back(
+    chunk_map: ChunkMap, while_merging: Meanwhile
+) -> None:
+    first, second = chunk_map.chunks(2, 3)
+    while_merging(lambda: chunk_map.delete(first[0]))
+    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    with chunk_map.catalog.read() as session:
+        assert count_searchable(session, chunk_map.generation_id) == 4
+    rows = stored_rows(chunk_map.catalog, chunk_map.store, chunk_map.generation_id)
+    assert all(same(row, row_of(photo_id)) for photo_id, row in rows.items())
+    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    chunk_map.check_rows([first[1], *second])
+
+
+def test_a_photo_forgotten_while_merging_does_not_come_back(
+    chunk_map: ChunkMap, while_merging: Meanwhile
+) -> None:
+    first, second = chunk_map.chunks(2, 3)
+
+    def forget() -> None:
+        chunk_map.delete(first[0])
+        chunk_map.change(Photo, first[0], deleted_at=db_now_plus(-2 * HOUR_SECONDS))
+        collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+
+    while_merging(forget)
+    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.live() == [(0, 5)]  # its row is dead
+    chunk_map.check_rows([first[1], *second])
+
+
+def test_a_chunk_that_arrives_while_merging_is_not_lost(
+    chunk_map: ChunkMap, while_merging: Meanwhile
+) -> None:
+    first, second = chunk_map.chunks(2, 3)
+    late: list[UUID] = []
+    while_merging(lambda: late.extend(sum_of(chunk_map.chunks(2))))
+    assert not merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.live() == [(0, 2), (0, 3), (0, 2)]
+    chunk_map.check_rows([*first, *second, *late])
+
+
+def test_a_corrupt_chunk_stays_and_others_are_merged(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(5, 5, 3, 3, slot_rows=10))
+    with chunk_map.catalog.read() as session:
+        broken = list_live_chunks(session, chunk_map.generation_id)[0].object_key
+    whole = chunk_map.store.get(broken)
+    chunk_map.store.put(broken, whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 1
+    assert chunk_map.live() == [(0, 5), (0, 5), (1, 6)]
+    chunk_map.store.put(broken, whole)
+    chunk_map.check_rows(photo_ids)
+
+
+def test_a_corrupt_chunk_is_not_read_with_every_round_of_merging(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunk_map.chunks(1, 1)
+    with chunk_map.catalog.read() as session:
+        broken = list_live_chunks(session, chunk_map.generation_id)[0].object_key
+    whole = chunk_map.store.get(broken)
+    chunk_map.store.put(broken, whole[:-1])
+    retries = ReadRetries()
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 0
+    chunk_map.store.put(broken, whole)
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 0, (
+        "its pause is not over"
+    )
+    monkeypatch.setattr("shared.storage.read_retries.time.monotonic", lambda: float("inf"))
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 1
+
+
+def test_generations_that_no_longer_answer_are_not_merged(chunk_map: ChunkMap) -> None:
+    chunk_map.chunks(1, 1, 1)
+    chunk_map.change(Generation, chunk_map.generation_id, state=GenerationState.RETIRED)
+    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 0

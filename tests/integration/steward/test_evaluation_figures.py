@@ -1,0 +1,175 @@
+"""Evaluations: exact figures of a map that is laid out by hand."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Any
+from uuid import UUID
+
+import pytest
+import sqlalchemy as sql
+
+from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.garbage_collection import collect_superseded_chunks
+from shared.catalog.chunks import Descriptor
+from shared.catalog.session import Catalog
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
+from tests.integration.town import Town, Watched
+from tests.support.catalog_rows import (
+    delete,
+    read_job,
+)
+
+
+def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
+    town.publish(STREETS)
+    town.publish(WITHOUT_PLACE)
+    figures = town.figures()
+    assert figures["leave_one_out"] == {
+        "queries": 8,
+        "R@1": 2 / 8,
+        "R@5": 5 / 8,
+        "R@10": 7 / 8,
+        "without_positive": 7,
+    }
+    assert figures["labelled_queries"] is None
+    assert figures["radius_m"] == 25
+    (evaluation,) = town.evaluations()
+    assert figures == {
+        "evaluation_id": str(evaluation.id),
+        "generation_id": str(town.generation_id),
+        **evaluation.figures,
+    }
+    assert (evaluation.searchable, evaluation.labelled_queries) == (17, 0)
+    assert not evaluation.automatic
+    assert town.calibration() is not None
+
+
+def test_a_little_farther_than_the_radius_is_another_place(town: Town) -> None:
+    town.publish([(0, at(0)), (1, at(0, 24.9)), (90, at(1)), (91, at(1, 25.1))])
+    loo = town.figures()["leave_one_out"]
+    assert (loo["queries"], loo["R@1"], loo["without_positive"]) == (2, 1, 2)
+
+
+def test_labelled_queries_are_counted_in_and_out_of_the_map(town: Town) -> None:
+    town.publish(STREETS)
+    town.publish(
+        [
+            (1, query(**at(0, 5))),  # the first is right
+            (3, query(**at(1, 5))),  # the first is right
+            (120, query(place="hall")),  # third, after 100 and 50
+            (30, query(**at(45))),  # nowhere
+            (210, query(place="kitchen")),  # no such label
+            (60, query()),  # no one knows where: not asked
+        ]
+    )
+    labelled = town.figures()["labelled_queries"]
+    assert labelled["queries"] == 3
+    assert (labelled["R@1"], labelled["R@5"], labelled["R@10"]) == (2 / 3, 1, 1)
+    assert labelled["out_of_map"] == 2
+    assert labelled["same_session"] == 0
+    assert labelled["median_error_of_right_ones_m"] < 25
+    (evaluation,) = town.evaluations()
+    assert (evaluation.searchable, evaluation.labelled_queries) == (15, 5)
+
+
+def test_labelled_queries_do_not_disturb_leave_one_out(town: Town) -> None:
+    town.publish(STREETS)
+    before = town.figures()["leave_one_out"]
+    town.publish([(n, query(**at(0))) for n in range(0, 360, 30)])
+    assert town.figures()["leave_one_out"] == before
+
+
+def test_a_sample_is_of_its_size_and_comes_from_its_seed(town: Town) -> None:
+    town.publish([(7 * n, at(n)) for n in range(30)])  # each alone
+    requests = [_asked(town, sample=10, seed=seed) for seed in (1, 1, 2)]
+    # The sample comes first; then the neighbours of the photos that it finds.
+    assert requests[0] == requests[1]
+    assert set(requests[0][:10]) != set(requests[2][:10])
+    assert all(10 <= len(ids) < 30 for ids in requests)
+    assert len(_asked(town, sample=1000, seed=0)) == 30
+
+
+def _asked(town: Town, **params: Any) -> list[UUID]:
+    """Which photos an evaluation asks with; a search may be repeated, deeper."""
+    seen: dict[UUID, None] = {}
+    search = town.search.search
+
+    class Noting:
+        def search(self, request: SearchRequest) -> SearchResponse:
+            seen.update(dict.fromkeys(request.exclude))
+            return search(request)
+
+        def status(self) -> SearchStatus:
+            return town.search.status()
+
+    town.start(**params)
+    assert town.work(Noting())
+    return list(seen)
+
+
+@pytest.mark.parametrize(
+    ("later", "same"),
+    [(0 * HOUR, True), (11.9 * HOUR, True), (-11.9 * HOUR, True), (12 * HOUR, False)],
+)
+def test_queries_of_the_session_of_their_match_teach_no_confidence(
+    town: Town, later: timedelta, same: bool
+) -> None:
+    """40 of them are right and 20 wrong: enough to learn from, if they were of another day."""
+    town.publish([(6 * n, at(n, captured_at=NOON)) for n in range(60)])
+    town.publish(
+        [
+            (6 * n + 1, query(**at(n if n < 40 else n - 20, captured_at=NOON + later)))
+            for n in range(60)
+        ]
+    )
+    figures = town.figures()
+    assert figures["labelled_queries"]["same_session"] == (60 if same else 0)
+    calibration = town.calibration()
+    assert calibration is not None
+    assert calibration["labelled_queries"] == (0 if same else 60)
+    expected = "uncalibrated" if same else "calibrated"
+    assert figures["estimate"]["calibration"] == expected
+    assert (figures["labelled_queries"]["auroc"] is None) == same
+
+
+def test_a_photo_deleted_meanwhile_counts_neither_way(town: Town, catalog: Catalog) -> None:
+    photo_ids = town.publish([(0, at(0)), (1, at(0)), (90, at(1)), (91, at(1))])
+    asking = town.publish([(2, query(**at(0))), (92, query(**at(1)))])
+    job_id = town.start()
+
+    def delete_some() -> None:
+        for gone in (photo_ids[3], asking[1]):
+            delete(catalog, town.map_id, gone)
+            _forget(catalog, gone)
+
+    town.work(Watched(town.search, 1, delete_some))
+    result = read_job(catalog, job_id).result
+    assert result is not None
+    assert result["leave_one_out"]["queries"] == 3
+    assert result["leave_one_out"]["R@1"] == pytest.approx(2 / 3), "the pair of the gone one"
+    assert (result["labelled_queries"]["queries"], result["labelled_queries"]["R@1"]) == (1, 1)
+
+
+def _forget(catalog: Catalog, photo_id: UUID) -> None:
+    with catalog.write() as session:
+        session.execute(sql.delete(Descriptor).where(Descriptor.photo_id == photo_id))
+
+
+def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> None:
+    """The photo that is asked with has another reference then: it is looked up once more."""
+    for begin in range(0, len(STREETS), 3):
+        town.publish(STREETS[begin : begin + 3])
+    before = town.figures()["leave_one_out"]
+
+    def merge() -> None:
+        assert merge_slot(town.catalog, town.store, town.generation_id, 0)
+        collect_superseded_chunks(town.catalog, town.store, grace_seconds=0)
+        town.search.sync()
+
+    job_id = town.start()
+    town.work(Watched(town.search, 4, merge))
+    result = read_job(town.catalog, job_id).result
+    assert result is not None
+    assert result["leave_one_out"] == before

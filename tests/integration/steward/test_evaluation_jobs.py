@@ -1,0 +1,272 @@
+"""Evaluations that are cancelled, killed or taken over, and their HTTP API."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from services.steward import evaluation_worker as asked_module
+from shared.catalog.generations import Evaluation
+from shared.catalog.jobs import get_job
+from shared.catalog.maps import Search, get_map
+from shared.catalog.session import Catalog
+from shared.errors import Unavailable
+from shared.jobs import JobState, reclaim_expired_leases
+from shared.jobs.transitions import cancel_job, retry_job
+from shared.storage import read_retries
+from tests.integration.in_process_api import Service
+from tests.integration.steward.streets import STREETS, WITHOUT_PLACE
+from tests.integration.town import Town, Watched
+from tests.support.catalog_rows import (
+    add_generation,
+    end_pauses,
+    expire_lease,
+    read_job,
+)
+from tests.support.photos import photo_bytes
+from tests.support.problems import field_refused, problem
+
+
+@pytest.fixture
+def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The evaluator looks at its job after every question."""
+    monkeypatch.setattr(asked_module, "PROGRESS_INTERVAL_SECONDS", -1.0)
+
+
+@pytest.mark.usefixtures("look_always")
+def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+
+    def cancel_it() -> None:
+        with town.catalog.write() as session:
+            cancel_job(get_job(session, town.map_id, job_id, lock=True))
+
+    search = Watched(town.search, 2, cancel_it)
+    assert town.work(search)
+    assert search.searches <= 3
+    assert read_job(town.catalog, job_id).state == JobState.CANCELLED
+    assert town.evaluations() == []
+    assert town.calibration() is None
+    assert not town.work()
+
+
+def test_an_evaluation_cancelled_at_the_last_moment_leaves_nothing(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+
+    def cancel_it() -> None:
+        with town.catalog.write() as session:
+            cancel_job(get_job(session, town.map_id, job_id, lock=True))
+
+    town.work(Watched(town.search, len(STREETS), cancel_it))
+    assert read_job(town.catalog, job_id).state == JobState.CANCELLED
+    assert (town.evaluations(), town.calibration()) == ([], None)
+    with town.catalog.write() as session:
+        retry_job(session, get_job(session, town.map_id, job_id, lock=True))
+    assert town.work()
+    assert len(town.evaluations()) == 1
+
+
+def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+    stop = threading.Event()
+    search = Watched(town.search, 2, stop.set)
+    assert town.work(search, stop)
+    assert search.searches == 2
+    job = read_job(town.catalog, job_id)
+    assert (job.state, job.attempts, job.lease_token) == (JobState.QUEUED, 0, None)
+    assert town.evaluations() == []
+    assert town.work()
+    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill() -> None:
+    raise Killed
+
+
+def test_a_killed_evaluation_begins_anew(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+    with pytest.raises(Killed):
+        town.work(Watched(town.search, 5, kill))
+    assert not town.work(), "its lease is not over"
+    expire_lease(town.catalog, job_id)
+    with town.catalog.write() as session:
+        assert reclaim_expired_leases(session, max_attempts=3) == 1
+    search = Watched(town.search, 0, kill)
+    assert town.work(search)
+    assert search.searches >= len(STREETS)
+    job = read_job(town.catalog, job_id)
+    assert job.state == JobState.SUCCEEDED
+    assert job.progress_done == job.progress_total == len(STREETS)
+    (evaluation,) = town.evaluations()
+    assert evaluation.figures["leave_one_out"]["R@10"] == 7 / 8
+
+
+def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+
+    def take_over() -> None:
+        expire_lease(town.catalog, job_id)
+        with town.catalog.write() as session:
+            reclaim_expired_leases(session, max_attempts=3)
+        assert town.work()
+
+    assert town.work(Watched(town.search, 3, take_over))
+    assert len(town.evaluations()) == 1
+    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
+
+
+def test_an_evaluation_waits_while_search_is_away(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+
+    def away() -> None:
+        raise Unavailable("search_behind", "Search has not caught up.")
+
+    assert town.work(Watched(town.search, 3, away))
+    job = read_job(town.catalog, job_id)
+    assert (job.state, job.attempts) == (JobState.QUEUED, 0)
+    assert job.run_after is not None
+    assert not town.work(), "it pauses"
+    end_pauses(town.catalog)
+    assert town.work()
+    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
+
+
+def test_an_evaluation_that_crashes_is_tried_again_and_fails_in_the_end(town: Town) -> None:
+    town.publish(STREETS)
+    job_id = town.start()
+
+    def crash() -> None:
+        raise ZeroDivisionError
+
+    for _ in range(3):
+        assert town.work(Watched(town.search, 1, crash))
+    job = read_job(town.catalog, job_id)
+    assert (job.state, job.attempts) == (JobState.FAILED, 3)
+    assert job.error is not None
+    assert "ZeroDivisionError" in job.error["detail"]
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_a_damaged_map_is_not_measured_by_its_rest(
+    town: Town, order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether the broken chunk holds photos that are asked with or only such as may be found."""
+    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+    town.publish(STREETS)
+    town.publish(WITHOUT_PLACE)
+    keys = sorted(
+        (info.key for info in town.store.list("chunks/") if info.key.endswith(".npy")),
+        key=lambda key: town.store.path(key).stat().st_mtime_ns,
+    )
+    whole = town.store.get(keys[order])
+    town.store.put(keys[order], whole[:-1])
+    job_id = town.start()
+    assert town.work()
+    job = read_job(town.catalog, job_id)
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "map_damaged"
+    assert keys[order] in job.error["detail"]
+    assert town.evaluations() == []
+    town.store.put(keys[order], whole)
+    town.search.sync()
+    assert town.figures()["leave_one_out"]["R@1"] == 2 / 8
+
+
+def test_there_must_be_something_to_evaluate(service: Service) -> None:
+    def refused() -> None:
+        body = problem(service("POST", "/evaluations"), 409, "nothing_to_evaluate")
+        assert "coordinates or a place" in body["detail"]
+
+    refused()
+    service.indexed(1)
+    refused()
+    service.indexed(2, role="query", latitude=1, longitude=2)
+    refused()
+    service.upload(photo_bytes(3), place="hall")
+    refused()
+    service.drain()
+    job = service.json("POST", "/evaluations", 202)
+    assert job["status_url"] == f"/api/v1/jobs/{job['job_id']}"
+    read = service.json("GET", f"/jobs/{job['job_id']}")
+    assert (read["kind"], read["state"]) == ("evaluate", "queued")
+
+
+@pytest.mark.parametrize(
+    ("params", "field"),
+    [
+        ({"sample": 0}, "sample"),
+        ({"sample": 1_000_001}, "sample"),
+        ({"sample": 1.5}, "sample"),
+        ({"sample": "many"}, "sample"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 2**31}, "seed"),
+        ({"radius": 5}, "radius"),
+    ],
+)
+def test_bad_numbers_are_refused_by_name(
+    service: Service, params: dict[str, Any], field: str
+) -> None:
+    field_refused(service("POST", "/evaluations", json=params), field)
+
+
+@pytest.mark.parametrize("path", ["evaluations", "searches"])
+def test_a_cursor_shows_each_row_once_while_new_ones_arrive(
+    service: Service, catalog: Catalog, path: str
+) -> None:
+    with catalog.write() as session:
+        map_id = get_map(session, "default").id
+        generation_id = add_generation(session, map_id).id
+
+    def arrive() -> None:
+        with catalog.write() as session:
+            session.add(
+                Evaluation(
+                    map_id=map_id,
+                    generation_id=generation_id,
+                    searchable=1,
+                    labelled_queries=0,
+                    figures={},
+                )
+                if path == "evaluations"
+                else Search(
+                    map_id=map_id,
+                    generation_id=generation_id,
+                    query_filename="q.jpg",
+                    top_k=1,
+                    results=0,
+                    processing_ms=1.0,
+                )
+            )
+
+    name = {"evaluations": "evaluation_id", "searches": "search_id"}[path]
+    for _ in range(7):
+        arrive()
+    everything = service.json("GET", f"/{path}", params={"limit": 100})
+    assert everything["next_cursor"] is None
+    expected = [row[name] for row in everything[path]]
+    assert expected == sorted(expected, reverse=True)
+    assert len(expected) == 7
+    seen: list[str] = []
+    cursor: dict[str, str] = {}
+    while True:
+        page = service.json("GET", f"/{path}", params={"limit": 2, **cursor})
+        seen += [row[name] for row in page[path]]
+        if page["next_cursor"] is None:
+            break
+        cursor = {"cursor": page["next_cursor"]}
+        arrive()
+    assert seen == expected
+    field_refused(service("GET", f"/{path}", params={"cursor": "no-cursor"}), "cursor")

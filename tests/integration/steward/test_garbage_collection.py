@@ -1,0 +1,179 @@
+"""Garbage collection: superseded chunks, ended generations, deleted photos, queries, job files."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import UUID
+
+import pytest
+from sqlalchemy import func, select, update
+
+from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.garbage_collection import (
+    collect_deleted_photos,
+    collect_ended_generations,
+    collect_model_change_files,
+    collect_queries,
+    collect_superseded_chunks,
+)
+from shared.catalog.base import db_now_plus
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.photos import Photo, get_photo
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, JobState
+from shared.storage import FolderStore
+from shared.storage.keys import (
+    job_work_key,
+    query_key,
+    query_vector_key,
+    thumbnail_key,
+)
+from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
+from tests.integration.steward.test_compaction import sum_of
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_generation,
+    add_job,
+    ask,
+    stored_rows,
+    upload,
+)
+
+
+def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(2, 3))
+    old = chunk_map.objects("chunks/")
+    merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    collect_superseded_chunks(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert old < chunk_map.objects("chunks/")
+    with chunk_map.catalog.write() as session:
+        session.execute(
+            update(Chunk)
+            .where(Chunk.superseded_at.is_not(None))
+            .values(superseded_at=db_now_plus(-HOUR_SECONDS - 1))
+        )
+    collect_superseded_chunks(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert not old & chunk_map.objects("chunks/")
+    with chunk_map.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(Chunk)) == 1
+    chunk_map.check_rows(photo_ids)
+
+
+def test_ended_generations_lose_their_chunks_after_the_grace_and_not_before(
+    chunk_map: ChunkMap,
+) -> None:
+    chunk_map.chunks(2, 3)
+    with chunk_map.catalog.write() as session:
+        session.get_one(Generation, chunk_map.generation_id).state = GenerationState.RETIRED
+        session.flush()
+        ended = [chunk_map.generation_id]
+        ended.append(add_generation(session, chunk_map.map_id, GenerationState.ABANDONED).id)
+        active = add_generation(session, chunk_map.map_id).id
+    add_chunk(chunk_map.catalog, chunk_map.store, ended[1], chunk_map.photos(1))
+    stay = chunk_map.photos(2)
+    add_chunk(chunk_map.catalog, chunk_map.store, active, stay)
+    for generation_id in ended:
+        chunk_map.change(Generation, generation_id, ended_at=db_now_plus(-HOUR_SECONDS + 60))
+    collect_ended_generations(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert len(chunk_map.objects("chunks/")) == 2 * 4
+    for generation_id in ended:
+        chunk_map.change(Generation, generation_id, ended_at=db_now_plus(-HOUR_SECONDS - 1))
+    collect_ended_generations(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert {key.split("/")[1] for key in chunk_map.objects("chunks/")} == {str(active)}
+    assert set(stored_rows(chunk_map.catalog, chunk_map.store, active)) == set(stay)
+    with chunk_map.catalog.read() as session:
+        assert set(session.scalars(select(Descriptor.generation_id))) == {active}
+        assert session.scalar(select(func.count()).select_from(Generation)) == 3  # as history
+    collect_ended_generations(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+
+
+def test_a_deleted_photos_bytes_go_at_once_and_its_row_after_the_grace(chunk_map: ChunkMap) -> None:
+    data = b"the bytes"
+    photo_id, job_id = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, data)
+    stays, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"others")
+    add_chunk(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, [photo_id, stays])
+    for each in (photo_id, stays):
+        chunk_map.store.put(thumbnail_key(each), b"small")
+    chunk_map.delete(photo_id)
+    collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert chunk_map.objects("thumbnails/") == {thumbnail_key(stays)}
+    with chunk_map.catalog.read() as session:
+        assert chunk_map.objects("originals/") == {
+            get_photo(session, chunk_map.map_id, stays).object_key
+        }
+        assert session.get_one(Photo, photo_id).object_key == ""
+    again, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, data)  # at once, too
+    chunk_map.delete(again)
+
+    chunk_map.change(Photo, photo_id, deleted_at=db_now_plus(-HOUR_SECONDS - 1))
+    version = chunk_map.version()
+    collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    with chunk_map.catalog.read() as session:
+        assert session.get(Photo, photo_id) is None
+        assert session.get(Job, job_id) is None
+        assert session.get(Photo, again) is not None  # its grace is not over
+    assert chunk_map.version() == version + 1
+    chunk_map.check_rows([stays])
+    assert len(chunk_map.objects("originals/")) == 1
+    last, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, data)
+    with chunk_map.catalog.read() as session:
+        assert get_photo(session, chunk_map.map_id, last).id == last
+
+
+def test_bytes_are_gone_before_the_row_that_remembers_them(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo_id, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"the bytes")
+    chunk_map.delete(photo_id)
+    chunk_map.change(Photo, photo_id, deleted_at=db_now_plus(-2 * HOUR_SECONDS))
+
+    def away(*_: Any) -> None:
+        raise OSError("the disk is not there")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FolderStore, "delete", away)
+        with pytest.raises(OSError, match="disk"):
+            collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    with chunk_map.catalog.read() as session:
+        assert session.get_one(Photo, photo_id).object_key != ""
+    collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert chunk_map.objects("originals/") == set()
+
+
+def test_queries_go_when_their_time_is_over(chunk_map: ChunkMap) -> None:
+    old, young = (ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"q") for _ in range(2))
+    for job_id in (old, young):
+        chunk_map.store.put(query_vector_key(job_id), b"v")
+    index = add_one_job(chunk_map, JobKind.INDEX)
+    for job_id in (old, index):
+        chunk_map.change(Job, job_id, created_at=db_now_plus(-HOUR_SECONDS - 1))
+    collect_queries(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    assert chunk_map.objects("queries/") == {query_key(young), query_vector_key(young)}
+    with chunk_map.catalog.read() as session:
+        assert set(session.scalars(select(Job.id))) == {young, index}
+
+
+def add_one_job(chunk_map: ChunkMap, kind: JobKind, **columns: Any) -> UUID:
+    with chunk_map.catalog.write() as session:
+        return add_job(session, chunk_map.map_id, kind, **columns).id
+
+
+def test_what_a_model_change_kept_goes_when_it_needs_it_no_more(chunk_map: ChunkMap) -> None:
+    needed = [
+        add_one_job(chunk_map, JobKind.FIT),
+        add_one_job(chunk_map, JobKind.FIT, state=JobState.RUNNING, stage="cluster"),
+    ]
+    over = [
+        add_one_job(chunk_map, JobKind.FIT, state=JobState.CANCELLED),
+        add_one_job(chunk_map, JobKind.FIT, state=JobState.FAILED),
+        add_one_job(
+            chunk_map, JobKind.FIT, state=JobState.RUNNING, generation_id=chunk_map.generation_id
+        ),
+        new_id(),  # no one knows it
+    ]
+    for job_id in needed + over:
+        chunk_map.store.put(job_work_key(job_id, "plan.json"), b"[]")
+    chunk_map.store.put("work/stray.txt", b"?")
+    collect_model_change_files(chunk_map.catalog, chunk_map.store)
+    assert chunk_map.objects("work/") == {job_work_key(job_id, "plan.json") for job_id in needed}

@@ -1,0 +1,259 @@
+"""Objects without a row: trash, restore, hold, concurrency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from prometheus_client import CollectorRegistry
+from sqlalchemy import select, update
+
+from services.steward.metrics import StewardMetrics
+from services.steward.scheduler import Scheduler
+from services.steward.tasks import orphans as orphans_module
+from services.steward.tasks.orphans import (
+    CollectionHeld,
+    collect_orphans,
+    empty_expired_trash,
+)
+from shared.catalog.installation import REBUILDING, get_or_create_installation
+from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
+from shared.config.settings import Settings
+from shared.ids import new_id
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
+from shared.storage.keys import (
+    key_before_trash,
+    new_original_key,
+    new_vocabulary_key,
+    query_key,
+    query_vector_key,
+    thumbnail_key,
+)
+from shared.storage.trash import Hold, HoldReason, TrashSize, read_hold, restore_trash, write_hold
+from tests.integration.steward.chunk_map import DAY_SECONDS, ChunkMap
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_job,
+    ask,
+    upload,
+)
+
+
+def test_old_orphans_of_every_prefix_go_and_what_is_referred_to_stays(chunk_map: ChunkMap) -> None:
+    live = _live_objects(chunk_map)
+    orphans = {
+        new_original_key(),
+        thumbnail_key(new_id()),
+        f"chunks/{chunk_map.generation_id}/{new_id()}.npy",
+        f"chunks/{chunk_map.generation_id}/{new_id()}.json",
+        f"chunks/{new_id()}/{new_id()}.npy",
+        new_vocabulary_key(),
+        query_key(new_id()),
+        query_vector_key(new_id()),
+    }
+    for key in orphans:
+        chunk_map.store.put(key, b"orphan")
+    assert chunk_map.objects() == live | orphans
+    chunk_map.age(live, 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0  # young ones stay
+    assert chunk_map.objects() == live | orphans
+    chunk_map.age(orphans, DAY_SECONDS - 60)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    chunk_map.age(orphans, DAY_SECONDS + 60)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == len(orphans)
+    assert chunk_map.objects() == live
+
+
+def _live_objects(chunk_map: ChunkMap) -> set[str]:
+    """One object of each kind that a row refers to; their keys."""
+    photo_id, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"photo")
+    chunk_map.store.put(thumbnail_key(photo_id), b"small")
+    add_chunk(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, [photo_id])
+    job_id = ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
+    chunk_map.store.put(query_vector_key(job_id), b"vector")
+    stored, waiting = new_vocabulary_key(), new_vocabulary_key()
+    for key in (stored, waiting):
+        chunk_map.store.put(key, b"centres")
+    with chunk_map.catalog.write() as session:
+        session.add(
+            Vocabulary(
+                map_id=chunk_map.map_id,
+                origin=VocabularyOrigin.IMPORTED,
+                clusters=1,
+                dimension=1,
+                object_key=stored,
+                sha256="0" * 64,
+            )
+        )
+        add_job(session, chunk_map.map_id, JobKind.IMPORT, params={"object_key": waiting})
+    return chunk_map.objects()
+
+
+def test_orphans_lie_in_the_trash_until_their_days_are_over(chunk_map: ChunkMap) -> None:
+    live = _live_objects(chunk_map)
+    orphans = {new_original_key(), query_key(new_id())}
+    for key in orphans:
+        chunk_map.store.put(key, b"orphan")
+    chunk_map.age(orphans, 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    trashed = chunk_map.objects("trash/")
+    assert {key_before_trash(key) for key in trashed} == orphans
+    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (0, TrashSize(2, 12))
+    chunk_map.age(trashed, 7.1 * DAY_SECONDS)
+    chunk_map.age({first := min(trashed)}, 6.9 * DAY_SECONDS)
+    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (1, TrashSize(1, 6))
+    assert chunk_map.objects("trash/") == {first}
+    assert chunk_map.objects() == live
+
+
+def test_what_is_restored_from_the_trash_is_kept_as_long_as_a_new_orphan(
+    chunk_map: ChunkMap,
+) -> None:
+    live, orphan, taken = _live_objects(chunk_map), new_original_key(), new_original_key()
+    for key in (orphan, taken):
+        chunk_map.store.put(key, b"orphan")
+    chunk_map.age({orphan, taken}, 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    chunk_map.store.put(taken, b"another one")
+    restored = {
+        key_before_trash(info.key): back
+        for info, back in restore_trash(chunk_map.store, "originals/")
+    }
+    assert restored == {orphan: True, taken: False}
+    assert chunk_map.store.get(taken) == b"another one"
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    assert chunk_map.objects() == live | {orphan, taken}
+    assert len(chunk_map.objects("trash/")) == 1
+
+
+def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
+    chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 3)
+    monkeypatch.setattr(orphans_module, "MAX_REMEMBERED_ORPHANS", 2)
+    live = _live_objects(chunk_map)
+    orphans = {new_original_key() for _ in range(4)}
+    for key in orphans:
+        chunk_map.store.put(key, b"orphan")
+    chunk_map.age(orphans, 2 * DAY_SECONDS)
+    metrics = StewardMetrics(CollectorRegistry())
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings, metrics)
+    (duty,) = [duty for duty in steward.tasks if duty.name == "collect orphans"]
+    share = settings.collect_max_share
+    assert share * len(live | orphans) < 4
+
+    duty.run()
+    assert chunk_map.objects() == live | orphans
+    assert chunk_map.objects("trash/") == set()
+    assert metrics.collection_held._value.get() == 1
+    assert "4 of" in caplog.text
+    assert caplog.records[-1].levelname == "ERROR"
+    hold = read_hold(chunk_map.store)
+    assert hold is not None
+    assert (hold.reason, hold.orphans, hold.orphan_bytes) == (HoldReason.SHARE, 4, 24)
+    with pytest.raises(CollectionHeld):
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=share)
+
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 4
+    assert chunk_map.objects() == live
+    assert len(chunk_map.objects("trash/")) == 4
+    assert read_hold(chunk_map.store) is None
+    duty.run()
+    assert metrics.collection_held._value.get() == 0
+    assert metrics.trash_bytes._value.get() == 24
+
+
+def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 0)
+    photo_id, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"photo")
+    with chunk_map.catalog.read() as session:
+        key = session.get_one(Photo, photo_id).object_key
+    chunk_map.age({key}, 2 * DAY_SECONDS)
+    chunk_map.change(Photo, photo_id, object_key="originals/other")
+    with pytest.raises(CollectionHeld):
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=0.1)
+    chunk_map.change(Photo, photo_id, object_key=key)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=0.1) == 0
+    assert read_hold(chunk_map.store) is None
+
+
+def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
+    chunk_map: ChunkMap,
+) -> None:
+    chunk_map.store.put(orphan := new_original_key(), b"orphan")
+    chunk_map.age({orphan}, 2 * DAY_SECONDS)
+    with chunk_map.catalog.write() as session:
+        get_or_create_installation(session).journal_sequence = REBUILDING
+    with pytest.raises(CollectionHeld) as caught:
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
+    assert caught.value.hold.reason == HoldReason.CATALOG_BEHIND
+    with chunk_map.catalog.write() as session:
+        get_or_create_installation(session).journal_sequence = 0
+    write_hold(chunk_map.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
+    assert (
+        collect_orphans(chunk_map.catalog, chunk_map.store, 3 * DAY_SECONDS) == 0
+    )  # it is too young
+    with pytest.raises(CollectionHeld) as caught:
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
+    assert caught.value.hold.reason == HoldReason.ADOPTED
+    assert chunk_map.objects() == {orphan}
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 1
+
+
+def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -> None:
+    live = _live_objects(chunk_map)
+    chunk_map.age(live, 2 * DAY_SECONDS)
+    with chunk_map.catalog.write() as session:
+        session.execute(update(Job).values(state=JobState.FAILED))  # the import, too
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
+    assert len(chunk_map.objects("vocabularies/")) == 1
+    with chunk_map.catalog.read() as session:
+        photo_id = session.scalars(select(Photo.id)).one()
+    chunk_map.delete(photo_id)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
+    assert chunk_map.objects("thumbnails/") == set()  # left by a batch that met the deletion
+
+
+def test_files_that_people_put_beside_the_originals_are_not_removed(chunk_map: ChunkMap) -> None:
+    theirs = {"originals/.DS_Store", "originals/holiday.jpg", f"originals/{new_id()}.jpg"}
+    for key in theirs:
+        chunk_map.store.put(key, b"not ours")
+    chunk_map.age(theirs, 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    assert chunk_map.objects() == theirs
+
+
+def test_stray_files_stop_no_collection_and_go_with_the_orphans(chunk_map: ChunkMap) -> None:
+    live = _live_objects(chunk_map)
+    with chunk_map.catalog.read() as session:
+        photo_id = session.scalars(select(Photo.id)).one()
+    stray = {
+        "thumbnails/.DS_Store",
+        "thumbnails/Thumbs.db",
+        f"thumbnails/{photo_id.hex}.jpg",  # nearly a live one
+        "chunks/notes.txt",
+        "vocabularies/read me.md",
+        "queries/not-a-uuid.npy",
+        "queries/deep/er",
+    }
+    orphan = query_key(new_id())
+    for key in (*stray, orphan):
+        chunk_map.store.put(key, b"?")
+    chunk_map.age(chunk_map.objects(), 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == len(stray) + 1
+    assert chunk_map.objects() == live
+
+
+def test_more_orphans_than_one_look_takes_all_go(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orphans_module, "OBJECTS_PER_LOOKUP", 3)
+    live = _live_objects(chunk_map)
+    for _ in range(8):
+        chunk_map.store.put(new_original_key(), b"orphan")
+    chunk_map.age(chunk_map.objects(), 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 8
+    assert chunk_map.objects() == live

@@ -1,0 +1,190 @@
+"""The scheduler runs every periodic task, and a failing one stops no other."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select
+
+from services.steward.scheduler import PeriodicTask, Scheduler
+from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.garbage_collection import (
+    collect_ended_generations,
+    collect_garbage,
+)
+from services.steward.tasks.maintenance import resend_hints
+from shared.catalog.base import db_now_plus
+from shared.catalog.generations import GenerationState
+from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
+from shared.storage import FolderStore
+from shared.storage.keys import (
+    incoming_key,
+    new_original_key,
+)
+from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
+from tests.integration.steward.test_compaction import sum_of
+from tests.integration.steward.test_garbage_collection import add_one_job
+from tests.support.catalog_rows import (
+    add_generation,
+    add_job,
+    add_map,
+    add_photo,
+    ask,
+    take,
+    upload,
+)
+
+
+def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: Settings) -> None:
+    retained = sum_of(chunk_map.chunks(2, 2))
+    merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    gone = [
+        upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, bytes([n]))[0]
+        for n in range(6)
+    ]
+    chunk_map.delete(*gone)
+    ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
+    now = settings.model_copy(
+        update=dict.fromkeys(
+            ("superseded_grace_seconds", "retired_grace_seconds", "query_ttl_seconds"), -1.0
+        )
+    )
+    together = threading.Barrier(2)
+
+    def both() -> None:
+        together.wait(timeout=30)
+        collect_garbage(chunk_map.catalog, chunk_map.store, now)
+
+    with ThreadPoolExecutor(2) as pool:
+        for done in [pool.submit(both) for _ in range(2)]:
+            done.result()
+    chunk_map.check_rows(retained)
+    assert {key.split("/")[0] for key in chunk_map.objects()} == {"chunks", "journal"}
+    with chunk_map.catalog.read() as session:
+        assert set(session.scalars(select(Photo.id))) == set(retained)
+
+
+def test_a_duty_that_raises_does_not_stop_the_others(
+    chunk_map: ChunkMap, settings: Settings
+) -> None:
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings)
+    done: list[str] = []
+    stop = threading.Event()
+
+    def fail() -> None:
+        done.append("fail")
+        raise RuntimeError("the store is away")
+
+    def work() -> None:
+        done.append("work")
+        if done.count("fail") > 1:
+            stop.set()
+
+    steward.tasks = [PeriodicTask("fail", 0.0, fail), PeriodicTask("work", 0.0, work)]
+    steward.run(stop)
+    assert done == ["fail", "work", "fail", "work"]  # and it is tried again
+
+
+def test_each_duty_is_done_by_the_loop(
+    chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One round does everything once: each duty leaves its trace."""
+    hints = InProcessWakeups()
+    soon = settings.model_copy(
+        update={"compact_chunks": 2, "orphan_age_seconds": 0.0, "auto_fit_photos": 1}
+    )
+    retained = sum_of(chunk_map.chunks(1, 1))
+    gone, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"gone")
+    chunk_map.delete(gone)
+    with chunk_map.catalog.write() as session:
+        other = add_map(session, "other", "test-tiny-vlad").id
+        waiting = add_photo(session, other).id
+        add_job(session, other, photo_id=waiting, waiting_for="vocabulary")
+        lost = add_job(session, chunk_map.map_id).id
+    take(chunk_map.catalog)
+    chunk_map.change(Job, lost, lease_until=db_now_plus(-1))
+    chunk_map.store.put(new_original_key(), b"orphan")
+    chunk_map.age(chunk_map.objects("originals/"), 60)
+    with chunk_map.catalog.write() as session:
+        made = RequestIdentity("someone", "key", "POST /api/v1/maps", "0" * 64)
+        claim_idempotency_key(session, made, lease_seconds=1, life_seconds=-1)
+        forgotten = PresignedUpload(
+            map_id=chunk_map.map_id,
+            filename="a.jpg",
+            size_bytes=1,
+            sha256="0" * 64,
+            expires_at=db_now_plus(-1),
+        )
+        session.add(forgotten)
+        session.flush()
+    chunk_map.store.put(incoming_key(forgotten.id), b"never completed")
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, hints, soon)
+    stop = threading.Event()
+    steward.tasks.append(PeriodicTask("stop", 0.0, stop.set))
+    steward.run(stop)
+    assert chunk_map.live() == [(0, 2)]
+    assert chunk_map.objects("originals/") == set()
+    assert chunk_map.objects("incoming/") == set()
+    assert hints.wait(0)
+    chunk_map.check_rows(retained)
+    with chunk_map.catalog.read() as session:
+        assert session.scalars(select(IdempotencyRecord.id)).all() == []
+        assert session.scalars(select(PresignedUpload.id)).all() == []
+        assert session.get_one(Job, lost).state == JobState.QUEUED
+        fit = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).one()
+        assert fit.map_id == other
+
+
+def test_a_lost_hint_is_sent_again_while_there_is_work(chunk_map: ChunkMap) -> None:
+    hints = InProcessWakeups()
+    resend_hints(chunk_map.catalog, hints)
+    assert not hints.wait(0)
+    add_one_job(chunk_map, JobKind.INDEX, waiting_for="vocabulary")
+    add_one_job(chunk_map, JobKind.INDEX, run_after=db_now_plus(60))
+    resend_hints(chunk_map.catalog, hints)
+    assert not hints.wait(0)  # no worker could do anything
+    add_one_job(chunk_map, JobKind.INDEX)
+    resend_hints(chunk_map.catalog, hints)
+    assert hints.wait(0)
+    take(chunk_map.catalog)
+    resend_hints(chunk_map.catalog, hints)
+    assert not hints.wait(0)
+
+
+def test_jobs_of_an_abandoned_generation_vanish_after_the_grace(
+    chunk_map: ChunkMap, store: FolderStore
+) -> None:
+    (photo_ids,) = chunk_map.chunks(3)
+    with chunk_map.catalog.write() as session:
+        given_up = add_generation(
+            session,
+            chunk_map.map_id,
+            GenerationState.ABANDONED,
+            ended_at=db_now_plus(-HOUR_SECONDS),
+        ).id
+        for photo_id in photo_ids:
+            add_job(
+                session,
+                chunk_map.map_id,
+                JobKind.REINDEX,
+                photo_id=photo_id,
+                generation_id=given_up,
+                state=JobState.CANCELLED,
+            )
+    collect_ended_generations(chunk_map.catalog, store, 2 * HOUR_SECONDS)
+    assert count_jobs(chunk_map.catalog, given_up) == 3
+    collect_ended_generations(chunk_map.catalog, store, HOUR_SECONDS / 2)
+    assert count_jobs(chunk_map.catalog, given_up) == 0
+    chunk_map.check_rows(photo_ids)
+
+
+def count_jobs(catalog: Catalog, generation_id: UUID) -> int:
+    with catalog.read() as session:
+        return len(session.scalars(select(Job).where(Job.generation_id == generation_id)).all())

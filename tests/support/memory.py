@@ -1,0 +1,18 @@
+"""The memory of this process, from /proc."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def memory_bytes(name: str) -> int:
+    """`VmRSS`, the resident set size, or `VmHWM`, its peak."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) * 1024
+    raise AssertionError(f"/proc/self/status has no {name}")
+
+
+def reset_peak_memory() -> None:
+    """Reset the peak to the current resident set size."""
+    Path("/proc/self/clear_refs").write_text("5")

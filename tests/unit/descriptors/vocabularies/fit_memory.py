@@ -1,0 +1,80 @@
+"""A process that fits a vocabulary to patches as ViT-S makes them, and says what memory it took:
+
+python -m tests.unit.descriptors.vocabularies.fit_memory PHOTOS
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.patches import fit_vocabulary
+from shared.extractor_config.configs import get_extractor_config
+from tests.support.memory import memory_bytes
+from tests.unit.descriptors.vocabularies.points import clustered_points
+
+WIDTH = 384
+PATCHES = 256
+BATCH_PHOTOS = 16
+CLUSTERS = 16
+
+
+class ManyPatches:
+    """A backbone without a network: as many and as wide features as ViT-S/14's at 224 pixels."""
+
+    name = "test-patches"
+    fingerprint = "0" * 64
+    licence = "MIT"
+    width = WIDTH
+    layer = "none"
+    facet: str | None = None
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        self.card: dict[str, Any] = {}
+        self._some = clustered_points(0, BATCH_PHOTOS * PATCHES, WIDTH, 40)
+        self._turned = 0
+
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        self._turned += 1  # every batch has other features
+        turned = self._some.roll(self._turned, dims=1)
+        return turned[: len(pixels) * PATCHES].reshape(len(pixels), PATCHES, WIDTH)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, PATCHES
+
+
+def main(photos: int) -> None:
+    torch.set_num_threads(1)
+    recipe = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
+    extractor = Extractor(recipe, torch.device("cpu"), backbone=ManyPatches())
+    blank = np.zeros((8, 8, 3), np.uint8)
+
+    def batches() -> Iterator[list[NDArray[np.uint8]]]:
+        for begin in range(0, photos, BATCH_PHOTOS):
+            yield [blank] * min(BATCH_PHOTOS, photos - begin)
+
+    before = memory_bytes("VmRSS")
+    fitted = fit_vocabulary(extractor, batches(), photos, clusters=CLUSTERS, seed=0)
+    print(
+        json.dumps(
+            {
+                "before": before,
+                "peak": memory_bytes("VmHWM"),
+                "photos": fitted.provenance["photos"],
+                "patches": fitted.provenance["patches"],
+                "clusters": fitted.centres.clusters,
+            }
+        )
+    )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

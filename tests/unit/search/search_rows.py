@@ -1,0 +1,139 @@
+"""Rows to search in, and what brute force in float64 finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import pairwise
+from uuid import UUID
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from services.search import executor
+from services.search.chunk_loader import LoadedChunk
+from services.search.executor import SCORE_DECIMALS, SearchOptions
+from services.search.photo_columns import PhotoColumns
+from services.search.query_batcher import QueryBatcher
+from services.search.snapshot import Snapshot
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
+from shared.codes.int8_codes import int8_codes
+from shared.codes.sign_codes import encode_signs
+from shared.ids import new_id
+from shared.search_api.protocol import SearchResponse
+
+DIMENSION = 7168
+
+Rows = NDArray[np.float32]
+
+
+def photo(number: int) -> UUID:
+    return UUID(int=number + 1)
+
+
+def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
+    """The rows in so many chunks, with one kind of codes or none."""
+    bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
+    chunks = [
+        LoadedChunk(
+            new_id(),
+            f"chunks/{a}.npy",
+            rows[a:b],
+            PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
+            codes=encode_signs(rows[a:b]) if by == "signs" else None,
+            int8=int8_codes(rows[a:b]) if by == "int8" else None,
+        )
+        for a, b in pairwise(bounds.tolist())
+    ]
+    return Snapshot(new_id(), new_id(), 1, tuple(chunks))
+
+
+def brute_force(
+    rows: Rows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
+) -> list[tuple[UUID, float]]:
+    exact = query.astype(np.float64)
+    exact /= np.linalg.norm(exact)
+    scores = np.round([row.astype(np.float64) @ exact for row in rows], SCORE_DECIMALS)
+    scored = [
+        (-min(1.0, score), photo(number))
+        for number, score in enumerate(scores.tolist())
+        if selected[number] and score >= min_score
+    ]
+    return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def answer(
+    snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], question: SearchOptions
+) -> SearchResponse:
+    """Of a query that comes alone."""
+    return executor.execute_query(snapshot, query, selected, question, QueryBatcher())
+
+
+def hits_of(found: SearchResponse) -> list[tuple[UUID, float]]:
+    return [(hit.photo_id, hit.score) for hit in found.hits]
+
+
+def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
+    """Rows in neighbourhoods: some places were photographed many times."""
+    rng = np.random.default_rng(seed)
+    centres = rng.standard_normal((max(1, count // 5), dimension))
+    near = centres[rng.integers(len(centres), size=count)]
+    rows = near + rng.uniform(0.1, 3.0, size=(count, 1)) * rng.standard_normal((count, dimension))
+    found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """A map of rows, with duplicates and zeros among them, and a query."""
+
+    rows: Rows
+    pieces: int
+    query: Rows
+    selected: NDArray[np.bool_]
+    k: int
+    min_score: float | None
+
+    @property
+    def expected(self) -> list[tuple[UUID, float]]:
+        least = -2.0 if self.min_score is None else self.min_score
+        return brute_force(self.rows, self.query, self.k, self.selected, least)
+
+
+@st.composite
+def cases(draw: st.DrawFn, dimension: int) -> Case:
+    count = draw(st.integers(1, 300))
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
+    rows = places(int(rng.integers(2**31)), count, dimension)
+    for _ in range(draw(st.integers(0, 30))):
+        a, b = rng.integers(0, count, 2)
+        rows[a] = rows[b]
+    rows[rng.integers(0, count, draw(st.integers(0, 3)))] = 0
+    query = rng.standard_normal(dimension).astype(np.float32)
+    if draw(st.booleans()):  # of a place on the map
+        query = query * np.float32(0.005) + rows[rng.integers(count)]
+    return Case(
+        rows=rows,
+        pieces=draw(st.integers(1, 4)),
+        query=query,
+        selected=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
+        k=draw(st.sampled_from([1, 2, 10, 100, 400])),
+        min_score=draw(st.sampled_from([None, 0.1])),
+    )
+
+
+def facts_of(
+    photo_id: UUID,
+    *,
+    role: PhotoRole = PhotoRole.DATABASE,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    captured_at: datetime | None = None,
+    place: str | None = None,
+    tags: tuple[str, ...] = (),
+) -> PhotoFilterValues:
+    """A live photo; fields that are not given are unknown."""
+    return PhotoFilterValues(
+        photo_id, role, None, latitude, longitude, captured_at, place, list(tags)
+    )
