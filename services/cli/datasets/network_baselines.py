@@ -31,7 +31,7 @@ Rows = NDArray[np.float32]
 
 
 class NetworkBaselines:
-    """Describes photos with an untrained network and with the default extractor.
+    """Describes photos with an untrained network and with pretrained EfficientNet-Lite0 and VLAD.
 
     The extractor is used with its shipped and with a fitted vocabulary; the rows of the latter are
     also reduced by PCA whitening.
