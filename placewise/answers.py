@@ -107,7 +107,18 @@ class SimilarPhoto(Photo):
     similarity_score: float
     weighted_score: float | None = None
     rerank_score: float | None = None
+    match_probability: float | None = None
     explanation: Explanation | None = None
+
+
+class EstimateLevel(Answer):
+    """A level of an estimate: a place, or a circle around a position."""
+
+    place: str | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    radius_m: float | None = None
+    probability: float
 
 
 class Estimate(Answer):
@@ -121,6 +132,15 @@ class Estimate(Answer):
     confidence: float | None = None
     calibration: str = "uncalibrated"
     reason: str
+    levels: list[EstimateLevel] = []
+    """finest first"""
+    answer_level: int | None = None
+    """index in `levels` of the finest one that is certain enough"""
+    certainty: float | None = None
+    not_in_map_probability: float | None = None
+    radius_68_m: float | None = None
+    radius_95_m: float | None = None
+    calibration_source: str | None = None
 
 
 class Similar(Answer):
@@ -304,6 +324,7 @@ class Map(Answer):
     vocabulary: str | None
     dimension: int | None
     pca_from: int | None
+    place_labels_are_paths: bool = False
     created_at: datetime
 
 

@@ -177,8 +177,9 @@ class AsyncClient(AsyncTransport):
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `tags` and `ids` (comma-separated);
-                `word_weights=False` ranks by the unweighted cosine similarity.
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
+                share of answers that must be right.
         """
         options: Json = {
             "params": drop_none(
@@ -389,10 +390,21 @@ class AsyncClient(AsyncTransport):
         """List the maps of the server."""
         return [Map(**item) for item in await self._call("GET", "/maps")]
 
-    async def create_map(self, name: str, extractor: str | None = None) -> Map:
+    async def create_map(
+        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+    ) -> Map:
         """Create a map; `extractor` defaults to the server's setting."""
-        body = drop_none(name=name, extractor=extractor)
+        body = drop_none(
+            name=name,
+            extractor=extractor,
+            place_labels_are_paths=place_labels_are_paths or None,
+        )
         return Map(**await self._call("POST", "/maps", json=body))
+
+    async def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
+        """Change whether `/` separates the levels of the map's place labels."""
+        body = {"place_labels_are_paths": place_labels_are_paths}
+        return Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
     async def delete_map(self, name: str) -> DeletedMap:
         """Delete a map and all its photos."""

@@ -172,8 +172,9 @@ class Client(Transport):
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `tags` and `ids` (comma-separated);
-                `word_weights=False` ranks by the unweighted cosine similarity.
+                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
+                share of answers that must be right.
         """
         options: Json = {
             "params": drop_none(
@@ -384,10 +385,21 @@ class Client(Transport):
         """List the maps of the server."""
         return [Map(**item) for item in self._call("GET", "/maps")]
 
-    def create_map(self, name: str, extractor: str | None = None) -> Map:
+    def create_map(
+        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+    ) -> Map:
         """Create a map; `extractor` defaults to the server's setting."""
-        body = drop_none(name=name, extractor=extractor)
+        body = drop_none(
+            name=name,
+            extractor=extractor,
+            place_labels_are_paths=place_labels_are_paths or None,
+        )
         return Map(**self._call("POST", "/maps", json=body))
+
+    def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
+        """Change whether `/` separates the levels of the map's place labels."""
+        body = {"place_labels_are_paths": place_labels_are_paths}
+        return Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
     def delete_map(self, name: str) -> DeletedMap:
         """Delete a map and all its photos."""

@@ -1,10 +1,10 @@
-"""Generates the vocabulary that is shipped with EfficientNet-Lite0:
+"""Generates the vocabularies that are shipped with the extractors of EfficientNet-Lite0:
 
     python -m tools.make_shipped_vocabulary
 
-It is fitted on photographs contained in installed packages (scikit-learn, scikit-image), cut into
-overlapping views at several scales. Since it is not fitted on a map's own photos, searches with it
-report `vocabulary: foreign`, and a map should fit its own.
+They are fitted on photographs contained in installed packages (scikit-learn, scikit-image), cut
+into overlapping views at several scales. Since they are not fitted on a map's own photos, searches
+with them report `vocabulary: foreign`, and a map should fit its own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shared.descriptors.extractor import SHIPPED_VOCABULARIES, Extractor, choose
 from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 from shared.descriptors.vocabulary import encode_centres, parse_centres
 from shared.descriptors.vocabulary_fit import TOLERANCE
-from shared.extractor_config.configs import EXTRACTOR_CONFIGS
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig
 
 # Photographs only: no drawings, scans, microscope images, depth maps or generated images.
 PHOTOGRAPHS = {
@@ -52,9 +52,15 @@ MAX_KMEANS_PASSES = 100
 
 
 def main() -> None:
-    """Fit the centres and write them with their provenance."""
-    recipe = EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"]
-    extractor = Extractor(recipe, choose_device("cpu"))
+    """Fit and write the vocabulary of each extractor that has one."""
+    for config in EXTRACTOR_CONFIGS.values():
+        if config.shipped_vocabulary is not None:
+            write_vocabulary(config)
+
+
+def write_vocabulary(config: ExtractorConfig) -> None:
+    """Fit the centres of one extractor and write them with their provenance."""
+    extractor = Extractor(config, choose_device("cpu"))
     views = [
         view for path in list_photographs() for view in cut_views(Image.open(path).convert("RGB"))
     ]
@@ -66,7 +72,7 @@ def main() -> None:
             for i in range(0, len(views), 16)
         ]
     )
-    centres, iterations = _find_centres(points, recipe.clusters)
+    centres, iterations = _find_centres(points, config.clusters)
     vocabulary = parse_centres(centres.numpy(), width=extractor.backbone.width)
     provenance = {
         "backbone": extractor.backbone.name,
@@ -92,7 +98,7 @@ def main() -> None:
             path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in list_photographs()
         },
     }
-    target = SHIPPED_VOCABULARIES / str(recipe.shipped_vocabulary)
+    target = SHIPPED_VOCABULARIES / str(config.shipped_vocabulary)
     target.write_bytes(encode_centres(vocabulary))
     target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
     print(

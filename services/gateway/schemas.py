@@ -120,9 +120,24 @@ class SimilarPhotoResponse(PhotoResponse):
         description="with `rerank`: the similarity plus half of the share (0 to 1) of patches that "
         "match the query's with a consistent displacement; null if the photo was not compared",
     )
+    match_probability: float | None = Field(
+        None,
+        description="probability that the photo shows the query's place, at the finest of the "
+        "estimate's `levels`; null without levels",
+    )
     explanation: ExplanationResponse | None = Field(
         None, description="with `explain=true`: contributions of clusters and patches"
     )
+
+
+class EstimateLevelResponse(ResponseModel):
+    """A level of an estimate: a place, or a circle around a position."""
+
+    place: str | None = Field(None, description="label of the place, or the start of its path")
+    latitude: float | None = Field(None, description="centre of the circle, degrees")
+    longitude: float | None = None
+    radius_m: float | None = None
+    probability: float = Field(description="probability that the query was taken there")
 
 
 class EstimateResponse(ResponseModel):
@@ -143,6 +158,32 @@ class EstimateResponse(ResponseModel):
     )
     calibration: str = Field("uncalibrated", description="`calibrated` or `uncalibrated`")
     reason: str
+    levels: list[EstimateLevelResponse] = Field(
+        [],
+        description="levels of the estimate, finest first; each contains the finer ones and is at "
+        "least as probable",
+    )
+    answer_level: int | None = Field(
+        None,
+        description="index in `levels` of the finest one that is certain enough; null if none is",
+    )
+    certainty: float | None = Field(
+        None, description="share of the answers that must be right, as requested"
+    )
+    not_in_map_probability: float | None = Field(
+        None, description="probability that the map has no photo of the query's place"
+    )
+    radius_68_m: float | None = Field(
+        None,
+        description="radius in metres around the position that contains the true one with a "
+        "probability of 68 %; null without coordinates, or if it exceeds the largest level",
+    )
+    radius_95_m: float | None = Field(None, description="the same with 95 %")
+    calibration_source: str | None = Field(
+        None,
+        description="what the probabilities were fitted on: `prior` (generated maps), "
+        "`own_photos` or `labelled_queries` of this map; null without levels",
+    )
 
 
 class SimilarityResponse(ResponseModel):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from shared.catalog.photos import PhotoFilterValues
 from shared.geodesy import distances_m
+from shared.place_paths import is_within_level
 from shared.search_api.photo_filter import Box, PhotoFilter
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -228,6 +229,12 @@ def build_row_mask(
         mask &= _mask_of_rows(find_rows(photos, photo_filter.ids), len(mask))
     if photo_filter.place is not None:
         mask &= _mask_of_rows(photos.rows_by_place.get(photo_filter.place, NO_ROWS), len(mask))
+    if photo_filter.place_under is not None:
+        level = photo_filter.place_under
+        under = [
+            rows for place, rows in photos.rows_by_place.items() if is_within_level(place, level)
+        ]
+        mask &= _mask_of_rows(np.concatenate([NO_ROWS, *under]), len(mask))
     for tag in photo_filter.tags:
         mask &= _mask_of_rows(photos.rows_by_tag.get(tag, NO_ROWS), len(mask))
     if exclude:

@@ -112,7 +112,12 @@ class EvaluationWorker:
             words = _count_words(session, generation) if job.kind == JobKind.WORD_WEIGHTS else 0
         radius_m = self._settings.estimate_radius_m
         evaluation = MapEvaluation(
-            self._catalog, self._search, generation, radius_m, progress.advance
+            self._catalog,
+            self._search,
+            generation,
+            radius_m,
+            self._settings.level_radii_m,
+            progress.advance,
         )
         if job.kind == JobKind.WORD_WEIGHTS:
             self._fit_word_weights(job, generation, words, searchable, evaluation, progress)

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from datetime import timedelta
 from functools import partial
 from statistics import median
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from shared.evaluation.calibration import (
 )
 from shared.evaluation.place_evidence import (
     EVIDENCE_DEPTH,
+    PhotoLocation,
     PlaceEvidence,
     RankedPhoto,
     compute_evidence,
@@ -51,6 +52,14 @@ from shared.evaluation.place_evidence import (
     estimate_location,
     is_different_place,
     is_same_place,
+)
+from shared.evaluation.place_figures import PlaceEvaluation, evaluate_places
+from shared.evaluation.place_levels import LevelScheme, candidate_levels
+from shared.evaluation.place_probability import PlaceSample
+from shared.evaluation.place_samples import (
+    SAME_SESSION_PERIOD,
+    IndexRanking,
+    OwnPhotoSampler,
 )
 from shared.search_api.protocol import SearchBackend, SearchHit
 
@@ -91,6 +100,9 @@ class QueryOutcome:
     same_session: bool
     """Taken within SAME_SESSION_PERIOD of the photo that it matched: excluded from calibration."""
     accepted: bool | None
+    truth: PhotoLocation
+    ranking: list[RankedPhoto]
+    best_photo_id: UUID | None
 
 
 @dataclass(slots=True)
@@ -152,9 +164,6 @@ def ratio(part: int, total: int) -> float | None:
 
 MAX_RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 
-# A match taken less than this before or after the query belongs to the same session.
-SAME_SESSION_PERIOD = timedelta(hours=12)
-
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluationResult:
@@ -172,6 +181,7 @@ class MapEvaluation:
         search: The search tier.
         generation: The generation to evaluate.
         radius_m: Photos within this distance, in metres, show the same place.
+        level_radii_m: Radii of the levels of an estimate, in metres.
         on_query: Called after every search; an exception that it raises ends the evaluation.
     """
 
@@ -181,6 +191,7 @@ class MapEvaluation:
         search: SearchBackend,
         generation: Generation,
         radius_m: float,
+        level_radii_m: tuple[float, ...],
         on_query: Callable[[], None],
     ) -> None:
         self.radius_m = radius_m
@@ -190,8 +201,13 @@ class MapEvaluation:
             database = read_geotagged_photos(session, *ids, PhotoRole.DATABASE)
             self.database = GeotaggedPhotos(database)
             self.queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
-            version = session.get_one(Map, generation.map_id).version
+            map_ = session.get_one(Map, generation.map_id)
+            version = map_.version
+            self.scheme = LevelScheme(
+                labels_are_paths=map_.place_labels_are_paths, radii_m=level_radii_m
+            )
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
+        self._index_of = {photo.photo_id: i for i, photo in enumerate(self.database.photos)}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
 
     def draw_sample(self, size: int, seed: int) -> list[GeotaggedPhoto]:
@@ -212,7 +228,14 @@ class MapEvaluation:
             weights: Word weights of the ranking; empty for an unweighted one.
         """
         rank_photo = partial(self.search.rank_similar, weights=weights)
-        recall, impostors, alone = self._leave_one_out(sample, rank_photo)
+        own_photos = OwnPhotoSampler(
+            [photo.spot for photo in self.database.photos],
+            [photo.captured_at for photo in self.database.photos],
+            self.scheme,
+            self.radius_m,
+            partial(self._rank_own_photo, rank_photo),
+        )
+        recall, impostors, alone = self._leave_one_out(sample, own_photos)
         threshold = fit_threshold(impostors)
         provisional = Calibration(
             radius_m=self.radius_m,
@@ -223,8 +246,13 @@ class MapEvaluation:
         )
         labelled = self._evaluate_labelled_queries(provisional, rank_photo)
         samples = labelled.confidence_samples()
+        places = self._evaluate_places(sample, own_photos, labelled)
         calibration = provisional.model_copy(
-            update={"labelled_queries": len(samples), "confidence": fit_confidence(samples)}
+            update={
+                "labelled_queries": len(samples),
+                "confidence": fit_confidence(samples),
+                "places": places.model,
+            }
         )
         figures = {
             "radius_m": self.radius_m,
@@ -235,11 +263,12 @@ class MapEvaluation:
                 "impostors": len(impostors),
                 "calibration": calibration.state,
             },
+            "places": places.figures,
         }
         return MapEvaluationResult(figures, calibration)
 
     def _leave_one_out(
-        self, sample: Sequence[GeotaggedPhoto], rank_photo: RankPhoto
+        self, sample: Sequence[GeotaggedPhoto], own_photos: OwnPhotoSampler
     ) -> tuple[RecallCounter, list[PlaceEvidence], int]:
         """Return recall, the evidence of impostors, and the number of photos alone at their place.
 
@@ -247,32 +276,61 @@ class MapEvaluation:
         """
         recall, impostors, alone = RecallCounter(), [], 0
         for query in sample:
-            ranking = rank_photo(query, EVIDENCE_DEPTH)
-            self.on_query()
-            if ranking is None:
+            found = own_photos.ranking(self._index_of[query.photo_id])
+            if found is None:
                 continue
+            ranking = [
+                RankedPhoto(float(score), self.database.photos[index].spot)
+                for index, score in zip(*found, strict=True)
+            ]
             if self.database.count_at_place(query.spot, self.radius_m) > 1:  # includes the query
-                recall.add([is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking])
+                recall.add([is_same_place(query.spot, r.location, self.radius_m) for r in ranking])
             else:
                 alone += 1
-            evidence = compute_evidence(
-                self._other_places(query, ranking, rank_photo), self.radius_m
-            )
+            others = [r for r in ranking if is_different_place(query.spot, r.location)]
+            evidence = compute_evidence(others[:EVIDENCE_DEPTH], self.radius_m)
             if evidence is not None:
                 impostors.append(evidence)
         return recall, impostors, alone
 
-    def _other_places(
-        self, query: GeotaggedPhoto, ranking: LocatedRanking, rank_photo: RankPhoto
-    ) -> list[RankedPhoto]:
-        """Return the ranking as it would be if the query's place were not in the map."""
-        depth = EVIDENCE_DEPTH
-        while True:
-            others = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.location)]
-            if len(others) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
-                return others[:EVIDENCE_DEPTH]
-            depth *= 2
-            ranking = rank_photo(query, depth) or []
+    def _rank_own_photo(self, rank_photo: RankPhoto, index: int) -> IndexRanking | None:
+        """Rank the photos with a location by their similarity to one of them."""
+        ranking = rank_photo(self.database.photos[index], MAX_RANKS)
+        self.on_query()
+        if ranking is None:
+            return None
+        known = [
+            (self._index_of[hit.photo_id], hit.ranked_by)
+            for hit, _ in ranking
+            if hit.photo_id in self._index_of
+        ]
+        indices = np.array([index for index, _ in known], dtype=np.int64)
+        return indices, np.array([score for _, score in known], dtype=np.float64)
+
+    def _evaluate_places(
+        self,
+        sample: Sequence[GeotaggedPhoto],
+        own_photos: OwnPhotoSampler,
+        labelled: LabelledQueryMetrics,
+    ) -> PlaceEvaluation:
+        """Fit the probabilities of the levels, and measure them by cross-validation."""
+        photos = [self._index_of[photo.photo_id] for photo in sample]
+        spread = own_photos.spread(photos)
+        queries = []
+        for number, outcome in enumerate(labelled.outcomes):
+            if outcome.same_session or not outcome.ranking:
+                continue
+            best = self._index_of.get(outcome.best_photo_id) if outcome.best_photo_id else None
+            neighbours = own_photos.neighbours(best) if best is not None else []
+            levels = candidate_levels(
+                outcome.ranking, neighbours, self.scheme, spread, self.radius_m
+            )
+            if levels:
+                right = [level.is_right(outcome.truth) for level in levels]
+                queries.append(PlaceSample(number, levels, right))
+        return evaluate_places(
+            list(own_photos.samples(photos, spread)), queries, self.scheme, spread
+        )
 
     def _evaluate_labelled_queries(
         self, calibration: Calibration, rank_photo: RankPhoto
@@ -302,6 +360,9 @@ class MapEvaluation:
                     error_m=distance_between_m(query.spot, estimate),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     accepted=calibration.accepts(evidence) if evidence else None,
+                    truth=query.spot,
+                    ranking=_to_ranked(ranking),
+                    best_photo_id=ranking[0][0].photo_id if ranking else None,
                 )
             )
         return labelled

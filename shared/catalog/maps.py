@@ -53,13 +53,24 @@ class Map(Journaled, Base):
     name: Mapped[str] = mapped_column(sa.String(100), unique=True)
     extractor: Mapped[str] = mapped_column(sa.String(200))
     version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
+    place_labels_are_paths: Mapped[bool] = mapped_column(
+        sa.Boolean, default=False, server_default=sa.false()
+    )
+    """Whether `/` separates the levels of the place labels."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
-def create_map(session: Session, name: str, extractor: str) -> Map:
+def create_map(
+    session: Session, name: str, extractor: str, *, place_labels_are_paths: bool = False
+) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken."""
-    map_ = Map(id=new_id(), name=name, extractor=extractor)
+    map_ = Map(
+        id=new_id(),
+        name=name,
+        extractor=extractor,
+        place_labels_are_paths=place_labels_are_paths,
+    )
     try:
         with session.begin_nested():
             session.add(map_)

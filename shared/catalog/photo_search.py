@@ -24,6 +24,7 @@ from shared.catalog.base import (
 )
 from shared.catalog.photos import Photo, PhotoRole
 from shared.geodesy import latitude_bounds, longitude_half_width
+from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 
 # Upper limit of the total: the cost of a count grows with the number of matches.
@@ -79,6 +80,13 @@ def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> 
         conditions.append(photo.captured_at <= photo_filter.captured_before)
     if photo_filter.place is not None:
         conditions.append(photo.place == photo_filter.place)
+    if photo_filter.place_under is not None:
+        level = photo_filter.place_under
+        below = level + PATH_SEPARATOR
+        # Not LIKE, which ignores case in SQLite and in a path has wildcards to escape.
+        conditions.append(
+            or_(photo.place == level, func.substr(photo.place, 1, len(below)) == below)
+        )
     if photo_filter.ids is not None:
         conditions.append(photo.id.in_(photo_filter.ids))
     conditions.extend(json_array_has(photo.tags, tag) for tag in photo_filter.tags)

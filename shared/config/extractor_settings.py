@@ -18,7 +18,7 @@ class ExtractorSettings(BaseSettings):
     """Which extractors maps may use, and how an extractor worker runs them."""
 
     extractor: str = Field(
-        "efficientnet-lite0-vlad",
+        "efficientnet-lite0-vlad128",
         description="extractor of new maps, with options: "
         "anyloc-vitb14:layer=9,preprocessing=demo1024",
     )
@@ -92,7 +92,7 @@ class ExtractorSettings(BaseSettings):
     local_features: Literal["recompute", "keep"] = Field(
         "recompute",
         description="local features of compared photos: recompute them each time, or keep them as "
-        "float16 in the object store (44 kB per photo with the default extractor)",
+        "float16 in the object store (97 kB per photo with the default extractor)",
     )
 
     @field_validator("torchhub_allowed")

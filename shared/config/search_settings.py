@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Literal
 
@@ -20,6 +21,17 @@ class SearchSettings(BaseSettings):
         gt=0,
         description="distance to the true position within which an estimate counts as correct, "
         "metres",
+    )
+    estimate_radii_m: str = Field(
+        "25,100,500,2000",
+        description="radii of the levels of an estimate by coordinates, metres, separated by "
+        "commas",
+    )
+    certainty: float = Field(
+        0.95,
+        gt=0,
+        le=1,
+        description="share of the answers that must be right, unless a search has `certainty`",
     )
     word_weights: bool = Field(
         True,
@@ -58,6 +70,17 @@ class SearchSettings(BaseSettings):
         "omitted from the result",
     )
 
+    @field_validator("estimate_radii_m")
+    @classmethod
+    def _check_radii(cls, value: str) -> str:
+        try:
+            radii = [float(radius) for radius in split_list(value)]
+        except ValueError:
+            radii = []
+        if not radii or not all(0 < radius < math.inf for radius in radii):
+            raise ValueError(f"{value!r} is not a list of radii in metres, such as 25,100,500")
+        return value
+
     @field_validator("search_shard")
     @classmethod
     def _check_shard(cls, value: str) -> str:
@@ -73,6 +96,11 @@ class SearchSettings(BaseSettings):
                     "commas"
                 )
         return value
+
+    @property
+    def level_radii_m(self) -> tuple[float, ...]:
+        """The radii of the levels of an estimate in metres, ascending."""
+        return tuple(sorted({float(radius) for radius in split_list(self.estimate_radii_m)}))
 
     @property
     def shard(self) -> Shard:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from shared.evaluation.place_evidence import PlaceEvidence
+from shared.evaluation.place_probability import PlaceModel
 
 FALSE_ACCEPT_RATE = 0.05  # of impostors
 MIN_IMPOSTORS = 20  # with fewer, a rate of one in twenty cannot be estimated
@@ -69,6 +70,8 @@ class Calibration(BaseModel):
     """number of labelled queries that the confidence was fitted on"""
     confidence: LogisticRegression | None
     """None: uncalibrated"""
+    places: PlaceModel | None = None
+    """probabilities of the levels of estimates; None in calibrations of earlier releases"""
 
     @property
     def state(self) -> str:

@@ -36,7 +36,9 @@ FACETS = ("query", "key", "value", "token")
 EXTRACTOR_AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
 # The preprocessing of AnyLoc's published results, which these names reproduce.
 ANYLOC_PREPROCESSING_NAMES = ("demo1024", "paper480x640", "round14")
-PREPROCESSING_NAMES = ("square224", *ANYLOC_PREPROCESSING_NAMES)
+# Keeps the aspect ratio; for convolutional backbones, because its sides are not whole patches.
+AREA_PREPROCESSING_NAME = "area288x384"
+PREPROCESSING_NAMES = ("square224", *ANYLOC_PREPROCESSING_NAMES, AREA_PREPROCESSING_NAME)
 MAX_CLUSTERS = 4096
 MAX_PCA_DIMENSION = 1024  # dimensions after PCA, whose time and memory grow quadratically
 TORCHHUB_BACKBONE = "torchhub"  # the backbone that is a torch.hub entry
@@ -155,6 +157,16 @@ EXTRACTOR_CONFIGS = {
             aggregator="vlad",
             shipped_vocabulary="efficientnet-lite0.npy",
         ),
+        ExtractorConfig(
+            name="efficientnet-lite0-vlad128",
+            backbone="efficientnet-lite0",
+            width=112,
+            parameters=5_000_000,
+            preprocessing=AREA_PREPROCESSING_NAME,
+            aggregator="vlad",
+            clusters=128,
+            shipped_vocabulary="efficientnet-lite0-128.npy",
+        ),
         _anyloc_config("vits14", depth=12, width=384, layer=10, parameters=22_100_000),
         _anyloc_config("vitb14", depth=12, width=768, layer=10, parameters=86_600_000),
         _anyloc_config("vitl14", depth=24, width=1024, layer=20, parameters=304_400_000),
@@ -194,7 +206,7 @@ EXTRACTOR_CONFIGS = {
 def get_extractor_config(name: str, *, allow_test_extractors: bool) -> ExtractorConfig:
     """Parse an extractor name with options into its configuration.
 
-    Whether a torch.hub entry may be loaded is up to `Settings.recipe`; whether a trained model was
+    Whether a torch.hub entry may be loaded is up to `Settings.extractor_config`; whether a trained model was
     added, up to the catalog.
 
     Returns:
@@ -309,7 +321,13 @@ def _allowed_options(base: ExtractorConfig, config: ExtractorConfig) -> dict[str
     allowed: dict[str, OptionParser] = {}
     if base.needs_vocabulary:
         allowed["aggregator"] = _one_of(EXTRACTOR_AGGREGATORS)
-        allowed["preprocessing"] = _one_of(PREPROCESSING_NAMES)
+        allowed["preprocessing"] = _one_of(
+            tuple(
+                name
+                for name in PREPROCESSING_NAMES
+                if base.depth is None or name != AREA_PREPROCESSING_NAME
+            )
+        )
     if config.needs_vocabulary:
         allowed["clusters"] = (
             _integer_between(1, MAX_CLUSTERS),

@@ -22,6 +22,7 @@ to a sum of 1.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -110,6 +111,8 @@ def _axis_weights(
 
 
 PATCH = 14  # pixels; of DINOv2
+STRIDE = 32  # pixels; of convolutional backbones
+MAX_ASPECT_RATIO = 4
 ROUND14_MAX_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches with quadratic attention
 
 
@@ -150,6 +153,17 @@ class Preprocessing:
 def _squeeze(image: Image.Image, height: int, width: int) -> Pixels:
     """Resize ignoring the aspect ratio: bilinear, antialiased when shrinking, rounded."""
     return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _fit_area(image: Image.Image, height: int, width: int) -> Pixels:
+    """Resize to about the area of height x width and the aspect ratio of the photo.
+
+    Sides are multiples of 32, the stride of the deepest features. Aspect ratios beyond 4 : 1 are
+    squeezed to it. Bilinear, antialiased when shrinking, rounded.
+    """
+    ratio = min(max(image.width / image.height, 1 / MAX_ASPECT_RATIO), MAX_ASPECT_RATIO)
+    sides = math.sqrt(height * width / ratio), math.sqrt(height * width * ratio)
+    return _squeeze(image, *(max(1, round(side / STRIDE)) * STRIDE for side in sides))
 
 
 def _demo1024(image: Image.Image) -> Pixels:
@@ -209,6 +223,17 @@ def _centre_crop(pixels: Pixels) -> Pixels:
     return cropped
 
 
+def _area_preprocessing(height: int, width: int) -> Preprocessing:
+    return Preprocessing(
+        f"area{height}x{width}",
+        1,
+        True,
+        2 * height * width,  # rounding a side to a multiple of STRIDE adds far less
+        (height, width),
+        partial(_fit_area, height=height, width=width),
+    )
+
+
 PREPROCESSINGS = {
     preprocessing.name: preprocessing
     for preprocessing in (
@@ -218,6 +243,7 @@ PREPROCESSINGS = {
         Preprocessing(
             "square32", 1, True, 32 * 32, (32, 32), partial(_squeeze, height=32, width=32)
         ),
+        _area_preprocessing(288, 384),
         Preprocessing("demo1024", 1, False, 1022 * 1022, (756, 1022), _demo1024),
         Preprocessing("paper480x640", 1, False, 476 * 630, (476, 630), _paper480x640),
         Preprocessing("round14", 1, False, ROUND14_MAX_PIXELS, (770, 1022), _round14),

@@ -65,6 +65,8 @@ class PhotoFilter(_FilterModel):
     captured_after: datetime | None = None
     captured_before: datetime | None = None
     place: str | None = None
+    place_under: str | None = None
+    """A level of label paths, which the photo's label is or lies below."""
     tags: tuple[str, ...] = ()
     """The photo must have all of these tags."""
     ids: tuple[UUID, ...] | None = None

@@ -31,7 +31,7 @@ Rows = NDArray[np.float32]
 
 
 class NetworkBaselines:
-    """Describes photos with an untrained network and with the default extractor.
+    """Describes photos with an untrained network and with pretrained EfficientNet-Lite0 and VLAD.
 
     The extractor is measured with its shipped vocabulary and with a fitted one. Descriptors of the
     fitted one are also measured after PCA whitening.

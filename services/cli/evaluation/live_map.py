@@ -93,8 +93,40 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
             )
     console.print(table)
     figures = evaluations[0].figures
+    # Evaluations of earlier releases have no `places`.
+    if places := (figures.get("with_word_weights") or figures).get("places"):
+        console.print(_answers_table(places))
     for line in _estimate_lines(figures.get("with_word_weights") or figures):
         console.print(line, soft_wrap=True)
+
+
+def _answers_table(places: Json) -> Table:
+    errors = ", ".join(
+        "-" if level["calibration_error"] is None else f"{level['calibration_error']:.3f}"
+        for level in places["levels"]
+    )
+    source = places["source"].replace("_", " ")
+    table = Table(
+        "certainty",
+        *(
+            Column(name, justify="right")
+            for name in ("answered", "at the finest level", "correct", "mean level", "impostors")
+        ),
+        caption=f"{places['samples']} {source}, cross-validated. Expected calibration error by "
+        f"level, finest first: {errors}.",
+    )
+    for answers in places["answers"]:
+        mean_level = answers["mean_level"]
+        table.add_row(
+            f"{answers['certainty']:g}",
+            *(
+                _format_percent(answers[key]["mean"])
+                for key in ("answered", "answered_at_finest_level", "precision")
+            ),
+            "-" if mean_level is None else f"{mean_level:.2f}",
+            _format_percent(answers["impostors_at_finest_level"]),
+        )
+    return table
 
 
 def _recall_rows(figures: Json) -> list[tuple[str, Json]]:

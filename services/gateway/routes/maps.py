@@ -49,6 +49,11 @@ class CreateMapRequest(RequestModel):
         pattern=NO_NUL_PATTERN,
         description="omitted: the default of the server",
     )
+    place_labels_are_paths: bool = Field(
+        False,
+        description="whether `/` separates the levels of place labels, as in "
+        "`tower/floor 7/elevator`",
+    )
 
     @field_validator("name")
     @classmethod
@@ -59,6 +64,10 @@ class CreateMapRequest(RequestModel):
                 "letter or digit"
             )
         return name
+
+
+class UpdateMapRequest(RequestModel):
+    place_labels_are_paths: bool
 
 
 class MapResponse(ResponseModel):
@@ -77,6 +86,9 @@ class MapResponse(ResponseModel):
         description="dimension of its descriptors; null before the first photo"
     )
     pca_from: int | None = Field(description="dimension before PCA; null without PCA")
+    place_labels_are_paths: bool = Field(
+        description="whether `/` separates the levels of place labels"
+    )
     created_at: datetime
 
 
@@ -105,7 +117,13 @@ def create_new_map(
         raise invalid_field_error("extractor", error.detail) from None
     with gateway.catalog.write() as session:
         check_model_registered(session, config)
-        response = _map_response(session, create_map(session, body.name, config.name))
+        map_ = create_map(
+            session,
+            body.name,
+            config.name,
+            place_labels_are_paths=body.place_labels_are_paths,
+        )
+        response = _map_response(session, map_)
         idempotent.store_response(session, 201, response)
     return response
 
@@ -115,6 +133,22 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     """Get one map."""
     with gateway.catalog.read() as session:
         return _map_response(session, get_map(session, name))
+
+
+@router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE])
+def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
+    """Change whether the map's place labels are paths.
+
+    The probabilities of its estimates are those of the prior until the next evaluation.
+    """
+
+    def update(session: Session) -> MapResponse:
+        map_ = lock_map(session, get_map(session, name).id)
+        map_.place_labels_are_paths = body.place_labels_are_paths
+        session.flush()
+        return _map_response(session, map_)
+
+    return gateway.catalog.run(update)
 
 
 @router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE])
@@ -150,5 +184,6 @@ def _map_response(session: Session, map_: Map) -> MapResponse:
         vocabulary=vocabulary_standing(session, generation) if generation else None,
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
+        place_labels_are_paths=map_.place_labels_are_paths,
         created_at=map_.created_at,
     )

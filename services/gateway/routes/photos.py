@@ -32,7 +32,11 @@ from services.gateway.schemas import (
     PhotoResponse,
     RequestModel,
 )
-from services.gateway.similarity.search_params import FilterParams, parse_optional_time
+from services.gateway.similarity.search_params import (
+    FilterParams,
+    check_place_filter,
+    parse_optional_time,
+)
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map
@@ -212,7 +216,9 @@ def search_photos_by_metadata(
     metadata_filter = query.metadata_filter()
     after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
-        map_id = get_map(session, query.map).id
+        map_ = get_map(session, query.map)
+        check_place_filter(metadata_filter.photos, map_)
+        map_id = map_.id
         matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
     page = matches[: query.limit]
     return MetadataSearchResponse(

@@ -36,7 +36,11 @@ from services.gateway.similarity.rerank import (
     start_comparison_of_query_photo,
     start_comparison_of_stored_photo,
 )
-from services.gateway.similarity.search_params import SearchParams, SimilarityParams
+from services.gateway.similarity.search_params import (
+    SearchParams,
+    SimilarityParams,
+    check_place_filter,
+)
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
@@ -86,6 +90,7 @@ async def search_by_stored_photo(
     search_params = query.search_params()
 
     def search() -> SimilarityResponse | Job:
+        _check_filter(gateway, query.map, search_params)
         if not search_params.needs_comparison:
             return find_similar(
                 gateway, query_from_photo(gateway, query.map, file_id), search_params
@@ -129,6 +134,7 @@ async def search_by_uploaded_photo(
     """
     search_params = query.search_params()
     await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
+    await run_in_threadpool(_check_filter, gateway, query.map, search_params)
     job_id = new_id()
     key = query_key(job_id)
     with admission.admit_upload(UploadKind.QUERY, request):
@@ -203,6 +209,12 @@ async def _wait_for_result(
         if isinstance(result, SimilarityResponse):
             return result
         job = result
+
+
+def _check_filter(gateway: GatewayContext, map_name: str, search_params: SearchParams) -> None:
+    if search_params.photos.place_under is not None:
+        with gateway.catalog.read() as session:
+            check_place_filter(search_params.photos, get_map(session, map_name))
 
 
 def _queue_query(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from uuid import UUID
 
-from services.gateway.schemas import EstimateResponse
+from services.gateway.schemas import EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
 from shared.evaluation.calibration import Calibration
 from shared.evaluation.place_evidence import (
@@ -14,6 +14,7 @@ from shared.evaluation.place_evidence import (
     compute_evidence,
     estimate_location,
 )
+from shared.evaluation.place_probability import PlaceEstimate, PlaceModel
 from shared.search_api.protocol import SearchHit
 
 
@@ -68,6 +69,32 @@ def estimate_place(
         confidence=confidence,
         calibration=state,
         reason=_estimate_reason(accepted, evidence.support, calibration),
+    )
+
+
+def add_levels(
+    response: EstimateResponse, estimate: PlaceEstimate, model: PlaceModel, certainty: float
+) -> EstimateResponse:
+    """Returns the response with the levels of the estimate and their probabilities."""
+    return response.model_copy(
+        update={
+            "levels": [
+                EstimateLevelResponse(
+                    place=level.place,
+                    latitude=level.latitude,
+                    longitude=level.longitude,
+                    radius_m=level.radius_m,
+                    probability=probability,
+                )
+                for level, probability in zip(estimate.levels, estimate.probabilities, strict=True)
+            ],
+            "answer_level": estimate.answer,
+            "certainty": certainty,
+            "not_in_map_probability": estimate.not_in_map,
+            "radius_68_m": estimate.radius_68_m,
+            "radius_95_m": estimate.radius_95_m,
+            "calibration_source": model.source,
+        }
     )
 
 

@@ -12,7 +12,7 @@ import itertools
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 from uuid import UUID
@@ -27,7 +27,7 @@ from services.gateway.schemas import (
     SimilarPhotoResponse,
     job_url,
 )
-from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.similarity.estimate import add_levels, estimate_place, locate_hits
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database_errors import to_unavailable
@@ -38,7 +38,9 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.calibration import Calibration
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH, RankedPhoto
+from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_probability import PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse
@@ -104,6 +106,8 @@ class SimilarityResult:
     hits: list[SearchHit]
     """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
     photos: dict[UUID, Photo]
+    match_probabilities: dict[UUID, float]
+    """Probability of each of the best photos that it shows the query's place."""
     word_weights: tuple[float, ...]
     """The weights that the hits are ranked by, one per word; () for the plain ranking."""
     history_row: Search
@@ -181,6 +185,7 @@ def find_similar(
         SimilarPhotoResponse(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
+            match_probability=result.match_probabilities.get(hit.photo_id),
             **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map.name),
         )
         for hit in result.hits
@@ -197,12 +202,34 @@ def run_similarity_search(
     # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
     search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
     hits, photos, response = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
-    ranking = unfiltered_ranking = locate_hits(hits, photos)
+    unfiltered_hits, unfiltered_photos = hits, photos
     if not search_params.photos.is_empty:
-        unfiltered_ranking = locate_hits(*search(NO_FILTER, EVIDENCE_DEPTH)[:2])
+        unfiltered_hits, unfiltered_photos, _ = search(NO_FILTER, EVIDENCE_DEPTH)
+    ranking = locate_hits(hits, photos)
+    unfiltered_ranking = locate_hits(unfiltered_hits, unfiltered_photos)
+    calibration = weights.calibration(hits)
     estimate = estimate_place(
-        weights.calibration(hits), ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
+        calibration, ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
     )
+    scheme = LevelScheme(
+        labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
+    )
+    model = ((calibration and calibration.places) or PlaceModel()).for_scheme(scheme)
+    certainty = search_params.certainty or gateway.settings.certainty
+    places = model.estimate(
+        unfiltered_ranking,
+        _rank_neighbours(gateway, query, search_params, unfiltered_hits, weights.values),
+        scheme,
+        certainty,
+        gateway.settings.estimate_radius_m,
+        ranking,
+    )
+    match_probabilities: dict[UUID, float] = {}
+    if places is not None:
+        estimate = add_levels(estimate, places, model, certainty)
+        match_probabilities = dict(
+            zip((hit.photo_id for hit in hits), places.match_probabilities, strict=True)
+        )
     similar = hits[:depth]
     if search_params.min_score is not None and weights.values:
         # `min_score` applies to the plain cosine similarity, but the ranking is by weighted scores:
@@ -245,8 +272,39 @@ def run_similarity_search(
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
     return SimilarityResult(
-        response_without_photos, similar, photos, weights.values if weighted else (), history
+        response_without_photos,
+        similar,
+        photos,
+        match_probabilities,
+        weights.values if weighted else (),
+        history,
     )
+
+
+def _rank_neighbours(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    hits: Sequence[SearchHit],
+    weights: tuple[float, ...],
+) -> list[RankedPhoto]:
+    """Returns the ranking of the best photo itself, without it and the query."""
+    if not hits:
+        return []
+    with gateway.catalog.read() as session:
+        located = find_descriptor(session, query.generation.id, hits[0].photo_id)
+    if located is None:  # deleted since
+        return []
+    best = replace(
+        query, object_key=located[1].object_key, row=located[0].row, photo_id=hits[0].photo_id
+    )
+    try:
+        found, photos, _ = _search_live_photos(
+            gateway, best, search_params, NO_FILTER, EVIDENCE_DEPTH + 1, weights=weights
+        )
+    except Gone:  # its chunk was merged into another one between the two reads
+        return []
+    return locate_hits([hit for hit in found if hit.photo_id != query.photo_id], photos)
 
 
 def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:

@@ -51,6 +51,7 @@ class CompareJobParams(BaseModel):
     request: CompareRequest
     top_k: int
     frame: SimilarityResponse
+    match_probabilities: dict[UUID, float] = {}
 
 
 def check_comparison_supported(
@@ -136,6 +137,7 @@ def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> Sim
             similarity_score=searched[candidate.photo_id].score,
             weighted_score=searched[candidate.photo_id].weighted_score,
             rerank_score=candidate.rerank_score,
+            match_probability=params.match_probabilities.get(candidate.photo_id),
             explanation=candidate.explanation
             and ExplanationResponse.model_validate(candidate.explanation),
             **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
@@ -168,6 +170,7 @@ def _build_compare_job(
         ),
         top_k=search_params.top_k,
         frame=result.response_without_photos,
+        match_probabilities=result.match_probabilities,
     )
     job = Job(
         id=new_id(),

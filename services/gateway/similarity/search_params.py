@@ -13,6 +13,7 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
+from shared.catalog.maps import Map
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -38,6 +39,12 @@ class FilterParams(MapParams):
     place: str | None = Field(
         None, max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"
     )
+    place_under: str | None = Field(
+        None,
+        max_length=MAX_TEXT_CHARACTERS,
+        description="photos whose label is this level or lies below it; only for maps with "
+        "`place_labels_are_paths`",
+    )
     tags: str | None = Field(
         None, max_length=5000, description="separated by commas; photos must have all"
     )
@@ -53,14 +60,32 @@ class FilterParams(MapParams):
         """
         if self.place is not None and "\0" in self.place:
             raise invalid_field_error("place", "contains a NUL character")
+        level = self.place_under
+        if level is not None and ("\0" in level or not level.strip("/ ")):
+            raise invalid_field_error("place_under", "names no level of a path")
         return PhotoFilter(
             near=_parse_circle(self.near) if self.near is not None else None,
             box=_parse_box(self.box) if self.box is not None else None,
             captured_after=parse_optional_time("captured_after", self.captured_after),
             captured_before=parse_optional_time("captured_before", self.captured_before),
             place=self.place or None,
+            place_under=level.rstrip("/") if level is not None else None,
             tags=tuple(parse_tags(self.tags.split(","))) if self.tags else (),
             ids=_parse_ids(self.ids) if self.ids is not None else None,
+        )
+
+
+def check_place_filter(photo_filter: PhotoFilter, map_: Map) -> None:
+    """Checks that the map has the levels that the filter names.
+
+    Raises:
+        Unprocessable: `invalid_field`, for `place_under` in a map whose labels are no paths.
+    """
+    if photo_filter.place_under is not None and not map_.place_labels_are_paths:
+        raise invalid_field_error(
+            "place_under",
+            f"needs place labels that are paths: PATCH /api/v1/maps/{map_.name} with "
+            "`place_labels_are_paths`",
         )
 
 
@@ -138,6 +163,13 @@ class RankingParams(BaseModel):
     )
     explain: bool = Field(
         False, description="Return the clusters and patches that contribute to each similarity."
+    )
+    certainty: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="Share of the answers that must be right: the estimate answers at the finest "
+        "level that is certain enough. Default: CERTAINTY.",
     )
     mode: Mode = Field(
         Mode.AUTO,

@@ -17,14 +17,13 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search import service as search_service
-from services.steward.evaluation_search import GeotaggedPhoto
 from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
+from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
-from shared.evaluation.place_evidence import PhotoLocation
 from shared.jobs import InProcessWakeups
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse
@@ -331,10 +330,11 @@ def test_a_map_is_not_measured_while_a_shard_is_missing(
     places: SmallMap, tier_of: OpenTier, catalog: Catalog
 ) -> None:
     tier = tier_of(1, 1)
-    with catalog.read() as session:
+    with catalog.write() as session:
+        session.get_one(Photo, next(iter(places.rows))).place = "hall"
         generation = session.get_one(Generation, places.generation_id)
-    measure = MapEvaluation(catalog, tier.port, generation, 25.0, lambda: None)
-    sample = [GeotaggedPhoto(next(iter(places.rows)), PhotoLocation(None, None, "hall"), None)]
+    measure = MapEvaluation(catalog, tier.port, generation, 25.0, (25.0,), lambda: None)
+    sample = measure.draw_sample(1, 0)
     measure.evaluate(sample)
     tier.servers[1][0].stop()
     with pytest.raises(Unavailable) as caught:

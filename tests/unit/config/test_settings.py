@@ -30,7 +30,7 @@ def test_outside_of_tests_the_real_extractor_is_the_default(
 ) -> None:
     monkeypatch.delenv("EXTRACTOR")
     monkeypatch.delenv("ALLOW_TEST_EXTRACTORS")
-    assert Settings().extractor == "efficientnet-lite0-vlad"
+    assert Settings().extractor == "efficientnet-lite0-vlad128"
     assert Settings().allow_test_extractors is False
 
 
@@ -194,7 +194,7 @@ PREDECESSORS = {
 @pytest.mark.parametrize(
     ("variables", "extractor"),
     [
-        ({}, "efficientnet-lite0-vlad"),
+        ({}, "efficientnet-lite0-vlad128"),
         (PREDECESSORS, "anyloc-vitg14"),
         ({**PREDECESSORS, "VLAD_CLUSTERS": "32"}, "anyloc-vitg14:clusters=32"),
         ({"DINO_MODEL": "dinov2_vitl14"}, "anyloc-vitl14"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -243,27 +244,55 @@ def test_views_of_one_place_are_nearer_each_other_than_to_another_picture(
     assert min(same) > max(other) + 0.1
 
 
-def test_shipped_vocabulary_names_the_photographs_that_it_was_learnt_on(
-    efficientnet: Extractor,
+@pytest.fixture(scope="module")
+def aspect_kept(efficientnet: Extractor) -> Extractor:
+    return Extractor(
+        EXTRACTOR_CONFIGS["efficientnet-lite0-vlad128"], CPU, backbone=efficientnet.backbone
+    )
+
+
+def test_default_extractor_tells_places_apart_whatever_the_aspect_ratio(
+    aspect_kept: Extractor,
 ) -> None:
-    shipped = efficientnet.shipped_vocabulary()
+    shipped = aspect_kept.shipped_vocabulary()
+    assert shipped is not None
+    photos = [
+        photo.crop((left, 20, left + width, 380))
+        for photo in (package_photo("china.jpg"), package_photo("flower.jpg"))
+        for left, width in ((40, 480), (60, 300))
+    ]
+    pixels = [aspect_kept.preprocessing.apply(photo) for photo in photos]
+    assert pixels[0].shape != pixels[1].shape
+    rows = aspect_kept.describe(pixels, shipped[0])
+    assert rows.shape == (4, 128 * 112)
+    scores = rows @ rows.T
+    assert min(scores[0, 1], scores[2, 3]) > scores[:2, 2:].max() + 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "clusters"), [("efficientnet-lite0-vlad", 64), ("efficientnet-lite0-vlad128", 128)]
+)
+def test_shipped_vocabulary_names_the_photographs_that_it_was_learnt_on(
+    efficientnet: Extractor, name: str, clusters: int
+) -> None:
+    extractor = Extractor(EXTRACTOR_CONFIGS[name], CPU, backbone=efficientnet.backbone)
+    shipped = extractor.shipped_vocabulary()
     assert shipped is not None
     centres, provenance = shipped
-    assert (centres.clusters, centres.dimension) == (64, 112)
+    assert (centres.clusters, centres.dimension) == (clusters, 112)
+    assert provenance["preprocessing"] == extractor.preprocessing.as_spec()
     named = {name for entry in provenance["photographs"].values() for name in entry["files"]}
     assert {"china.jpg", "coffee.png"} <= named
     assert set(provenance["photographs_sha256"]) == named
     assert provenance["made_by"] == "python -m tools.make_shipped_vocabulary"
 
 
-def test_shipped_vocabulary_is_the_file_that_its_provenance_describes(
-    efficientnet: Extractor,
-) -> None:
-    shipped = efficientnet.shipped_vocabulary()
-    assert shipped is not None
-    centres = decode_centres((SHIPPED_VOCABULARIES / "efficientnet-lite0.npy").read_bytes())
-    assert hashlib.sha256(centres.array.tobytes()).hexdigest() == shipped[1]["sha256"]
-    assert shipped[1]["clusters"] == centres.clusters
+@pytest.mark.parametrize("name", ["efficientnet-lite0", "efficientnet-lite0-128"])
+def test_shipped_vocabulary_is_the_file_that_its_provenance_describes(name: str) -> None:
+    centres = decode_centres((SHIPPED_VOCABULARIES / f"{name}.npy").read_bytes())
+    provenance = json.loads((SHIPPED_VOCABULARIES / f"{name}.json").read_text())
+    assert hashlib.sha256(centres.array.tobytes()).hexdigest() == provenance["sha256"]
+    assert provenance["clusters"] == centres.clusters
 
 
 def test_photographs_are_those_that_the_provenance_saw(efficientnet: Extractor) -> None:

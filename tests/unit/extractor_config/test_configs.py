@@ -68,6 +68,7 @@ def test_anyloc_takes_the_value_facet_of_its_authors_layer(
 
 def test_dimension_follows_the_clusters_of_vlad_only() -> None:
     assert config("efficientnet-lite0-vlad").dimension == 7168
+    assert config("efficientnet-lite0-vlad128").dimension == 128 * 112
     assert config("efficientnet-lite0-vlad:clusters=8").dimension == 8 * 112
     assert EXTRACTOR_CONFIGS["test-tiny-avg"].dimension == 16
 
@@ -169,6 +170,13 @@ def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> No
     own = config("efficientnet-lite0-vlad")
     assert own.shipped_vocabulary is not None
     assert config("efficientnet-lite0-vlad:clusters=8").shipped_vocabulary == own.shipped_vocabulary
+
+
+def test_area_preprocessing_is_for_convolutional_backbones() -> None:
+    found = config("efficientnet-lite0-vlad:preprocessing=area288x384")
+    assert found.preprocessing == config("efficientnet-lite0-vlad128").preprocessing
+    with pytest.raises(Misconfigured, match="preprocessing is one of square224, demo1024"):
+        config("anyloc-vitb14:preprocessing=area288x384")
 
 
 def test_aggregators_without_a_vocabulary_have_the_length_of_a_local_feature() -> None:

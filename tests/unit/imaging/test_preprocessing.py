@@ -105,6 +105,28 @@ def test_sizes_are_those_that_the_papers_name() -> None:
     assert size("round14", 640, 480) == (476, 644)
 
 
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((480, 640), (288, 384)),
+        ((640, 480), (384, 288)),
+        ((1080, 1920), (256, 448)),
+        ((32, 64), (224, 480)),
+        ((100, 100), (320, 320)),
+        ((10, 5000), (160, 672)),
+        ((1, 1), (320, 320)),
+    ],
+)
+def test_area_preprocessing_keeps_the_aspect_ratio_up_to_4_to_1(
+    size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    height, width = size
+    found = get_preprocessing("area288x384")
+    pixels = found.apply(Image.new("RGB", (width, height)))
+    assert pixels.shape == (*expected, 3)
+    assert pixels.shape[0] * pixels.shape[1] <= found.max_pixels
+
+
 def test_what_needs_no_resizing_keeps_its_bytes() -> None:
     pixels = get_preprocessing("demo1024").apply(photo(480, 640))
     assert pixels.dtype == np.uint8
@@ -137,7 +159,7 @@ def test_versions_are_those_that_stored_descriptors_were_made_with() -> None:
 
 def test_only_the_services_own_ways_turn_photos_upright() -> None:
     upright = {name for name, found in PREPROCESSINGS.items() if found.upright}
-    assert upright == {"square224", "square32"}
+    assert upright == {"area288x384", "square224", "square32"}
 
 
 @pytest.mark.parametrize(

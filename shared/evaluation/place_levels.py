@@ -1,0 +1,265 @@
+"""Levels of a place estimate: the places that a ranking points to, from the finest to the coarsest.
+
+The levels of a *label path* such as `tower/floor 7/elevator` are its prefixes. The levels of
+coordinates are circles of increasing radius around the estimated position. Each level has features
+that say how clearly the ranking points to it; a model (`place_probability`) turns them into a
+probability.
+
+The features compare scores in units of the `spread` of a map's rankings, the median difference
+between the first score and the last of `EVIDENCE_DEPTH`, so that extractors are comparable. Some of
+them compare the query with the *neighbours* of the best photo, the photos of the map that are most
+similar to it: a query that is less similar to it than many of its neighbours are was probably taken
+elsewhere (local density, as in the local outlier factor of Breunig et al. 2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from shared.evaluation.place_evidence import (
+    VOTING_PHOTOS,
+    PhotoLocation,
+    RankedPhoto,
+    distance_between_m,
+    estimate_location,
+)
+from shared.place_paths import is_within_level, label_levels
+
+VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
+WIDE_TEMPERATURE = 0.3
+MIN_SHARE = 1e-3  # of the votes; bounds the log-odds of a level that has all votes or none
+MIN_SPREAD = 1e-6
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class LevelScheme(BaseModel):
+    """What the levels of a map are."""
+
+    model_config = ConfigDict(frozen=True)
+
+    labels_are_paths: bool
+    radii_m: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CandidateLevel:
+    """A level of an estimate: a place, or a circle around the estimated position."""
+
+    place: str | None = None
+    is_path: bool = False
+    """whether `place` is a level of label paths, which contains the finer ones"""
+    latitude: float | None = None
+    longitude: float | None = None
+    radius_m: float | None = None
+    features: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(len(FEATURES),)"""
+
+    def contains(self, location: PhotoLocation) -> bool:
+        """Return whether a location lies in the level."""
+        if self.radius_m is not None:
+            center = PhotoLocation(self.latitude, self.longitude, None)
+            distance = distance_between_m(center, location)
+            return distance is not None and distance <= self.radius_m
+        if self.place is None or not self.is_path:
+            return self.place is not None and location.place == self.place
+        return is_within_level(location.place, self.place)
+
+    def is_right(self, truth: PhotoLocation) -> bool | None:
+        """Return whether the level contains the true location; None if the truth does not say.
+
+        A label that ends above the level (`tower/floor 7` for `tower/floor 7/elevator`) does not
+        say, and neither does a location without a label or without coordinates.
+        """
+        if self.contains(truth):
+            return True
+        if self.radius_m is not None:
+            return None if truth.latitude is None else False
+        levels = label_levels(truth.place, self.is_path)
+        ends_above = self.is_path and bool(levels) and is_within_level(self.place, levels[0])
+        return None if ends_above or not levels else False
+
+
+def candidate_levels(
+    ranking: Sequence[RankedPhoto],
+    neighbours: Sequence[RankedPhoto],
+    scheme: LevelScheme,
+    spread: float,
+    position_radius_m: float,
+    found: Sequence[RankedPhoto] | None = None,
+) -> list[CandidateLevel]:
+    """Find the levels that a ranking points to, with their features.
+
+    The levels are circles if the best photo has coordinates and labels are no paths, and otherwise
+    those of labels.
+
+    Args:
+        ranking: The first photos of the map, best first, for the features.
+        neighbours: The ranking of the best photo itself, without it; empty if it is not known.
+        scheme: The levels of the map.
+        spread: Unit of score differences.
+        position_radius_m: Photos within this distance of the best one determine the position.
+        found: The ranking that determines the levels, if a filter restricts it.
+
+    Returns:
+        The levels, finest first; empty if the best photos have no location.
+    """
+    found = ranking if found is None else found
+    if not ranking or not found:
+        return []
+    if scheme.labels_are_paths or found[0].location.latitude is None:
+        levels = _vote_for_places(found, scheme.labels_are_paths, spread)
+    else:
+        center = estimate_location(found, position_radius_m)
+        levels = [
+            CandidateLevel(latitude=center.latitude, longitude=center.longitude, radius_m=radius)
+            for radius in sorted(scheme.radii_m)
+        ]
+    scores, neighbour_scores = _scores(ranking), _scores(neighbours)
+    return [
+        replace(
+            level,
+            features=level_features(
+                scores,
+                _inside(level, ranking),
+                neighbour_scores,
+                _inside(level, neighbours),
+                spread,
+            ),
+        )
+        for level in levels
+    ]
+
+
+def _vote_for_places(
+    ranking: Sequence[RankedPhoto], is_path: bool, spread: float
+) -> list[CandidateLevel]:
+    """Choose a place at each level, from the coarsest, by the votes inside the one chosen before.
+
+    The votes are weighted (`vote_weights`); a photo without a label has none. Where most votes are
+    those of photos whose labels end at a level, the estimate ends there, too.
+    """
+    paths = [label_levels(r.location.place, is_path)[::-1] for r in ranking]
+    votes = vote_weights(ranking, spread).tolist()
+    chosen: list[CandidateLevel] = []
+    voters = [index for index, path in enumerate(paths) if path]
+    while True:
+        depth = len(chosen)
+        counts: dict[str, float] = {}
+        ended = 0.0
+        for index in voters:
+            if depth < len(paths[index]):
+                place = paths[index][depth]
+                counts[place] = counts.get(place, 0.0) + votes[index]
+            else:
+                ended += votes[index]
+        if not counts or max(counts.values()) < ended:
+            return chosen[::-1]
+        best = max(counts, key=lambda place: counts[place])
+        chosen.append(CandidateLevel(place=best, is_path=is_path))
+        voters = [i for i in voters if depth < len(paths[i]) and paths[i][depth] == best]
+
+
+def _inside(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> Mask:
+    return np.array([level.contains(r.location) for r in ranking], dtype=bool)
+
+
+FEATURES = (
+    "votes",
+    "wide_votes",
+    "margin",
+    "agreement_3",
+    "agreement_10",
+    "agreement",
+    "support",
+    "run",
+    "lead",
+    "ahead_of_neighbours_outside",
+    "ahead_of_neighbours_inside",
+    "nearer_neighbours",
+    "ahead_of_neighbours",
+)
+"""Names of a level's features, in the order of `level_features`."""
+
+
+def level_features(
+    scores: FloatArray,
+    inside: Mask,
+    neighbour_scores: FloatArray,
+    neighbours_inside: Mask,
+    spread: float,
+) -> FloatArray:
+    """Compute the features of a level.
+
+    Args:
+        scores: (k,) scores of the ranking, highest first.
+        inside: (k,) which of its photos lie in the level.
+        neighbour_scores: (n,) scores of the best photo's own ranking.
+        neighbours_inside: (n,) which of these photos lie in the level.
+        spread: Unit of score differences.
+
+    Returns:
+        (len(FEATURES),) float64: log-odds of the votes inside, at two temperatures; margin of the
+        best score inside over the best outside; share of the first 3, the first 10 and all photos
+        that lie inside; log of the summed margins of the first ten inside; log of the number of
+        leading photos inside; first score minus last. Then the first score minus the best of a
+        neighbour outside, and inside; log of the number of neighbours that are more similar to the
+        best photo than the query is; and the first score minus the mean of the first ten
+        neighbours. The last four are 0 without neighbours.
+    """
+    last = scores[-1]
+    best_outside = scores[~inside].max(initial=last)
+    support = np.maximum(0.0, scores[:VOTING_PHOTOS][inside[:VOTING_PHOTOS]] - best_outside).sum()
+    run = len(inside) if inside.all() else int(inside.argmin())
+    features = [
+        _log_odds(_votes(scores, VOTE_TEMPERATURE * spread), inside),
+        _log_odds(_votes(scores, WIDE_TEMPERATURE * spread), inside),
+        (scores[inside].max(initial=last) - best_outside) / spread,
+        inside[:3].mean(),
+        inside[:VOTING_PHOTOS].mean(),
+        inside.mean(),
+        np.log1p(support / spread),
+        np.log1p(run),
+        (scores[0] - last) / spread,
+    ]
+    if len(neighbour_scores):
+        first, last = scores[0], neighbour_scores[-1]
+        features += [
+            (first - neighbour_scores[~neighbours_inside].max(initial=last)) / spread,
+            (first - neighbour_scores[neighbours_inside].max(initial=last)) / spread,
+            np.log1p((neighbour_scores > first).sum()),
+            (first - neighbour_scores[:VOTING_PHOTOS].mean()) / spread,
+        ]
+    else:
+        features += [0.0] * 4
+    return np.array(features, dtype=np.float64)
+
+
+def ranking_spread(ranking: Sequence[RankedPhoto]) -> float:
+    """Return the difference between the first and the last score, at least MIN_SPREAD."""
+    return max(MIN_SPREAD, ranking[0].score - ranking[-1].score) if ranking else MIN_SPREAD
+
+
+def vote_weights(ranking: Sequence[RankedPhoto], spread: float) -> FloatArray:
+    """Return the weight of each photo's vote, 1 for the best."""
+    return _votes(_scores(ranking), VOTE_TEMPERATURE * spread)
+
+
+def _scores(ranking: Sequence[RankedPhoto]) -> FloatArray:
+    return np.array([r.score for r in ranking], dtype=np.float64)
+
+
+def _votes(scores: FloatArray, temperature: float) -> FloatArray:
+    votes: FloatArray = np.exp((scores - scores.max(initial=-np.inf)) / temperature)
+    return votes
+
+
+def _log_odds(votes: FloatArray, inside: Mask) -> float:
+    share = votes[inside].sum() / votes.sum()
+    return float(np.log((share + MIN_SHARE) / (1 - share + MIN_SHARE)))

@@ -1,0 +1,181 @@
+"""Samples of a map's own photos, and impostors, for its place model.
+
+A photo is searched without itself. If its place was also photographed in another session, all
+photos of its own session are left out; else photos taken within `BURST_PERIOD` of it. Where the
+capture times are not known, only the photo itself is: its neighbours in the same walk stay in the
+map, which flatters the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime, timedelta
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.evaluation.place_evidence import (
+    DIFFERENT_PLACE_M,
+    EVIDENCE_DEPTH,
+    PhotoLocation,
+    RankedPhoto,
+)
+from shared.evaluation.place_levels import (
+    CandidateLevel,
+    LevelScheme,
+    candidate_levels,
+    ranking_spread,
+)
+from shared.evaluation.place_probability import PlaceSample
+from shared.geodesy import distances_m
+from shared.place_paths import label_levels
+
+# A photo taken less than this before or after another one belongs to the same session.
+SAME_SESSION_PERIOD = timedelta(hours=12)
+BURST_PERIOD = timedelta(seconds=1)
+
+Indices = NDArray[np.int64]
+IndexRanking = tuple[Indices, NDArray[np.float64]]
+"""(k,) numbers of photos, best first, and their scores"""
+RankOwnPhoto = Callable[[int], IndexRanking | None]
+"""Ranks the photos of the map by their similarity to one of them, without it."""
+
+
+class OwnPhotoSampler:
+    """Draws samples for a place model from photos of a map.
+
+    Args:
+        locations: The locations of all photos of the map that have one.
+        captured_at: Their capture times.
+        scheme: The levels of the map.
+        position_radius_m: Radius of a place in metres.
+        rank: Ranks these photos. Called once per photo.
+    """
+
+    def __init__(
+        self,
+        locations: Sequence[PhotoLocation],
+        captured_at: Sequence[datetime | None],
+        scheme: LevelScheme,
+        position_radius_m: float,
+        rank: RankOwnPhoto,
+    ) -> None:
+        self._locations = locations
+        self._scheme = scheme
+        self._radius_m = position_radius_m
+        self._rank = rank
+        self._rankings: dict[int, IndexRanking | None] = {}
+        self._latitudes = np.array([_or_nan(spot.latitude) for spot in locations])
+        self._longitudes = np.array([_or_nan(spot.longitude) for spot in locations])
+        self._seconds = np.array(
+            [_or_nan(None if t is None else t.timestamp()) for t in captured_at]
+        )
+        paths = [label_levels(spot.place, scheme.labels_are_paths) for spot in locations]
+        depth = max(map(len, paths), default=0)
+        self._labels = [
+            np.array([path[i] if i < len(path) else None for path in paths], dtype=object)
+            for i in range(depth)
+        ]
+
+    def ranking(self, photo: int) -> IndexRanking | None:
+        """Return the ranking of a photo, which is searched only once."""
+        if photo not in self._rankings:
+            self._rankings[photo] = self._rank(photo)
+        return self._rankings[photo]
+
+    def spread(self, photos: Sequence[int]) -> float:
+        """Return the median difference of the first and the last score of their rankings."""
+        rankings = [
+            self._ranked(r, self._visible(photo)) for photo in photos if (r := self.ranking(photo))
+        ]
+        return median([ranking_spread(ranking) for ranking in rankings] or [1.0])
+
+    def samples(self, photos: Sequence[int], spread: float) -> Iterator[PlaceSample]:
+        """Yield the samples of photos: each as it is, and as an impostor of each kind.
+
+        The last kind stands for queries from far away, for which every level is wrong: they find
+        what an impostor finds.
+        """
+        for photo in photos:
+            visible = self._visible(photo)
+            levels: list[CandidateLevel] = []
+            left_out = None
+            for left_out, missing in self._kinds(photo):
+                levels = self._levels(photo, visible & ~missing, spread)
+                if levels:
+                    right = [level.is_right(self._locations[photo]) for level in levels]
+                    yield PlaceSample(photo, levels, right, left_out)
+            if levels and left_out is not None:
+                yield PlaceSample(photo, levels, [False] * len(levels), "everything near")
+
+    def neighbours(self, photo: int, visible: NDArray[np.bool_] | None = None) -> list[RankedPhoto]:
+        """Return the ranking of a photo among the visible ones, by default all."""
+        ranking = self.ranking(photo)
+        if ranking is None:
+            return []
+        everything = np.ones(len(self._locations), dtype=bool)
+        return self._ranked(ranking, everything if visible is None else visible)
+
+    def _levels(
+        self, photo: int, visible: NDArray[np.bool_], spread: float
+    ) -> list[CandidateLevel]:
+        ranking = self.ranking(photo)
+        if ranking is None:
+            return []
+        first = ranking[0][visible[ranking[0]]][:1]
+        return candidate_levels(
+            self._ranked(ranking, visible),
+            self.neighbours(int(first[0]), visible) if len(first) else [],
+            self._scheme,
+            spread,
+            self._radius_m,
+        )
+
+    def _ranked(self, ranking: IndexRanking, visible: NDArray[np.bool_]) -> list[RankedPhoto]:
+        shown = np.flatnonzero(visible[ranking[0]])[:EVIDENCE_DEPTH]
+        return [
+            RankedPhoto(float(ranking[1][rank]), self._locations[ranking[0][rank]])
+            for rank in shown
+        ]
+
+    def _visible(self, photo: int) -> NDArray[np.bool_]:
+        """Return the (n,) mask of the photos that a sample may find."""
+        visible = np.ones(len(self._locations), dtype=bool)
+        visible[photo] = False
+        apart = np.abs(self._seconds - self._seconds[photo])
+        same_session = apart < SAME_SESSION_PERIOD.total_seconds()
+        if (self._at_place(photo) & ~same_session & ~np.isnan(apart)).any():
+            left_out = same_session
+        else:
+            left_out = apart <= BURST_PERIOD.total_seconds()
+        visible[left_out] = False
+        return visible
+
+    def _at_place(self, photo: int) -> NDArray[np.bool_]:
+        near: NDArray[np.bool_] = self._away_m(photo) <= self._radius_m
+        if self._labels and self._labels[0][photo] is not None:
+            near |= self._labels[0] == self._labels[0][photo]
+        return near
+
+    def _kinds(self, photo: int) -> Iterator[tuple[str | None, NDArray[np.bool_]]]:
+        """Yield what is left out of the map, with the (n,) mask of the photos that are missing."""
+        yield None, np.zeros(len(self._locations), dtype=bool)
+        if not self._scheme.labels_are_paths and self._locations[photo].latitude is not None:
+            missing = self._away_m(photo) <= DIFFERENT_PLACE_M
+            yield "position", missing | self._at_place(photo)
+            return
+        for position, labels in enumerate(self._labels):
+            if labels[photo] is not None and (labels != labels[photo]).any():
+                yield f"level {position}", labels == labels[photo]
+
+    def _away_m(self, photo: int) -> NDArray[np.float64]:
+        spot = self._locations[photo]
+        if spot.latitude is None or spot.longitude is None:
+            return np.full(len(self._locations), np.inf)
+        away = distances_m(spot.latitude, spot.longitude, self._latitudes, self._longitudes)
+        return np.where(np.isnan(away), np.inf, away)
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value

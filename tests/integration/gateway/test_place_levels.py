@@ -1,0 +1,108 @@
+"""Levels of an estimate over HTTP: in maps whose labels are paths, and in others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.integration.in_process_api import Service
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+
+PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
+
+
+def ask(service: Service, number: int, map_name: str = "default", **params: Any) -> Any:
+    job_id = service.ask(photo_bytes(number), map_name, **params)
+    service.drain()
+    return service.json("GET", f"/jobs/{job_id}/result", params={"map": map_name})
+
+
+@pytest.fixture
+def tower(service: Service) -> Service:
+    body = {"name": "tower", "place_labels_are_paths": True}
+    assert service.json("POST", "/maps", 201, json=body)["place_labels_are_paths"] is True
+    for number, place in enumerate(PATHS):
+        service.upload(photo_bytes(number), "tower", place=place)
+    service.drain()
+    return service
+
+
+def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
+    tower: Service,
+) -> None:
+    answer = ask(tower, 0, "tower", certainty=0.01)
+    estimate = answer["estimate"]
+    levels = [level["place"] for level in estimate["levels"]]
+    assert levels == ["tower/7/lift", "tower/7", "tower"]
+    probabilities = [level["probability"] for level in estimate["levels"]]
+    assert probabilities == sorted(probabilities)
+    assert estimate["calibration_source"] == "prior"
+    assert (estimate["certainty"], estimate["answer_level"]) == (0.01, 0)
+    assert 0 <= estimate["not_in_map_probability"] <= 1
+    assert (estimate["radius_68_m"], estimate["radius_95_m"]) == (None, None)
+    assert estimate["place"] == "tower/7/lift"
+    assert answer["similar_images"][0]["match_probability"] == probabilities[0]
+    assert ask(tower, 0, "tower")["estimate"]["certainty"] == 0.95
+    assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
+
+
+def test_a_level_filters_photos_below_it_and_an_exact_label_only_its_own(tower: Service) -> None:
+    def found(**params: Any) -> set[str]:
+        images = tower.json("GET", "/search", params={"map": "tower", **params})["images"]
+        similar = ask(tower, 0, "tower", **params)["similar_images"]
+        places = {image["place"] for image in images}
+        assert {image["place"] for image in similar} == places
+        return places
+
+    assert found(place_under="tower/7") == {"tower/7/lift", "tower/7/hall"}
+    assert found(place_under="tower/7/") == {"tower/7/lift", "tower/7/hall"}
+    assert found(place_under="tower") == set(PATHS) - {"a"}
+    assert found(place_under="TOWER") == set()
+    assert found(place="tower") == {"tower"}
+    for level in ("", "/", " / "):
+        answer = tower("GET", "/search", params={"map": "tower", "place_under": level})
+        problem(answer, 422, "invalid_field")
+
+
+def test_labels_are_no_paths_unless_the_map_says_so(service: Service) -> None:
+    for number, place in enumerate(PATHS):
+        service.upload(photo_bytes(number), place=place)
+    service.drain()
+    assert [e["place"] for e in ask(service, 0)["estimate"]["levels"]] == ["tower/7/lift"]
+    for method, path in (("GET", "/search"), ("POST", "/similarity")):
+        files = {"file": ("query.jpg", photo_bytes(0))} if method == "POST" else None
+        answer = service(method, path, params={"place_under": "tower"}, files=files)
+        problem(answer, 422, "invalid_field")
+    body = {"place_labels_are_paths": True}
+    assert service.json("PATCH", "/maps/default", json=body)["place_labels_are_paths"] is True
+    assert len(ask(service, 0)["estimate"]["levels"]) == 3
+
+
+def test_circles_are_the_levels_of_coordinates(service: Service) -> None:
+    service.upload(photo_bytes(0), latitude=45.0, longitude=7.0, place="here")
+    service.upload(photo_bytes(1), latitude=46.0, longitude=7.0)
+    service.drain()
+    estimate = ask(service, 0)["estimate"]
+    assert [level["radius_m"] for level in estimate["levels"]] == [25, 100, 500, 2000]
+    assert {(level["latitude"], level["longitude"]) for level in estimate["levels"]} == {
+        (45.0, 7.0)
+    }
+
+
+def test_a_photo_without_a_location_has_no_levels(service: Service) -> None:
+    service.indexed(0)
+    answer = ask(service, 0)
+    assert answer["estimate"]["levels"] == []
+    assert answer["estimate"]["calibration_source"] is None
+    assert answer["similar_images"][0]["match_probability"] is None
+
+
+@pytest.mark.parametrize("certainty", ["0", "1.01", "-1", "nan", "sure"])
+def test_a_certainty_is_a_share(service: Service, certainty: str) -> None:
+    files = {"file": ("query.jpg", photo_bytes(0))}
+    assert (
+        service("POST", "/similarity", params={"certainty": certainty}, files=files).status_code
+        == 422
+    )

@@ -1,0 +1,266 @@
+"""From a ranking to levels with probabilities: labels as paths, circles, and when to answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from shared.evaluation.calibration import Calibration
+from shared.evaluation.place_evidence import PhotoLocation, RankedPhoto
+from shared.evaluation.place_figures import evaluate_places
+from shared.evaluation.place_levels import CandidateLevel, LevelScheme, candidate_levels
+from shared.evaluation.place_probability import (
+    CERTAINTIES,
+    MIN_LABELLED_QUERIES,
+    PlaceModel,
+    PlaceSample,
+    Thresholds,
+    error_radius_m,
+    fit_place_model,
+    shipped_prior,
+)
+from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.place_paths import is_within_level, label_levels
+
+PATHS = LevelScheme(labels_are_paths=True, radii_m=(25.0, 100.0))
+PLAIN = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0))
+DEGREE_M = 111_195.0
+
+
+def label(place: str | None) -> PhotoLocation:
+    return PhotoLocation(None, None, place)
+
+
+def north(metres: float, place: str | None = None) -> PhotoLocation:
+    return PhotoLocation(45.0 + metres / DEGREE_M, 7.0, place)
+
+
+def ranking(*pairs: tuple[float, PhotoLocation]) -> list[RankedPhoto]:
+    return [RankedPhoto(score, location) for score, location in pairs]
+
+
+def places(ranked: list[RankedPhoto], scheme: LevelScheme = PATHS) -> list[str | None]:
+    return [level.place for level in candidate_levels(ranked, [], scheme, 0.5, 25.0)]
+
+
+# --- labels ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "levels"),
+    [
+        ("tower/floor 7/lift", ("tower/floor 7/lift", "tower/floor 7", "tower")),
+        ("tower", ("tower",)),
+        ("a//b", ("a//b", "a")),
+        ("a/ /b", ("a/ /b", "a")),
+        ("/a/", ("/a",)),
+        ("//", ()),
+        (None, ()),
+    ],
+)
+def test_levels_of_a_path_are_its_prefixes_that_end_in_a_name(
+    text: str | None, levels: tuple[str, ...]
+) -> None:
+    assert label_levels(text, is_path=True) == levels
+
+
+def test_a_label_that_is_no_path_is_its_only_level() -> None:
+    assert label_levels("a/b", is_path=False) == ("a/b",)
+
+
+def test_every_label_lies_within_its_levels_and_not_within_names_that_begin_alike() -> None:
+    for text in ("a", "a//b", "/a/b/", "a/ /b"):
+        assert all(is_within_level(text, level) for level in label_levels(text, is_path=True))
+    assert not is_within_level("tower/floor 70", "tower/floor 7")
+
+
+def test_each_level_lies_inside_the_coarser_one() -> None:
+    ranked = ranking((0.9, label("b/1/x")), (0.88, label("a/1/x")), (0.87, label("a/1/x")))
+    assert places(ranked) == ["a/1/x", "a/1", "a"]
+
+
+def test_an_estimate_ends_where_most_labels_end() -> None:
+    ranked = ranking((0.9, label("a/1")), (0.9, label("a/1")), (0.9, label("a/1/x")))
+    assert places(ranked) == ["a/1", "a"]
+    assert places(ranked[:1] + ranked[2:] * 2) == ["a/1/x", "a/1", "a"]
+
+
+def test_labels_with_slashes_are_whole_labels_in_other_maps() -> None:
+    ranked = ranking((0.9, label("a/1/x")), (0.5, label("a/1/y")))
+    assert places(ranked, PLAIN) == ["a/1/x"]
+
+
+def test_photos_without_labels_have_no_vote_and_no_level() -> None:
+    assert places(ranking((0.9, label(None)), (0.1, label("a")))) == ["a"]
+    assert places(ranking((0.9, label(None)), (0.8, label("//")))) == []
+    assert candidate_levels([], [], PATHS, 0.5, 25.0) == []
+
+
+def test_labels_decide_in_a_map_of_paths_and_coordinates_in_others() -> None:
+    """The label and the coordinates of these photos disagree: they are 5 km apart."""
+    ranked = ranking((0.9, north(0, "a/x")), (0.8, north(5000, "a/x")))
+    assert places(ranked) == ["a/x", "a"]
+    circles = candidate_levels(ranked, [], PLAIN, 0.5, 25.0)
+    assert [level.radius_m for level in circles] == [25.0, 100.0]
+    assert circles[0].contains(north(10))
+    assert not circles[0].contains(north(5000, "a/x"))
+
+
+def test_a_truth_that_is_coarser_than_a_level_does_not_judge_it() -> None:
+    level = CandidateLevel(place="a/1/x", is_path=True)
+    truths = ("a/1/x", "a/1/x/shelf", "a/1/y", "a/1", "b", None, "//")
+    assert [level.is_right(label(truth)) for truth in truths] == [
+        True, True, False, None, False, None, None,
+    ]  # fmt: skip
+    circle = CandidateLevel(latitude=45.0, longitude=7.0, radius_m=25.0)
+    truths_m = [circle.is_right(spot) for spot in (north(20), north(30), label("a"))]
+    assert truths_m == [True, False, None]
+
+
+def test_thousands_of_labels_have_their_levels() -> None:
+    ranked = ranking(*((1 - n / 1e4, label(f"a/{n % 7}/{n}")) for n in range(5000)))
+    assert places(ranked)[-1] == "a"
+
+
+# --- probabilities ---------------------------------------------------------------------------
+
+
+def test_without_an_evaluation_the_prior_says_how_sure_a_clear_and_an_unclear_ranking_are() -> None:
+    clear = ranking(
+        *((0.9 - n / 100, label("a/1/x")) for n in range(10)),
+        *((0.1, label("b/1/x")) for _ in range(40)),
+    )
+    unclear = ranking(*((0.3 - n / 1e3, label(f"{n}/1/x")) for n in range(50)))
+    sure, unsure = (PlaceModel().estimate(r, r[1:], PATHS, 0.95, 25.0) for r in (clear, unclear))
+    assert sure is not None
+    assert unsure is not None
+    assert sure.probabilities[0] > 0.8 > 0.6 > unsure.probabilities[0]
+    assert sure.not_in_map < unsure.not_in_map
+    assert unsure.answer is None
+
+
+def test_a_level_is_never_less_probable_than_a_finer_one() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        names = [f"{a}/{b}/{c}" for a, b, c in rng.integers(0, 3, (50, 3))]
+        scores = np.sort(rng.random(50))[::-1]
+        ranked = ranking(*zip(scores.tolist(), map(label, names), strict=True))
+        estimate = PlaceModel().estimate(ranked, ranked[1:], PATHS, 0.9, 25.0)
+        assert estimate is not None
+        assert list(estimate.probabilities) == sorted(estimate.probabilities)
+        assert estimate.probabilities[0] + estimate.not_in_map <= 1 + 1e-12
+        inside = [estimate.levels[0].contains(r.location) for r in ranked]
+        others = [p for p, i in zip(estimate.match_probabilities, inside, strict=True) if not i]
+        assert sum(others) + estimate.probabilities[0] + estimate.not_in_map <= 1 + 1e-9
+
+
+def test_the_error_radius_lies_between_the_levels_that_enclose_its_share() -> None:
+    circles = [CandidateLevel(latitude=45.0, longitude=7.0, radius_m=r) for r in (25.0, 100.0)]
+    assert error_radius_m(circles, [0.5, 0.9], 0.68) == pytest.approx(25 + 75 * 0.18 / 0.4)
+    assert error_radius_m(circles, [0.8, 0.9], 0.68) == pytest.approx(25 * 0.68 / 0.8)
+    assert error_radius_m(circles, [0.5, 0.9], 0.95) is None
+    assert error_radius_m([CandidateLevel(place="a")], [0.99], 0.68) is None
+
+
+def test_an_answer_is_the_finest_level_over_its_threshold_and_under_the_limit() -> None:
+    at_95 = Thresholds(not_in_map=0.2, levels=(0.9, None))
+    model = PlaceModel(thresholds=(at_95,) * len(CERTAINTIES))
+    assert model.answer([0.91, 0.96], 0.1, 0.95) == 0
+    assert model.answer([0.91, 0.96], 0.3, 0.95) == 1  # probably not in the map
+    assert model.answer([0.5, 0.96], 0.1, 0.95) == 1
+    assert model.answer([0.5, 0.94], 0.1, 0.95) is None  # no threshold: the certainty is one
+    assert model.answer([0.91, 0.96], 0.1, 1.0) is None  # beyond the stored certainties
+
+
+def test_a_model_of_other_levels_is_not_used() -> None:
+    model = PlaceModel(source="own_photos", scheme=PATHS)
+    assert model.for_scheme(PATHS) is model
+    assert model.for_scheme(PLAIN).source == "prior"
+
+
+# --- fits ------------------------------------------------------------------------------------
+
+
+def sampler(places: int, per_place: int, noise: float, seed: int = 0) -> OwnPhotoSampler:
+    """A map of places on floors, whose photos are points around a centre for each place."""
+    rng = np.random.default_rng(seed)
+    centres = rng.normal(size=(places, 16))
+    rows = np.repeat(centres, per_place, 0) + noise * rng.normal(size=(places * per_place, 16))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    scores = rows @ rows.T
+    locations = [label(f"house/{n % 5}/{n}") for n in range(places) for _ in range(per_place)]
+
+    def rank(photo: int) -> IndexRanking:
+        order = np.argsort(-scores[photo], kind="stable")
+        order = order[order != photo]
+        return order, scores[photo][order]
+
+    return OwnPhotoSampler(locations, [None] * len(locations), PATHS, 25.0, rank)
+
+
+def own_samples(places: int = 40, per_place: int = 5, noise: float = 1.0) -> list[PlaceSample]:
+    own = sampler(places, per_place, noise)
+    photos = range(places * per_place)
+    return list(own.samples(photos, own.spread(photos)))
+
+
+def test_probabilities_of_held_out_photos_are_those_that_are_observed() -> None:
+    evaluation = evaluate_places(own_samples(), [], PATHS, 0.5)
+    assert evaluation.figures is not None
+    assert evaluation.model.source == "own_photos"
+    for level in evaluation.figures["levels"]:
+        assert level["calibration_error"] < 0.1
+        assert level["samples"] == 200
+
+
+def test_the_answers_at_a_certainty_are_right_and_few_impostors_get_one() -> None:
+    evaluation = evaluate_places(own_samples(), [], PATHS, 0.5)
+    assert evaluation.figures is not None
+    shares = []
+    for answers in evaluation.figures["answers"]:
+        shares.append(answers["answered"]["mean"])
+        if shares[-1] > 0.1:
+            assert answers["precision"]["mean"] >= answers["certainty"] - 0.05
+        assert answers["impostors_at_finest_level"] <= 1 - answers["certainty"] + 0.02
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.3
+
+
+def test_a_map_of_few_photos_keeps_the_prior_and_a_small_one_stays_near_it() -> None:
+    few = [s for s in own_samples() if s.photo < 19]
+    assert fit_place_model(few, [], PATHS, 0.5).model == PlaceModel()
+    small = fit_place_model([s for s in own_samples() if s.photo < 30], [], PATHS, 0.5).model
+    large = fit_place_model(own_samples(), [], PATHS, 0.5).model
+    assert (small.own_photos, large.own_photos) == (30, 200)
+
+    def change(model: PlaceModel) -> float:
+        return float(np.linalg.norm(np.array(model.levels[0]) - shipped_prior().level))
+
+    assert change(small) < change(large)
+
+
+def test_labelled_queries_refine_the_model() -> None:
+    """Half of the queries that look certain are wrong: the own photos did not say so."""
+    samples = own_samples(noise=0.3)
+    own = [s for s in samples if s.left_out is None][: MIN_LABELLED_QUERIES + 20]
+    wrong = [PlaceSample(n, s.levels, [bool(n % 2)] * len(s.levels)) for n, s in enumerate(own)]
+    fitted = fit_place_model(samples, wrong, PATHS, 0.5)
+    assert fitted.model.source == "labelled_queries"
+    before = fit_place_model(samples, [], PATHS, 0.5).model
+    sure = [before.probabilities(s.levels)[0][0] for s in own]
+    refined = [fitted.model.probabilities(s.levels)[0][0] for s in own]
+    assert np.mean(sure) > 0.9
+    assert abs(np.mean(refined) - 0.5) < abs(np.mean(sure) - 0.5)
+    too_few = fit_place_model(samples, wrong[: MIN_LABELLED_QUERIES - 1], PATHS, 0.5)
+    assert too_few.model == before
+
+
+def test_a_calibration_of_an_earlier_release_has_no_probabilities() -> None:
+    stored = {
+        "radius_m": 25.0, "support_threshold": 0.1, "impostors": 30, "labelled_queries": 0,
+        "confidence": None,
+    }  # fmt: skip
+    assert Calibration.model_validate(stored).places is None
+    model = fit_place_model(own_samples(), [], PATHS, 0.5).model
+    calibration = Calibration.model_validate({**stored, "places": model.model_dump(mode="json")})
+    assert calibration.places == model
