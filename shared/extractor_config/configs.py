@@ -206,8 +206,8 @@ EXTRACTOR_CONFIGS = {
 def get_extractor_config(name: str, *, allow_test_extractors: bool) -> ExtractorConfig:
     """Parse an extractor name with options into its configuration.
 
-    Whether a torch.hub entry may be loaded is up to `Settings.extractor_config`; whether a trained model was
-    added, up to the catalog.
+    Whether a torch.hub entry may be loaded is up to `Settings.extractor_config`; whether a trained
+    model was added, up to the catalog.
 
     Returns:
         The configuration; its `name` is the canonical one.
