@@ -381,13 +381,11 @@ def test_bench_prints_figures_and_leaves_the_folder_alone(tmp_path: Path) -> Non
     bench = CommandLine(tmp_path, home)(
         "bench", "spine", "--photos", "4", "--queries", "2", "--json"
     )
-    figures = bench.json()
-    assert figures["photos"] == 4
-    assert figures["searchable_after_seconds"] > 0
-    assert len(figures["timings"]) == 3
-    for name, timing in figures["timings"].items():
-        assert 0 < timing["median_ms"] <= timing["p95_ms"], name
-        assert timing["per_second"] > 0, name
+    figures = {figure["what"]: figure["measured"] for figure in bench.json()["figures"]}
+    assert figures["4 photos searchable after"] > 0
+    for name in ("upload, 4 clients", "query by stored photo", "query by new photo"):
+        assert 0 < figures[f"{name}, p50"] <= figures[f"{name}, p95"] <= figures[f"{name}, worst"]
+        assert figures[f"{name}, rate"] > 0
     assert not home.exists()
 
 
