@@ -24,7 +24,6 @@ from services.cli.evaluation.describers import extractor_describer
 from services.cli.output import console
 from shared.datasets.open_dataset import (
     EvaluationSet,
-    evaluation_set_names,
     open_evaluation_set,
 )
 from shared.evaluation.place_evidence import PhotoLocation
@@ -119,7 +118,7 @@ def main(folders: Sequence[Path]) -> None:
     """Describe and sample the cities, and write the prior."""
     samples: list[PlaceSample] = []
     for number, folder in enumerate(folders):
-        city = open_evaluation_set(folder, evaluation_set_names(folder)[0])
+        city = open_evaluation_set(folder)
         photos = [photo.path for photo in city.database]
         sampled = sample_city(photos, _describe(city, photos))
         samples += sampled

@@ -208,7 +208,7 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     house.wait_for(31)
     assert house.call("GET", "/readyz").status_code == 200
     assert not house.died.is_set(), "a part ended"
-    for part in ("steward", "extractor", "steward's evaluate and word_weights worker"):
+    for part in ("steward", "worker extractor", "worker evaluator"):
         messages = [r.message for r in caplog.records if f"the {part} waits" in r.message]
         assert len(messages) == 1, f"once per outage: {messages}"
 
