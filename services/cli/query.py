@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
+from rich.progress_bar import ProgressBar
 from rich.table import Column, Table
 
-from placewise.answers import Estimate, Explanation
+from placewise.answers import Estimate, EstimateLevel, Explanation
 from services.cli.client import connect
 from services.cli.output import (
     JsonOption,
@@ -22,6 +24,12 @@ from services.cli.output import (
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 
 MAX_CLUSTERS_SHOWN = 3  # per explanation
+BAR_WIDTH = 20  # characters
+CALIBRATION_SOURCES = {
+    "prior": "on generated maps; `placewise evaluate` fits them to this map",
+    "own_photos": "on photos of this map",
+    "labelled_queries": "on labelled queries",
+}
 
 
 def query(
@@ -64,6 +72,14 @@ def query(
             help="Show which image parts make each result similar. --json includes the overlays."
         ),
     ] = False,
+    certainty: Annotated[
+        float | None,
+        typer.Option(
+            max=1,
+            help="Share of the answers that must be right, above 0: the estimate answers at the "
+            "finest level that is certain enough. Default: the server's CERTAINTY.",
+        ),
+    ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -85,14 +101,17 @@ def query(
                 place=place,
                 tags=tags,
                 word_weights=None if word_weights else False,
+                certainty=certainty,
             )
         if as_json:
             print_json(answer)
             return
         weighted = answer.word_weights == "applied"
+        levels = answer.estimate.levels
         table = Table(
             "rank",
             Column("score", no_wrap=True),
+            *([Column("match", justify="right", no_wrap=True)] if levels else []),
             *([Column("weighted", no_wrap=True)] if weighted else []),
             *([Column("reranked", no_wrap=True)] if rerank else []),
             Column("photo", overflow="fold"),
@@ -105,16 +124,21 @@ def query(
             table.add_row(
                 str(rank),
                 f"{match.similarity_score:.4f}",
+                *([_format_percent(match.match_probability)] if levels else []),
                 *([_format_score(match.weighted_score)] if weighted else []),
                 *([_format_score(match.rerank_score)] if rerank else []),
-                match.original_filename,
+                escape(match.original_filename),
                 _format_degrees(match.latitude),
                 _format_degrees(match.longitude),
-                match.place or "",
+                escape(match.place or ""),
                 *([_format_explanation(match.explanation)] if explain else []),
             )
         console.print(table)
-        console.print(_format_estimate(answer.estimate), soft_wrap=True)
+        if levels:
+            console.print(_summarize_levels(answer.estimate), soft_wrap=True, markup=False)
+            console.print(_levels_table(answer.estimate))
+        else:
+            console.print(_format_estimate(answer.estimate), soft_wrap=True, markup=False)
         console.print(
             f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
             f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}",
@@ -136,8 +160,75 @@ def _format_explanation(explanation: Explanation | None) -> str:
     return ", ".join(f"cluster {item.cluster}: {item.share:+.4f}" for item in top)
 
 
+def _summarize_levels(estimate: Estimate) -> str:
+    """Why the estimate answers at its level, or does not answer, in one sentence."""
+    required = f"{100 * (estimate.certainty or 0):g} %"
+    if estimate.answer_level is not None:
+        level = estimate.levels[estimate.answer_level]
+        return (
+            f"At a certainty of {required}, the finest answer is {_format_level(level)}, "
+            f"with a probability of {_format_percent(level.probability)}."
+        )
+    outside = estimate.not_in_map_probability or 0
+    if outside > 0.5:
+        return f"The map probably has no photo of this place ({_format_percent(outside)})."
+    level = estimate.levels[-1]
+    return (
+        f"No level is certain enough at a certainty of {required}; the most probable is "
+        f"{_format_level(level)}, with {_format_percent(level.probability)}."
+    )
+
+
+def _levels_table(estimate: Estimate) -> Table:
+    """Probabilities of the levels and of "not in this map", at most 80 columns wide."""
+    radii = (("68", estimate.radius_68_m), ("95", estimate.radius_95_m))
+    rings = ", ".join(f"{share} % within {_format_m(m)}" for share, m in radii if m is not None)
+    source = str(estimate.calibration_source)
+    table = Table(
+        Column("level", overflow="fold"),
+        Column("probability", justify="right", no_wrap=True),
+        Column("", width=BAR_WIDTH),
+        caption=f"{f'Position: {rings}. ' if rings else ''}Probabilities were fitted "
+        f"{CALIBRATION_SOURCES.get(source, f'on {source}')}.",
+    )
+    for level in estimate.levels:
+        name = level.place or f"within {_format_m(level.radius_m or 0)}"
+        table.add_row(
+            escape(name), _format_percent(level.probability), _probability_bar(level.probability)
+        )
+    outside = estimate.not_in_map_probability
+    table.add_section()
+    table.add_row("not in this map", _format_percent(outside), _probability_bar(outside or 0))
+    return table
+
+
+def _probability_bar(probability: float) -> ProgressBar:
+    return ProgressBar(
+        total=1,
+        completed=probability,
+        width=BAR_WIDTH,
+        complete_style="green",
+        finished_style="green",
+    )
+
+
+def _format_level(level: EstimateLevel) -> str:
+    if level.place is not None:
+        return level.place
+    position = f"{_format_degrees(level.latitude)}, {_format_degrees(level.longitude)}"
+    return f"within {_format_m(level.radius_m or 0)} of {position}"
+
+
+def _format_m(length_m: float) -> str:
+    return f"{length_m:.0f} m" if length_m < 999.5 else f"{round(length_m / 1000, 1):g} km"
+
+
+def _format_percent(probability: float | None) -> str:
+    return "" if probability is None else f"{100 * probability:.1f} %"
+
+
 def _format_estimate(estimate: Estimate) -> str:
-    """The estimate in one line."""
+    """The estimate without levels, in one line."""
     if estimate.in_map is False:
         return estimate.reason
     parts = [estimate.place] if estimate.place else []

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Town, Visitor
-
-TITLES = {True: "In this map", False: "Not in this map", None: "Best guess"}
 
 
 def ask(visitor: Visitor, photo: Path) -> Page:
@@ -19,26 +18,128 @@ def ask(visitor: Visitor, photo: Path) -> Page:
     return page
 
 
+def percent(probability: float) -> str:
+    return f"{100 * probability:.1f} %"
+
+
 @pytest.mark.parametrize("number", range(4))
-def test_the_page_says_where_a_photo_was_taken_or_that_it_is_not_in_the_map(
+def test_each_level_and_each_match_has_its_probability(
     visitor: Visitor, town: Town, number: int
 ) -> None:
     photo = town.queries[number]
     found = town.ask(photo)
     page = ask(visitor, photo)
-    estimate = found["estimate"]
-    expect(page.locator(".badge")).to_have_text(TITLES[estimate["in_map"]])
-    expect(page.locator(".match")).to_have_count(len(found["similar_images"]))
-    first = page.locator(".match").first
-    expect(first.locator(".figure")).to_have_text(
-        f"{found['similar_images'][0]['similarity_score']:.3f}"
+    estimate, matches = found["estimate"], found["similar_images"]
+    probabilities = [level["probability"] for level in estimate["levels"]]
+    rows = page.locator(".levels li")
+    expect(rows.locator(".level")).to_have_text(
+        ["Within 25 m", "Within 100 m", "Within 500 m", "Within 2 km", "Not in this map"]
     )
-    expect(page.locator(".number-pin")).to_have_count(len(found["similar_images"]))
-    circles = 0 if estimate["latitude"] is None else 1
-    expect(page.locator("path.estimate")).to_have_count(circles)
-    if circles:
-        expect(page.locator(".verdict .where")).to_contain_text(f"{estimate['latitude']:.5f}")
-        expect(page.locator(".verdict .radius")).to_contain_text(f"{estimate['radius_m']:.0f} m")
+    shown = [*probabilities, estimate["not_in_map_probability"]]
+    expect(rows.locator(".figure")).to_have_text([percent(each) for each in shown])
+    values = rows.locator("meter").evaluate_all("meters => meters.map(meter => meter.value)")
+    assert values == pytest.approx(shown)
+    expect(page.get_by_role("meter", name="Probability: Within 25 m")).to_be_visible()
+    expect(page.locator(".match")).to_have_count(len(matches))
+    expect(page.locator(".match .figure")).to_have_text(
+        [percent(match["match_probability"]) for match in matches]
+    )
+    expect(page.locator(".match").first).to_contain_text(
+        f"similarity {matches[0]['similarity_score']:.3f}"
+    )
+    expect(page.locator(".number-pin")).to_have_count(len(matches))
+    for share in (68, 95):
+        ring = estimate[f"radius_{share}_m"]
+        expect(page.locator(f"path.ring-{share}")).to_have_count(0 if ring is None else 1)
+        expect(page.locator(f".rings .ring-{share}")).to_have_count(0 if ring is None else 1)
+
+
+CENTER = {"latitude": 45.07, "longitude": 7.68}
+CIRCLES = [
+    {**CENTER, "place": None, "radius_m": 25, "probability": 0.51},
+    {**CENTER, "place": None, "radius_m": 100, "probability": 0.97},
+]
+UNPLACED = {"latitude": None, "longitude": None, "radius_m": None}
+PATHS = [
+    {**UNPLACED, "place": "tower/floor 7/elevator", "probability": 0.61},
+    {**UNPLACED, "place": "tower/floor 7", "probability": 0.97},
+]
+
+
+FINEST = "At a certainty of 95 %, the finest answer is"
+NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most probable is"
+
+
+@pytest.mark.parametrize(
+    ("levels", "answer", "outside", "title", "place", "reason"),
+    [
+        (
+            CIRCLES,
+            1,
+            0.02,
+            "In this map",
+            "45.07000, 7.68000 ± 100 m",
+            f"{FINEST} a radius of 100 m, with a probability of 97.0 %.",
+        ),
+        (
+            PATHS,
+            1,
+            0.02,
+            "In this map",
+            "tower/floor 7",
+            f"{FINEST} “tower/floor 7”, with a probability of 97.0 %.",
+        ),
+        (
+            PATHS,
+            None,
+            0.2,
+            "Best guess",
+            "tower/floor 7/elevator",
+            f"{NONE_CERTAIN} “tower/floor 7”, with 97.0 %.",
+        ),
+        (
+            CIRCLES,
+            None,
+            0.62,
+            "Not in this map",
+            None,
+            "The map probably has no photo of this place (62.0 %).",
+        ),
+    ],
+    ids=["circle", "path", "no certain level", "not in the map"],
+)
+def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
+    visitor: Visitor,
+    town: Town,
+    levels: list[dict[str, Any]],
+    answer: int | None,
+    outside: float,
+    title: str,
+    place: str | None,
+    reason: str,
+) -> None:
+    found = town.ask(town.queries[0])
+    found["estimate"] |= {
+        "in_map": False,
+        "latitude": None,
+        "levels": levels,
+        "answer_level": answer,
+        "not_in_map_probability": outside,
+        "radius_68_m": 42.4 if levels is CIRCLES else None,
+        "radius_95_m": None,
+    }
+    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
+    page = ask(visitor, town.queries[0])
+    expect(page.locator(".badge")).to_have_text(title)
+    expect(page.locator(".verdict .place")).to_have_text([place] if place else [])
+    expect(page.locator(".reason")).to_have_text(reason)
+    names = [level["place"] or f"Within {level['radius_m']} m" for level in levels]
+    chosen = [] if answer is None else [names[answer]]
+    expect(page.locator(".levels .chosen .level")).to_have_text(chosen)
+    rings = ["68 %: within 42 m"] if levels is CIRCLES else []
+    expect(page.locator(".rings li")).to_have_text(rings)
+    expect(page.locator("path.ring-68")).to_have_count(len(rings))
+    expect(page.locator("path.ring-95, path.estimate")).to_have_count(0)
 
 
 def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:

@@ -11,6 +11,9 @@ export function bytes(number) {
   return `${(number / 1000 ** power).toFixed(power && number / 1000 ** power < 100 ? 1 : 0)} ${units[power]}`;
 }
 
+/** A length, short: 25 m, 2 km, 1.5 km. */
+export const metres = (length) => (length < 999.5 ? `${Math.round(length)} m` : `${Number((length / 1000).toFixed(1))} km`);
+
 /** Degrees to the decimetre or so. */
 export const degrees = (latitude, longitude) => `${latitude.toFixed(5)}, ${longitude.toFixed(5)}`;
 

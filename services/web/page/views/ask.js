@@ -3,9 +3,10 @@
 import { Problem, ask, currentMap, get, idempotencyKey } from "../api.js";
 import { bar, button, fill, h, noteError, say } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
-import { count, degrees, percent, plural, score, whereabouts } from "../format.js";
+import { percent, plural, score, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 import { original, thumbnail } from "../photo.js";
+import { drawRings, verdict } from "./verdict.js";
 
 const TOP_K = 12;
 const NEWEST = 14;
@@ -145,7 +146,7 @@ async function showAnswer(answer, asked, signal) {
 async function drawAnswer(openMap, ground, found, open, signal) {
   const map = await openMap(ground, "Where the matches were taken", { signal });
   const { estimate, similar_images: photos } = found;
-  if (estimate.latitude !== null) map.circle(estimate.latitude, estimate.longitude, estimate.radius_m, "estimate");
+  drawRings(map, estimate);
   // From the last to the first, so that the best lies on top.
   photos.map((photo, index) => ({ photo, index })).reverse().forEach(({ photo, index }) => {
     if (photo.latitude !== null) map.numbered(photo.latitude, photo.longitude, index + 1, `${index + 1}: ${photo.original_filename}`, () => open(index));
@@ -153,40 +154,15 @@ async function drawAnswer(openMap, ground, found, open, signal) {
   map.fit();
 }
 
-function verdict(found) {
-  const { estimate } = found;
-  const [kind, title] = { true: ["known", "In this map"], false: ["unknown", "Not in this map"] }[estimate.in_map] ?? ["open", "Best guess"];
-  const place = [
-    estimate.place && h("p", { class: "place" }, estimate.place),
-    estimate.latitude !== null && h("p", { class: estimate.place ? "where" : "place where" }, degrees(estimate.latitude, estimate.longitude), h("span", { class: "radius" }, ` ± ${Math.round(estimate.radius_m)} m`)),
-  ];
-  const unsure = {
-    true: ["How sure this is can’t be said yet: ", h("a", { href: "#/add" }, "add labelled queries"), " of another day."],
-    false: ["The photos below are the nearest that the map has."],
-  }[estimate.in_map] ?? ["Whether it is in the map can’t be told yet: ", h("a", { href: "#/model" }, "measure the map"), "."];
-  const sure = estimate.confidence === null
-    ? h("p", { class: "soft" }, unsure)
-    : h("div", { class: "sure" }, h("span", { class: "figure" }, percent(estimate.confidence)), h("span", { class: "soft" }, " sure"), h("meter", { min: 0, max: 1, value: estimate.confidence, "aria-label": "Confidence" }));
-  return h("div", { class: `verdict ${kind}` },
-    h("p", { class: "badge" }, title),
-    place, sure,
-    h("details", {}, h("summary", {}, "Why"),
-      h("p", {}, estimate.reason),
-      h("dl", { class: "facts" },
-        h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
-        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity of the words that this map trusts" : "similarity"),
-        h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
-        h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
-    found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
-    found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
-}
-
 function matchCard(photo, index, onclick) {
-  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}, similarity ${score(photo.similarity_score)}: ${photo.original_filename}` },
+  const probability = photo.match_probability === null ? "" : `${percent(photo.match_probability)} the same place, `;
+  const cosine = score(photo.similarity_score);
+  const where = photo.place && photo.latitude === null ? photo.original_filename : whereabouts({ ...photo, place: null });
+  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}, ${probability}similarity ${cosine}: ${photo.original_filename}` },
     thumbnail(photo, ""),
     h("span", { class: "rank", "aria-hidden": "true" }, String(index + 1)),
     h("span", { class: "match-words" },
       h("span", { class: "match-name" }, photo.place ?? photo.original_filename),
-      h("span", { class: "figure" }, score(photo.similarity_score))),
-    h("span", { class: "soft match-where" }, photo.place && photo.latitude === null ? photo.original_filename : whereabouts({ ...photo, place: null })));
+      h("span", { class: "figure", title: "Probability of the same place" }, percent(photo.match_probability))),
+    h("span", { class: "soft match-where" }, `similarity ${cosine} · ${where}`));
 }

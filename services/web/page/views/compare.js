@@ -2,7 +2,7 @@
 
 import { Problem } from "../api.js";
 import { fill, h, openDialog } from "../dom.js";
-import { score, whereabouts } from "../format.js";
+import { percent, score, whereabouts } from "../format.js";
 import { original } from "../photo.js";
 
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
@@ -27,7 +27,9 @@ export function compare(asked, photos, index, signal) {
       h("figure", {}, h("div", { class: "frame" }, asked.picture(), overlay), h("figcaption", {}, asked.name)),
       h("figure", {}, h("div", { class: "frame" }, original(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename), h("span", { class: "soft" }, ` ${whereabouts(photo)}`))),
       h("div", { class: "compare-words" },
-        h("p", {}, h("span", { class: "figure large" }, score(photo.similarity_score)), h("span", { class: "soft" }, " cosine similarity")),
+        h("div", {},
+          photo.match_probability !== null && h("p", {}, h("span", { class: "figure large" }, percent(photo.match_probability)), h("span", { class: "soft" }, " the same place")),
+          h("p", {}, h("span", { class: "figure" }, score(photo.similarity_score)), h("span", { class: "soft" }, " cosine similarity"))),
         why,
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),

@@ -1,0 +1,91 @@
+// The place estimate in words, bars and rings.
+
+import { h } from "../dom.js";
+import { count, degrees, metres, percent } from "../format.js";
+
+const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
+
+/** The card with the estimate of a similarity search. */
+export function verdict(found) {
+  const { estimate } = found;
+  const { levels } = estimate;
+  const [kind, title] = judge(estimate);
+  return h("div", { class: `verdict ${kind}` },
+    h("p", { class: "badge" }, title),
+    kind === "unknown" ? null : whereabouts(levels[estimate.answer_level ?? 0] ?? estimate),
+    h("p", { class: "reason" }, reason(estimate)),
+    levels.length > 0 && levelBars(estimate),
+    ringsInWords(estimate),
+    source(estimate),
+    h("details", {}, h("summary", {}, "Details"),
+      h("dl", { class: "facts" },
+        estimate.confidence !== null && [h("dt", {}, "Confidence"), h("dd", {}, percent(estimate.confidence))],
+        h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
+        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity of the words that this map trusts" : "similarity"),
+        h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
+        h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
+    found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
+    found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
+}
+
+/** Draw the circles that contain the true position with 95 % and 68 %; where the levels are labels, the estimated position. */
+export function drawRings(map, estimate) {
+  const { levels: [finest], latitude, longitude, radius_m: radiusM } = estimate;
+  if (!finest?.radius_m && latitude !== null) map.circle(latitude, longitude, radiusM, "estimate");
+  for (const [, radius, kind] of RINGS) {
+    if (estimate[radius] !== null) map.circle(finest.latitude, finest.longitude, estimate[radius], kind);
+  }
+}
+
+/** The style and the title of the card. */
+function judge({ levels, answer_level: answer, not_in_map_probability: outside, in_map: accepted }) {
+  if (levels.length ? answer !== null : accepted) return ["known", "In this map"];
+  return (levels.length ? outside > 0.5 : accepted === false) ? ["unknown", "Not in this map"] : ["open", "Best guess"];
+}
+
+function whereabouts({ place, latitude, longitude, radius_m: radius }) {
+  return [
+    place && h("p", { class: "place" }, place),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${metres(radius)}`)),
+  ];
+}
+
+/** Why the estimate answers at its level, or does not answer: one sentence. */
+function reason({ levels, answer_level: answer, certainty, not_in_map_probability: outside, reason: withoutLevels }) {
+  if (!levels.length) return withoutLevels;
+  const required = `${Number((100 * certainty).toFixed(1))} %`;
+  if (answer !== null) return `At a certainty of ${required}, the finest answer is ${quoted(levels[answer])}, with a probability of ${percent(levels[answer].probability)}.`;
+  if (outside > 0.5) return `The map probably has no photo of this place (${percent(outside)}).`;
+  const coarsest = levels.at(-1);
+  return `No level is certain enough at a certainty of ${required}; the most probable is ${quoted(coarsest)}, with ${percent(coarsest.probability)}.`;
+}
+
+const named = (level) => level.place ?? `Within ${metres(level.radius_m)}`;
+const quoted = (level) => (level.place ? `“${level.place}”` : `a radius of ${metres(level.radius_m)}`);
+
+/** A bar for each level, and one for "not in this map". */
+function levelBars({ levels, answer_level: answer, not_in_map_probability: outside }) {
+  const row = (name, probability, kind) => h("li", { class: kind },
+    h("span", { class: "level" }, name),
+    h("span", { class: "figure" }, percent(probability)),
+    h("meter", { min: 0, max: 1, value: probability, "aria-label": `Probability: ${name}` }));
+  return h("ul", { class: "levels", "aria-label": "Levels, finest first" },
+    levels.map((level, index) => row(named(level), level.probability, index === answer ? "chosen" : null)),
+    row("Not in this map", outside, "outside"));
+}
+
+function ringsInWords(estimate) {
+  const rings = RINGS.filter(([, radius]) => estimate[radius] !== null)
+    .map(([share, radius, kind]) => h("li", {}, h("span", { class: `swatch ${kind}` }), `${100 * share} %: within ${metres(estimate[radius])}`));
+  return rings.length > 0 && h("ul", { class: "rings", "aria-label": "Rings on the map" }, rings.reverse());
+}
+
+/** What the probabilities were fitted on, and how they become better. */
+function source({ calibration_source: fitted }) {
+  const words = {
+    prior: ["These probabilities come from generated maps. ", h("a", { href: "#/model" }, "Measure the map"), " to fit them to its photos."],
+    own_photos: ["These probabilities were fitted on the map’s own photos. ", h("a", { href: "#/add" }, "Add labelled queries"), " of another day to correct them."],
+    labelled_queries: ["These probabilities were fitted on labelled queries."],
+  }[fitted];
+  return words && h("p", { class: "soft" }, words);
+}

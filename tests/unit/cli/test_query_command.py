@@ -1,0 +1,140 @@
+"""`placewise query`: the levels of an estimate as a table that fits into 80 columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from services.cli.query import query as query_command
+from tests.support.api_responses import PHOTO, SIMILAR
+from tests.unit.client.test_client import FakeServer, running_server
+
+PLACES = [
+    {"place": "tower/floor 7 [east]/elevator", "probability": 0.614},
+    {"place": "tower/floor 7 [east]", "probability": 0.972},
+    {"place": "tower", "probability": 1},
+]
+CIRCLES = [
+    {"latitude": 45.0, "longitude": 7.0, "radius_m": radius_m, "probability": probability}
+    for radius_m, probability in ((25, 0.5), (100, 0.75), (500, 0.9), (2000, 0.96))
+]
+
+app = typer.Typer()
+app.command()(query_command)
+
+
+def estimate(levels: list[dict[str, Any]], **fields: Any) -> dict[str, Any]:
+    return {
+        "reason": "Not known yet.",
+        "levels": levels,
+        "answer_level": None,
+        "certainty": 0.95,
+        "not_in_map_probability": 0.02,
+        "calibration_source": "own_photos",
+        **fields,
+    }
+
+
+def query(folder: Path, answer: dict[str, Any], *options: str, **photo: Any) -> tuple[str, str]:
+    """The output of the command for an answer of the server, and the path of its request."""
+    (folder / "where.jpg").write_bytes(b"photo")
+    match = {**PHOTO, "similarity_score": 0.8, **photo}
+    server: FakeServer
+    with running_server() as server:
+        server.will_answer(200, {**SIMILAR, "similar_images": [match], "estimate": answer})
+        shown = CliRunner().invoke(
+            app, [str(folder / "where.jpg"), "--server", server.url, *options]
+        )
+    assert shown.exit_code == 0, shown.output
+    return shown.stdout, server.asked[0][1]
+
+
+def bars(output: str) -> list[int]:
+    """Lengths of the bars, in characters."""
+    return [line.count("━") + line.count("╸") for line in output.splitlines() if " % │" in line]
+
+
+def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Path) -> None:
+    shown, _ = query(
+        tmp_path,
+        estimate(PLACES, answer_level=1),
+        match_probability=0.614,
+        original_filename="a[/b].jpg",
+    )
+    lines = shown.splitlines()
+    assert (
+        "At a certainty of 95 %, the finest answer is tower/floor 7 [east], with a probability of "
+        "97.2 %." in lines
+    )
+    for name, probability in (
+        *((level["place"], level["probability"]) for level in PLACES),
+        ("not in this map", 0.02),
+    ):
+        assert any(f" {name} " in row and f" {probability:.1%}"[:-1] in row for row in lines), name
+    assert "fitted on photos of this map" in " ".join(shown.split())
+    assert bars(shown)[-4:] == [12, 19, 20, 0]
+    match = next(row for row in lines if "a[/b].jpg" in row)
+    assert "0.8000" in match
+    assert "61.4 %" in match
+    tables = [row for row in lines if row.strip().startswith(("┃", "│"))]
+    assert max(map(len, tables)) <= 80
+
+
+def test_a_long_label_leaves_room_for_the_probability_and_the_bar(tmp_path: Path) -> None:
+    level = {"place": "building/" + 12 * "corridor ", "probability": 0.5}
+    shown, _ = query(tmp_path, estimate([level]))
+    rows = [row for row in shown.splitlines() if "50.0 %" in row and "│" in row]
+    assert len(rows[0]) <= 80
+    assert bars(shown)[-2:] == [10, 0]
+
+
+def test_circles_are_named_by_their_radius_with_the_radii_of_68_and_95_percent(
+    tmp_path: Path,
+) -> None:
+    shown, _ = query(
+        tmp_path,
+        estimate(CIRCLES, answer_level=3, radius_68_m=79.4, radius_95_m=1750.2),
+    )
+    text = " ".join(shown.split())
+    assert "the finest answer is within 2 km of 45.000000, 7.000000, with a prob" in text
+    assert "Position: 68 % within 79 m, 95 % within 1.8 km." in text
+    for name in ("within 25 m", "within 100 m", "within 500 m", "within 2 km"):
+        assert f" {name} " in shown
+
+
+@pytest.mark.parametrize(
+    ("outside", "sentence"),
+    [
+        (0.62, "The map probably has no photo of this place (62.0 %)."),
+        (
+            0.1,
+            (
+                "No level is certain enough at a certainty of 99.5 %; the most probable is within "
+                "2 km of 45.000000, 7.000000, with 96.0 %."
+            ),
+        ),
+    ],
+)
+def test_without_an_answer_one_sentence_gives_the_reason(
+    tmp_path: Path, outside: float, sentence: str
+) -> None:
+    answer = estimate(CIRCLES, certainty=0.995, not_in_map_probability=outside)
+    assert sentence in query(tmp_path, answer)[0].splitlines()
+
+
+def test_the_certainty_is_sent_to_the_server(tmp_path: Path) -> None:
+    _, path = query(tmp_path, estimate(PLACES), "--certainty", "0.8")
+    assert parse_qs(urlsplit(path).query)["certainty"] == ["0.8"]
+
+
+def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_path: Path) -> None:
+    shown, path = query(tmp_path, {"reason": "No place is known."})
+    assert "No place estimate: No place is known." in shown.splitlines()
+    assert "probability" not in shown
+    assert "match" not in shown
+    assert "certainty" not in path
