@@ -267,8 +267,10 @@ class MapParams(BaseModel):
     )
 
 
-class PageParams(MapParams):
+class PageParams(BaseModel):
     """Query parameters of a list that is returned in pages, newest first."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     limit: int = Field(50, ge=1, le=1000)
     cursor: str | None = Field(None, description="`next_cursor` of the previous page")
@@ -287,6 +289,10 @@ class PageParams(MapParams):
         return page, str(page[-1].id) if len(rows) > self.limit else None
 
 
+class MapPageParams(MapParams, PageParams):
+    """Query parameters of a list of a map that is returned in pages, newest first."""
+
+
 def invalid_cursor_error() -> PlacewiseError:
     """Build the 422 error for a malformed cursor."""
     return invalid_field_error("cursor", "is not a cursor that this endpoint returned")
@@ -302,7 +308,7 @@ def _accept_no_parameters(_params: Annotated[MapParams, Query(include_in_schema=
 
 
 MapQuery = Annotated[MapParams, Query()]
-PageQuery = Annotated[PageParams, Query()]
+PageQuery = Annotated[MapPageParams, Query()]
 NO_PARAMETERS = Depends(_accept_no_parameters)
 """Dependency of endpoints that use no query parameters."""
 GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]

@@ -23,8 +23,8 @@ from services.gateway.dependencies import (
     GatewayContext,
     GatewayDep,
     JobId,
+    MapPageParams,
     MapQuery,
-    PageParams,
     invalid_cursor_error,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
@@ -128,7 +128,7 @@ class BatchItemsResponse(ResponseModel):
     next_cursor: str | None
 
 
-class BatchItemsParams(PageParams):
+class BatchItemsParams(MapPageParams):
     limit: int = Field(100, ge=1, le=1000)
     state: list[JobState] | None = None
 

@@ -20,9 +20,9 @@ from services.gateway.dependencies import (
     GatewayContext,
     GatewayDep,
     JobId,
+    MapPageParams,
     MapParams,
     MapQuery,
-    PageParams,
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentDep
@@ -41,7 +41,7 @@ CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachabl
 HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
-class JobsParams(PageParams):
+class JobsParams(MapPageParams):
     state: list[JobState] | None = None
     kind: list[JobKind] | None = None
 

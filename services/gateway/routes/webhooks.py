@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter
-from pydantic import Field
+from fastapi import APIRouter, Query
+from pydantic import Field, model_validator
 
 from services.gateway.authentication import ADMIN
-from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageQuery, WebhookId
+from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageParams, WebhookId
 from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
@@ -108,11 +109,19 @@ def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookR
         return WebhookResponse.model_validate(delete_webhook(session, webhook_id))
 
 
+class DeliveriesParams(PageParams):
+    @model_validator(mode="before")
+    @classmethod
+    def _ignore_map(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Accept `map`, which clients send with every request: a webhook has none."""
+        return {name: value for name, value in values.items() if name != "map"}
+
+
 @router.get(
     "/webhooks/{webhook_id}/deliveries", operation_id="list_deliveries", dependencies=[ADMIN]
 )
 def read_deliveries(
-    gateway: GatewayDep, webhook_id: WebhookId, query: PageQuery
+    gateway: GatewayDep, webhook_id: WebhookId, query: Annotated[DeliveriesParams, Query()]
 ) -> DeliveriesResponse:
     """List the deliveries of a webhook, newest first, kept for JOB_RETENTION_DAYS."""
     before = query.before
