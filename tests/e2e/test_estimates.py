@@ -26,6 +26,13 @@ ESTIMATE_FIELDS = {
     "confidence",
     "calibration",
     "reason",
+    "certainty",
+    "levels",
+    "answer_level",
+    "not_in_map_probability",
+    "radius_68_m",
+    "radius_95_m",
+    "calibration_source",
 }
 fresh = itertools.count(9000)
 
