@@ -127,9 +127,9 @@ def candidate_levels(
             level,
             features=level_features(
                 scores,
-                _inside(level, ranking),
+                photos_inside(level, ranking),
                 neighbour_scores,
-                _inside(level, neighbours),
+                photos_inside(level, neighbours),
                 spread,
             ),
         )
@@ -166,7 +166,8 @@ def _vote_for_places(
         voters = [i for i in voters if depth < len(paths[i]) and paths[i][depth] == best]
 
 
-def _inside(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> Mask:
+def photos_inside(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> Mask:
+    """Return (k,) bool: which photos of a ranking lie in a level."""
     return np.array([level.contains(r.location) for r in ranking], dtype=bool)
 
 

@@ -37,6 +37,7 @@ from shared.evaluation.place_levels import (
     FloatArray,
     LevelScheme,
     candidate_levels,
+    photos_inside,
     ranking_spread,
     vote_weights,
 )
@@ -254,7 +255,7 @@ def _match_probabilities(
     votes: FloatArray,
 ) -> list[float]:
     """Give the photos of the finest level its probability; the others share the rest by votes."""
-    inside = np.array([finest.contains(r.location) for r in ranking], dtype=bool)
+    inside = photos_inside(finest, ranking)
     remaining = max(0.0, 1 - probability - not_in_map)
     shares = remaining * votes / max(float(votes[~inside].sum()), 1e-12)
     matches: list[float] = np.where(inside, probability, shares).tolist()

@@ -75,7 +75,7 @@ def estimate_place(
 def add_levels(
     response: EstimateResponse, estimate: PlaceEstimate, model: PlaceModel, certainty: float
 ) -> EstimateResponse:
-    """Returns the response with the levels of the estimate and their probabilities."""
+    """Return the response with the levels of the estimate and their probabilities."""
     return response.model_copy(
         update={
             "levels": [
