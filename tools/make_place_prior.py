@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from services.cli.environment import read_settings
-from services.cli.evaluation.describers import extractor_describer
 from services.cli.output import console
 from shared.datasets.open_dataset import (
     EvaluationSet,
     open_evaluation_set,
 )
+from shared.datasets.utm_filenames import FileNameLocation, parse_utm_file_name
 from shared.evaluation.place_evidence import PhotoLocation
 from shared.evaluation.place_levels import FEATURES, LevelScheme
 from shared.evaluation.place_probability import (
@@ -39,14 +39,13 @@ from shared.evaluation.place_probability import (
     sample_weights,
 )
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.ranking import describe_to_matrix
 
 RADII_M = (25.0, 100.0, 500.0, 2000.0)
 SQUARES_M = (400.0, 100.0, 25.0)
 Rows = NDArray[np.float32]
 
 
-TIME_FIELD, NORTH_FIELD, EAST_FIELD, LATITUDE_FIELD, LONGITUDE_FIELD = 13, 2, 1, 5, 6
+TIME_FIELD = 13
 
 
 def sample_city(photos: Sequence[Path], rows: Rows) -> list[PlaceSample]:
@@ -56,12 +55,13 @@ def sample_city(photos: Sequence[Path], rows: Rows) -> list[PlaceSample]:
         photos: The photos, with @UTM@ names.
         rows: (n, D) their descriptors.
     """
-    fields = [photo.name.split("@") for photo in photos]
-    captured_at = [datetime.strptime(f[TIME_FIELD] + "Z", "%Y%m%d%H%M%S%z") for f in fields]
-    spots = [
-        PhotoLocation(float(f[LATITUDE_FIELD]), float(f[LONGITUDE_FIELD]), None) for f in fields
+    names = [photo.name for photo in photos]
+    captured_at = [
+        datetime.strptime(name.split("@")[TIME_FIELD] + "Z", "%Y%m%d%H%M%S%z") for name in names
     ]
-    paths = [PhotoLocation(None, None, _square_path(f)) for f in fields]
+    located = [location for name in names if (location := parse_utm_file_name(name)) is not None]
+    spots = [PhotoLocation(location.latitude, location.longitude, None) for location in located]
+    paths = [PhotoLocation(None, None, _square_path(location)) for location in located]
     return [
         *sample_map(spots, captured_at, rows, labels_are_paths=False),
         *sample_map(paths, captured_at, rows, labels_are_paths=True),
@@ -127,6 +127,10 @@ def main(folders: Sequence[Path]) -> None:
 
 
 def _describe(city: EvaluationSet, photos: Sequence[Path]) -> Rows:
+    # Decoder processes import this module, and their memory limit leaves no room for torch.
+    from services.cli.evaluation.describers import extractor_describer
+    from shared.evaluation.ranking import describe_to_matrix
+
     settings = read_settings()
     extractor = settings.new_map_extractor
     with Progress() as progress:
@@ -135,9 +139,10 @@ def _describe(city: EvaluationSet, photos: Sequence[Path]) -> Rows:
             return np.array(rows)
 
 
-def _square_path(fields: Sequence[str]) -> str:
-    east, north = float(fields[EAST_FIELD]), float(fields[NORTH_FIELD])
-    return "/".join(f"{int(east // side)},{int(north // side)}" for side in SQUARES_M)
+def _square_path(location: FileNameLocation) -> str:
+    return "/".join(
+        f"{int(location.east // side)},{int(location.north // side)}" for side in SQUARES_M
+    )
 
 
 def _rounded(coefficients: Sequence[float]) -> tuple[float, ...]:
