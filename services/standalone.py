@@ -37,12 +37,12 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
+from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import delete_dead_search_workers
-from shared.catalog.schema import migrate, sqlite_file
-from shared.catalog.session import Catalog, TransactionTimeouts
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home

@@ -89,7 +89,7 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     """The Unavailable error of a database failure; None for any other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.database_errors import to_unavailable  # few commands use a database
+    from shared.catalog.database.errors import to_unavailable  # few commands use a database
 
     return to_unavailable(error)
 

@@ -19,7 +19,7 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
 from shared.jobs.wakeups import WakeupQueue

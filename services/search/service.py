@@ -28,9 +28,9 @@ from services.request_log import RequestLogMiddleware
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from services.service_threads import start_service_thread
-from shared.catalog.database_errors import OutageLog
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.catalog.processes import delete_search_worker, upsert_search_worker
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.http.problem_details import PROBLEM_RESPONSES, install_exception_handlers

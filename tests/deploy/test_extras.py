@@ -34,7 +34,7 @@ COMMAND = [
     "shared.telemetry.heartbeat",
     # Imported at their first use.
     "alembic.command",
-    "shared.catalog.postgres",
+    "shared.catalog.database.postgres",
     "shared.storage.s3",
 ]
 HINTS = ["shared.jobs.celery_wakeups", "shared.jobs.celery_wakeups"]

@@ -31,10 +31,10 @@ from services.cli.output import (
 from shared.backup.create import create_backup
 from shared.backup.folder import BackupProgress, open_backup
 from shared.backup.restore import restore_backup
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.schema import check_schema, migrate, opening
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import get_or_create_installation, open_installation_store
-from shared.catalog.schema import check_schema, migrate, opening
-from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import lock_home
 from shared.config.settings import Settings

@@ -37,9 +37,9 @@ from services.cli.operations.deployment_checks import (
 )
 from services.cli.operations.store_checks import collection_check, permissions_check
 from services.cli.output import JsonOption, KeyOption, ServerOption, console, print_json
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.schema import check_pages, check_schema
 from shared.catalog.photos import Photo
-from shared.catalog.schema import check_pages, check_schema
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server
 from shared.config.settings import Settings, memory_limit_bytes

@@ -21,12 +21,12 @@ from services.cli.environment import read_settings
 from services.cli.output import err_console, report_errors
 from services.service_threads import start_service_thread
 from shared.catalog.api_keys import has_admin_key
+from shared.catalog.database.schema import migrate as migrate_catalog
+from shared.catalog.database.schema import wait_for_schema
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.catalog.installation import get_or_create_installation, open_installation_store
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import process_heartbeat
-from shared.catalog.schema import migrate as migrate_catalog
-from shared.catalog.schema import wait_for_schema
-from shared.catalog.session import Catalog, TransactionTimeouts
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured

@@ -26,9 +26,9 @@ from services.cli.output import (
     report_errors,
 )
 from shared.backup.folder import BackupProgress
+from shared.catalog.database.schema import check_schema, migrate
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import adopt_store, get_or_create_installation
-from shared.catalog.schema import check_schema, migrate
-from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server, lock_home
 from shared.config.settings import Settings

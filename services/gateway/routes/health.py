@@ -14,7 +14,7 @@ from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKin
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.maps import Map
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull
