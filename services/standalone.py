@@ -29,7 +29,7 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics

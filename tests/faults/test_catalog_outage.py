@@ -21,7 +21,7 @@ from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, find_descriptor
