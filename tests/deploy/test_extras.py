@@ -30,6 +30,8 @@ EXTRAS = {
 # What every image's command imports, whatever service it runs.
 COMMAND = [
     "services.cli.main",
+    "services.cli.operations.installation_checks",
+    "services.cli.operations.maintenance",
     "shared.catalog.installation",
     "shared.telemetry.heartbeat",
     # Imported at their first use.
