@@ -6,12 +6,12 @@ from itertools import islice
 from uuid import UUID
 
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import Json, console, print_json, progress_bar
+from services.cli.output import Json, Table, console, print_json, print_table, progress_bar
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
@@ -91,11 +91,11 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
                 f"{recall['queries']} {kind}",
                 *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
-    console.print(table)
+    print_table(table)
     figures = evaluations[0].figures
     # Evaluations of earlier releases have no `places`.
     if places := (figures.get("with_word_weights") or figures).get("places"):
-        console.print(_answers_table(places))
+        print_table(_answers_table(places))
     for line in _estimate_lines(figures.get("with_word_weights") or figures):
         console.print(line, soft_wrap=True)
 

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
-from services.cli.output import console, print_json, printable_path
+from services.cli.output import Table, console, print_json, print_table, printable_path
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
@@ -165,7 +165,7 @@ def _print_result(result: EvaluationResult) -> None:
     table.add_row(
         f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
     )
-    console.print(table)
+    print_table(table)
     console.print(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; "
