@@ -15,7 +15,6 @@ from uuid import UUID
 import psycopg
 from PIL import Image
 from psycopg.sql import SQL, Identifier
-from rich.table import Table
 from sqlalchemy import select
 from sqlalchemy.engine import URL, make_url
 from starlette.testclient import TestClient
@@ -24,6 +23,7 @@ from benchmarks.catalog.explain import Explainer
 from benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog, fill_catalog
 from benchmarks.report import Report
 from services.cli.environment import read_settings
+from services.cli.output import Table
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext

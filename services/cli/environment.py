@@ -5,9 +5,8 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 from pydantic import ValidationError
-from rich.table import Table
 
-from services.cli.output import JsonOption, console, print_json, report_errors
+from services.cli.output import JsonOption, Table, console, print_json, print_table, report_errors
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -44,7 +43,7 @@ def config(as_json: JsonOption = False) -> None:
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
-    console.print(table)
+    print_table(table)
     console.print(f"New maps use the extractor {settings.new_map_extractor}.", soft_wrap=True)
 
 

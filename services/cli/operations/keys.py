@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import UUID
 
 import typer
-from rich.table import Table
 
 from placewise.answers import CreatedKey, Key
 from placewise.client import Client
@@ -22,9 +21,10 @@ from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
-    console,
+    Table,
     print_json,
     print_result,
+    print_table,
     report_errors,
 )
 from shared.errors import Conflict, NotFound
@@ -102,7 +102,7 @@ def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
                 f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
                 _key_status(item),
             )
-        console.print(table)
+        print_table(table)
 
 
 @app.command("revoke")
