@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from services.cli.client import connect
+from placewise.client import Client
+from services.cli.client import connect, describe_target
 from services.cli.environment import read_settings
 from services.cli.ingest.batches import (
     check_archive,
@@ -114,7 +115,7 @@ def index(
         path = Path(source)
         if source.startswith("s3://"):
             _reject_options("a bucket prefix", local_file_options)
-            with connect(server, map_name, key) as client, progress_bar() as progress:
+            with _connect(server, map_name, key) as client, progress_bar() as progress:
                 report = import_prefix(client, source, fit, progress)
         elif path.is_dir():
             photos = find_photos(path, table, utm_zone, places_by_folder=places)
@@ -130,7 +131,7 @@ def index(
             data = _read_manifest(path)
             if manifest_has_keys(data):
                 _reject_options("a manifest of object keys", local_file_options)
-                with connect(server, map_name, key) as client, progress_bar() as progress:
+                with _connect(server, map_name, key) as client, progress_bar() as progress:
                     report = import_keys(client, data, fit, progress)
             else:
                 photos = read_photo_manifest(path, data)
@@ -138,11 +139,19 @@ def index(
         else:
             check_archive(path)
             _reject_options("an archive", local_file_options)
-            with connect(server, map_name, key) as client, progress_bar() as progress:
+            with _connect(server, map_name, key) as client, progress_bar() as progress:
                 report = upload_archive(client, path, fit, progress)
         if failures is not None:
             _write_failures(failures, report)
-        _finish_command(report, map_name, role, as_json)
+        _finish_command(report, server, map_name, role, as_json)
+
+
+@contextlib.contextmanager
+def _connect(server: str | None, map_name: str | None, key: str | None) -> Iterator[Client]:
+    with connect(server, map_name, key) as client:
+        target = describe_target(client, server, map_name)
+        err_console.print(f"Indexing into {target}", soft_wrap=True, markup=False)
+        yield client
 
 
 def _upload_photos(
@@ -155,7 +164,7 @@ def _upload_photos(
     key: str | None,
 ) -> Json:
     with (
-        connect(server, map_name, key) as client,
+        _connect(server, map_name, key) as client,
         progress_bar() as progress,
         contextlib.ExitStack() as stack,
     ):
@@ -192,16 +201,18 @@ def _write_failures(out: Path, report: Json) -> None:
                 file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
-def _finish_command(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:
+def _finish_command(
+    report: Json, server: str | None, map_name: str | None, role: PhotoRole, as_json: bool
+) -> None:
     if as_json:
         print_json(report)
     else:
-        _print_report(report, map_name, role)
+        _print_report(report, server, map_name, role)
     if report["refused"] or report["failed"]:
         raise typer.Exit(1)
 
 
-def _print_report(report: Json, map_name: str | None, role: PhotoRole) -> None:
+def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
     err_console.print(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
         f"The map now has {report['searchable']} searchable photos "
@@ -209,6 +220,7 @@ def _print_report(report: Json, map_name: str | None, role: PhotoRole) -> None:
         soft_wrap=True,
     )
     print_failures(report, "refused", "failed")
-    map_option = f" --map {map_name}" if map_name else ""
+    options = f" --map {map_name}" if map_name else ""
+    options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    err_console.print(f"Next: {sys.argv[0]} {command}{map_option}", soft_wrap=True)
+    err_console.print(f"Next: {sys.argv[0]} {command}{options}", soft_wrap=True)
