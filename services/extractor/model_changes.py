@@ -45,6 +45,7 @@ from shared.descriptors.vocabulary_file import (
 )
 from shared.descriptors.vocabulary_fit import VocabularyFit
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import Job, JobKind
 from shared.storage import ObjectStore
 from shared.storage.keys import job_work_key
@@ -110,7 +111,13 @@ class VocabularyFitJob:
             self._catalog,
             job,
             stage="sample",
-            params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
+            params={
+                **job.params,
+                "clusters": clusters,
+                "sampled": 0,
+                "described": 0,
+                "provisional": len(photo_ids) < MIN_PHOTOS_TO_FIT,
+            },
             progress_total=len(plan) + FIT_PROGRESS_UNITS + len(photo_ids),
         )
 
@@ -181,6 +188,8 @@ class VocabularyFitJob:
             photos=params["described"],
             seed=params["seed"],
         )
+        # A fit that the previous release has planned does not have the parameter.
+        provenance["provisional"] = params.get("provisional", False)
         start_generation_with_new_vocabulary(
             self._catalog,
             self._store,

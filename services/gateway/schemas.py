@@ -196,8 +196,8 @@ class SimilarityResponse(ResponseModel):
     similar_images: list[SimilarPhotoResponse]
     estimate: EstimateResponse
     vocabulary: str = Field(
-        description="`own`: fitted on this map's photos; `foreign`: fitted on other photos; "
-        "`none`: the extractor uses none"
+        description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
+        "them; `foreign`: fitted on other photos; `none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
