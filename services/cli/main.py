@@ -10,6 +10,8 @@ import importlib
 import logging
 import sys
 from collections.abc import Collection
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -51,7 +53,6 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     """Build the application with the named commands, importing only their modules."""
     app = typer.Typer(
         name="placewise",
-        help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         add_completion=False,
@@ -73,10 +74,25 @@ def run() -> None:
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
     names = sys.argv[1:2]
+    if names == ["--version"]:
+        build_app(())()  # imports no command
     # Anything but a known command (--help, a typo) needs every command: for the help text and
     # for the suggestion of a similar name.
     build_app(names if names and names[0] in COMMANDS else COMMANDS.keys())()
 
 
-def _root_callback() -> None:
-    """Keep the application a command group even if it has only one command."""
+def _print_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"placewise {version('placewise')}")
+        raise typer.Exit
+
+
+def _root_callback(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version and exit.", is_eager=True, callback=_print_version
+        ),
+    ] = False,
+) -> None:
+    """Self-hosted visual place recognition: find where a photo was taken."""

@@ -13,7 +13,9 @@ A vocabulary fit (`VocabularyFitJob`) has three stages, with these objects under
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from uuid import UUID
 
 from sqlalchemy import select
@@ -151,18 +153,14 @@ class VocabularyFitJob:
             progress_done=sampled,
         )
 
-    def _read_photos(self, photo_ids: list[UUID]) -> list[bytes]:
-        """Return the bytes of the photos that have not been deleted since the plan."""
+    def _read_photos(self, photo_ids: list[UUID]) -> Iterator[bytes]:
+        """Yield the bytes of the photos that have not been deleted since the plan."""
         with self._catalog.read() as session:
             live = get_live_photos(session, photo_ids)
-        photos = []
         for photo_id in photo_ids:
             if photo_id in live:
-                try:
-                    photos.append(self._store.get(live[photo_id].object_key))
-                except NotFound:
-                    continue
-        return photos
+                with contextlib.suppress(NotFound):
+                    yield self._store.get(live[photo_id].object_key)
 
     def _cluster(self, job: Job, extractor: Extractor) -> None:
         """Run steps of the fit; when it is finished, create the vocabulary and its generation."""
