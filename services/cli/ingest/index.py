@@ -22,7 +22,14 @@ from services.cli.ingest.batches import (
     manifest_has_keys,
     upload_archive,
 )
-from services.cli.ingest.geotags import LocalPhoto, find_photos, read_photo_manifest
+from services.cli.ingest.geotags import (
+    LocalPhoto,
+    count_other_files,
+    find_local_sources,
+    find_photos,
+    has_coordinates,
+    read_photo_manifest,
+)
 from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
 from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
@@ -44,12 +51,13 @@ from shared.errors import InvalidRequest
 
 
 def index(
-    source: Annotated[
-        str,
+    sources: Annotated[
+        list[str],
         typer.Argument(
-            metavar="DIR|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
-            help="A folder (searched recursively); a zip, tar or gzipped tar archive; a JSONL "
-            "manifest with one photo per line; or a prefix of the server's own bucket.",
+            metavar="DIR|PHOTO...|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
+            help="Folders (searched recursively), photos and patterns such as 'trip/*.jpg'; or one "
+            "zip, tar or gzipped tar archive; or one JSONL manifest with one photo per line; or "
+            "one prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
@@ -112,13 +120,16 @@ def index(
     with report_errors(as_json):
         if failures is not None:
             check_output_path(failures, ".jsonl", "a list of failures")
-        path = Path(source)
-        if source.startswith("s3://"):
-            _reject_options("a bucket prefix", local_file_options)
-            with _connect(server, map_name, key) as client, progress_bar() as progress:
-                report = import_prefix(client, source, fit, progress)
-        elif path.is_dir():
-            photos = find_photos(path, table, utm_zone, places_by_folder=places)
+        source, path = sources[0], Path(sources[0])
+        local = find_local_sources(sources)
+        if local is not None:
+            if len(sources) > 1 or not path.is_dir():
+                _reject_options("photos and several folders", {"--csv": table})
+            photos = [
+                photo
+                for one in local
+                for photo in find_photos(one, table, utm_zone, places_by_folder=places)
+            ]
             if role != PhotoRole.DATABASE:
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
             # Vocabularies are fitted on database photos only.
@@ -126,6 +137,18 @@ def index(
             report = _upload_photos(
                 photos, fit_after_upload, update, journal, server, map_name, key
             )
+            report["other_files"] = sum(map(count_other_files, local))
+            report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
+        elif len(sources) > 1:
+            raise InvalidRequest(
+                "several_sources",
+                f"{source} and {len(sources) - 1} more: index archives, manifests and bucket "
+                "prefixes one at a time. Only folders, photos and patterns can be combined.",
+            )
+        elif source.startswith("s3://"):
+            _reject_options("a bucket prefix", local_file_options)
+            with _connect(server, map_name, key) as client, progress_bar() as progress:
+                report = import_prefix(client, source, fit, progress)
         elif path.suffix == ".jsonl":
             _reject_options("a manifest", folder_options)
             data = _read_manifest(path)
@@ -219,6 +242,12 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
         f"(vocabulary: {report['vocabulary']}).",
         soft_wrap=True,
     )
+    if report.get("other_files") or report.get("without_coordinates"):
+        err_console.print(
+            f"{report['other_files']} other files skipped, "
+            f"{report['without_coordinates']} photos without coordinates.",
+            soft_wrap=True,
+        )
     print_failures(report, "refused", "failed")
     options = f" --map {map_name}" if map_name else ""
     options += f" --server {server}" if server else ""

@@ -160,7 +160,7 @@ def _upload_concurrently(
     client: Client, photos: list[LocalPhoto], update: bool
 ) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
     def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
-        fields: dict[str, Any] = dict(photo.fields)
+        fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
 
         def send() -> Uploaded:
             return client.upload(photo.path, filename=photo.name, **fields)
