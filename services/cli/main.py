@@ -11,7 +11,9 @@ import importlib
 import logging
 import sys
 from collections.abc import Collection
+from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -86,7 +88,7 @@ def run() -> None:
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
     names = sys.argv[1:2]
-    if sys.argv[1:] in ([], ["--help"]):
+    if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = build_overview()
     else:
         # The suggestion of a similar name, for a typo, needs every command.
@@ -106,5 +108,18 @@ def _new_app() -> typer.Typer:
     return app
 
 
-def _root_callback() -> None:
-    """Keep the application a command group even if it has only one command."""
+def _print_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"placewise {version('placewise')}")
+        raise typer.Exit
+
+
+def _root_callback(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version and exit.", is_eager=True, callback=_print_version
+        ),
+    ] = False,
+) -> None:
+    """Self-hosted visual place recognition: find where a photo was taken."""

@@ -43,8 +43,13 @@ class Vocabulary(Journaled, Base):
 
     @property
     def standing(self) -> str:
-        """`own` if fitted on this map's photos, else `foreign`; part of API responses."""
-        return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
+        """`own` if fitted on this map's photos, else `foreign`; part of API responses.
+
+        `provisional` if the map had fewer than MIN_PHOTOS_TO_FIT photos when it was fitted.
+        """
+        if self.origin != VocabularyOrigin.FITTED:
+            return "foreign"
+        return "provisional" if self.provenance.get("provisional") else "own"
 
 
 def vocabulary_standing(session: Session, generation: Generation) -> str:

@@ -104,6 +104,7 @@ def insert_photo(
         sha256=received.sha256,
         object_key=received.key,
         filename=received.filename,
+        relative_path=fields.relative_path,
         media_type=incoming.media_type,
         size_bytes=received.size_bytes,
         width=header.width,
@@ -145,6 +146,8 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
             file_id=str(photo.id),
             differing=differing,
         )
+    if photo.relative_path is None:  # stored before paths were kept, or uploaded without its folder
+        photo.relative_path = fields.relative_path
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
         requeue_job(job)

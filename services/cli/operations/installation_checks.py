@@ -39,7 +39,7 @@ from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import ExtractorConfig
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, ExtractorConfig
 from shared.journal.outbox import catalog_lag
 
 BYTES_PER_PARAMETER = 4  # float32
@@ -285,6 +285,12 @@ def _check_vocabulary(settings: Settings) -> str:
             f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
             "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
             "photos were uploaded just now.",
+        )
+    provisional = [m.name for m in maps if m.vocabulary == "provisional"]
+    if provisional:
+        return (
+            f"vocabulary fitted on too few photos in {', '.join(provisional)}: fit another with "
+            f"`placewise vocabulary fit` when the map has {MIN_PHOTOS_TO_FIT} photos"
         )
     foreign = [m.name for m in maps if m.vocabulary == "foreign"]
     if foreign:

@@ -8,6 +8,7 @@ service only.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,9 @@ def serve() -> None:
 
 
 def _startup_message(running: Standalone, settings: Settings) -> str:
-    command, url = sys.argv[0], running.url
+    # Complete: without its folder, a command of another shell would start a second Placewise.
+    command = f"PLACEWISE_HOME={shlex.quote(str(settings.placewise_home))} {sys.argv[0]}"
+    url = running.url
     header = '-H "Authorization: Bearer $PLACEWISE_KEY" ' if running.local_key else ""
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
@@ -53,7 +56,8 @@ def _startup_message(running: Standalone, settings: Settings) -> str:
             f"  query:    curl {header}-F file=@OTHER.jpg -H 'Prefer: wait=30' "
             f"{url}/api/v1/similarity"
         ),
-        f"  folder:   {command} index DIR, then {command} query PHOTO",
+        f"  folder:   {command} index DIR",
+        f"            {command} query PHOTO",
     ]
     return "\n".join(lines)
 
@@ -68,9 +72,9 @@ def _key_instructions(running: Standalone, settings: Settings, command: str) -> 
         lines.append(f"  key:      export PLACEWISE_KEY={running.first_admin_key}")
         lines.append("            It is shown only once. Every call requires a key.")
     elif settings.admin_key is not None:
-        lines.append("  key:      ADMIN_KEY, or one of those listed by placewise keys list")
+        lines.append(f"  key:      ADMIN_KEY, or one of those listed by {command} keys list")
     else:
-        lines.append("  key:      one of those listed by placewise keys list")
+        lines.append(f"  key:      one of those listed by {command} keys list")
         lines.append(f"            To create one: {command} keys create NAME --scope admin")
     return lines
 

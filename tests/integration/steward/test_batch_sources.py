@@ -139,6 +139,7 @@ def test_an_archive_comes_in_with_its_table_and_goes(
         ["a", "b"],
     )
     assert (one.filename, one.latitude) == ("1.jpg", None)
+    assert (one.relative_path, two.relative_path) == ("city/1.jpg", "city/in/2.jpg")
     assert named.latitude == 45.0691
     assert batches.store.get(two.object_key) == photo_bytes(2)
     assert [item["line"] for item in batches.items(job_id)] == [None, 2, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
 
 from typer.testing import CliRunner
 
@@ -60,3 +61,18 @@ def test_the_help_of_a_command_imports_neither_a_database_nor_a_server_nor_torch
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == []
+
+
+def test_the_version_is_printed_without_importing_a_command() -> None:
+    code = (
+        "import sys\n"
+        "from services.cli.main import run\n"
+        "sys.argv = ['placewise', '--version']\n"
+        "try:\n"
+        "    run()\n"
+        "except SystemExit as ended:\n"
+        "    assert not ended.code\n"
+        "assert 'services.cli.query' not in sys.modules\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == f"placewise {version('placewise')}\n"
