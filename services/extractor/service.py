@@ -19,6 +19,7 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
+from shared.catalog.processes import process_heartbeat
 from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
@@ -83,7 +84,10 @@ def serve_extractor(
     # Keeps Celery from installing its own handlers and formats; `--loglevel` has no effect.
     signals.setup_logging.connect(keep_logging_setup, weak=False)
     try:
-        with serve_metrics(settings, registry):
+        with (
+            process_heartbeat(catalog, "extractor", worker.state),
+            serve_metrics(settings, registry),
+        ):
             worker.warm_up()
             for queue in WakeupQueue:
                 wakeups.send(queue)  # for jobs queued before this worker started

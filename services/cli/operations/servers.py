@@ -135,6 +135,7 @@ def gateway() -> None:
         from shared.telemetry.metrics_server import serve_metrics
 
         with (
+            process_heartbeat(catalog, "gateway"),
             listen(settings.host, settings.port) as listener,
             _open_wakeups(settings) as wakeups,
             _search_client(settings) as search,
@@ -196,7 +197,11 @@ def steward() -> None:
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
-        with _open_wakeups(settings) as wakeups, _search_client(settings) as search:
+        with (
+            process_heartbeat(catalog, "steward"),
+            _open_wakeups(settings) as wakeups,
+            _search_client(settings) as search,
+        ):
             store = open_installation_store(catalog, settings, exclusive=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             registry = CollectorRegistry()
@@ -240,7 +245,7 @@ def migrate() -> None:
 
 @contextlib.contextmanager
 def _service_context(name: str) -> Iterator[tuple[Settings, Catalog]]:
-    """Set up logging, tracing and heartbeat, and open the catalog once its schema is current."""
+    """Set up logging and tracing, and open the catalog once its schema is current."""
     with report_errors(as_json=False):
         settings = read_settings()
         configure_logging(settings, name)
@@ -248,8 +253,7 @@ def _service_context(name: str) -> Iterator[tuple[Settings, Catalog]]:
             catalog = open_catalog(settings, name)
             try:
                 wait_for_schema(catalog, settings.schema_wait_seconds)
-                with process_heartbeat(catalog, name):
-                    yield settings, catalog
+                yield settings, catalog
             finally:
                 catalog.close()
 
