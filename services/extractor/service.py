@@ -38,7 +38,7 @@ def serve_extractor(settings: Settings, announce: Announce) -> None:
     Raises:
         Misconfigured: `redis_missing`.
     """
-    with service_process(settings, "extractor") as catalog, process_heartbeat(catalog, "extractor"):
+    with service_process(settings, "extractor") as catalog:
         store = open_installation_store(catalog, settings, exclusive=False)
         _run_celery_worker(catalog, store, settings, announce)
 
@@ -85,7 +85,10 @@ def _run_celery_worker(
     # Keeps Celery from installing its own handlers and formats; `--loglevel` has no effect.
     signals.setup_logging.connect(keep_logging_setup, weak=False)
     try:
-        with serve_metrics(settings, registry):
+        with (
+            process_heartbeat(catalog, "extractor", worker.state),
+            serve_metrics(settings, registry),
+        ):
             worker.warm_up()
             for queue in WakeupQueue:
                 wakeups.send(queue)  # for jobs queued before this worker started
