@@ -31,7 +31,7 @@ from services.cli.output import (
 from shared.backup.create import create_backup
 from shared.backup.folder import BackupProgress, open_backup
 from shared.backup.restore import restore_backup
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database_errors import explain_outage
 from shared.catalog.installation import get_or_create_installation, open_installation_store
 from shared.catalog.schema import check_schema, migrate, opening
 from shared.catalog.session import NO_TIMEOUTS, Catalog
@@ -72,7 +72,7 @@ def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, Ow
             check_schema(catalog)
         yield catalog, open_installation_store(catalog, settings, exclusive=False)
     except SQLAlchemyError as error:
-        unavailable = to_unavailable(error)
+        unavailable = explain_outage(error)
         if unavailable is None:
             raise
         raise unavailable from error

@@ -135,6 +135,7 @@ def gateway() -> None:
         from services.gateway.app import create_app
         from services.gateway.authentication import ApiKeyAuthenticator
         from services.gateway.dependencies import GatewayContext
+        from services.gateway.proxy_sign_in import with_proxy_sign_in
         from services.http_server import http_server, listen, reachable_url, stop_on_signals
         from shared.telemetry.metrics_server import serve_metrics
 
@@ -149,7 +150,7 @@ def gateway() -> None:
                 get_or_create_default_map(session, settings.new_map_extractor)
             store = open_installation_store(catalog, settings, exclusive=False)
             requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
-            keys = ApiKeyAuthenticator(requests, *admin_key_hashes)
+            keys = with_proxy_sign_in(ApiKeyAuthenticator(requests, *admin_key_hashes), settings)
             context = GatewayContext(requests, store, wakeups, search, settings, keys)
             server = http_server(
                 create_app(context),

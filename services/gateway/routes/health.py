@@ -17,7 +17,7 @@ from services.gateway.schemas import ResponseModel
 from shared.catalog.database_errors import to_unavailable
 from shared.catalog.maps import Map
 from shared.config.settings import Settings
-from shared.errors import PlacewiseError, StorageFull
+from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 
 probe_router = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
@@ -52,7 +52,7 @@ class ComponentStatus(ResponseModel):
 class LoadResponse(ResponseModel):
     """Load and limits of this gateway.
 
-    At a limit, requests are refused (429, 507), but the service is not unhealthy.
+    At a limit, requests are refused (429, 507), and the service is degraded, not unhealthy.
     """
 
     waiting_jobs: int = Field(description="queued jobs, without queries and jobs of model changes")
@@ -119,7 +119,8 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 
-    `degraded`: chunks or shards can't be searched, or uploads are refused because the disk is full.
+    `degraded`: chunks or shards can't be searched, or uploads are refused because the disk or the
+    job queue is full.
     """
     components = _check_components(gateway, admission)
     statuses = {component.status for component in components.values()}
@@ -158,6 +159,7 @@ def _check_components(
         "catalog": _check_catalog(gateway),
         "object_store": _check_object_store(gateway, admission),
         "search": _check_search(gateway),
+        "uploads": _check_uploads(admission),
     }
 
 
@@ -180,6 +182,16 @@ def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) ->
         return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
+    return ComponentStatus(status="healthy")
+
+
+def _check_uploads(admission: AdmissionControl) -> ComponentStatus:
+    try:
+        admission.check_queue()
+    except TooManyRequests as error:
+        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
+    except SQLAlchemyError:
+        return ComponentStatus(status="degraded", detail="uploads are refused: see catalog")
     return ComponentStatus(status="healthy")
 
 
