@@ -351,6 +351,7 @@ class Stats(Answer):
     feature_dimension: int | None
     max_images_per_chunk: int
     extractor: str
+    device: str | None
     vocabulary: str | None
     total_searches: int
     recent_uploads_24h: int

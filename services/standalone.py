@@ -30,7 +30,7 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -38,12 +38,16 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
+from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import delete_dead_search_workers
-from shared.catalog.schema import migrate, sqlite_file
-from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.catalog.processes import (
+    delete_dead_search_workers,
+    delete_processes,
+    process_heartbeat,
+)
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
@@ -131,6 +135,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             get_or_create_default_map(session, settings.new_map_extractor)
             # The lock proves that no other worker is alive: rows are left from a killed process.
             delete_dead_search_workers(session, all_workers=True)
+            delete_processes(session, "extractor")
         release_expired_leases(catalog, settings.max_attempts, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
@@ -173,7 +178,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             except PlacewiseError as error:
                 running.stop(error)
                 return
-            with contextlib.closing(extractor):
+            with (
+                contextlib.closing(extractor),
+                process_heartbeat(catalog, "extractor", extractor.state),
+            ):
                 extractor.run(stop, wakeups)
 
         stop = threading.Event()

@@ -8,9 +8,8 @@ from typing import get_args
 from pydantic import SecretStr, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
-from rich.table import Table
 
-from services.cli.output import JsonOption, console, print_json, report_errors
+from services.cli.output import JsonOption, Table, console, print_json, print_table, report_errors
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -70,7 +69,7 @@ def config(as_json: JsonOption = False) -> None:
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
-    console.print(table)
+    print_table(table)
     console.print(f"New maps use the extractor {settings.new_map_extractor}.", soft_wrap=True)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 from rich.progress_bar import ProgressBar
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import Estimate, EstimateLevel, Explanation
 from services.cli.client import connect, describe_target
@@ -17,8 +17,10 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
+    Table,
     console,
     print_json,
+    print_table,
     report_errors,
 )
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -134,10 +136,10 @@ def query(
                 escape(match.place or ""),
                 *([_format_explanation(match.explanation)] if explain else []),
             )
-        console.print(table)
+        print_table(table)
         if levels:
             console.print(_summarize_levels(answer.estimate), soft_wrap=True, markup=False)
-            console.print(_levels_table(answer.estimate))
+            print_table(_levels_table(answer.estimate))
         else:
             console.print(_format_estimate(answer.estimate), soft_wrap=True, markup=False)
         console.print(

@@ -27,8 +27,8 @@ from services.extractor.generation_resolver import ResolvedGeneration, resolve_g
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import read_stored_rows
 from services.extractor.publish import PublishResult
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, get_live_photos, get_photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.descriptors.explanation import SimilarityShares, draw_overlay, explain_similarities
 from shared.descriptors.extractor import Extractor, not_finite_error

@@ -32,8 +32,8 @@ from services.extractor.checkpointed_steps import (
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.fit_pca import PcaFitJob
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole, get_live_photos
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, VocabularyOrigin, get_vocabulary
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor

@@ -20,9 +20,9 @@ from sqlalchemy import select
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.generation_resolver import ResolvedGeneration
 from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.photos import Photo, get_live_photos
-from shared.catalog.session import Catalog
 from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.errors import NotFound, PlacewiseError

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch.loggers import (
     CSVLogger,
@@ -28,7 +27,7 @@ from services.trainer.run_control import Display
 from services.trainer.run_folder import CHECKPOINTS_FOLDER
 from shared.datasets.dataset import TrainingSet
 from shared.errors import InvalidRequest, Misconfigured
-from shared.evaluation.exact_knn import exact_knn
+from shared.evaluation.exact_knn import has_faiss_gpu
 from shared.evaluation.ranking import DEFAULT_KS
 
 PRECISION_ALIASES = {
@@ -52,6 +51,8 @@ class Device:
     precision: Any
     """Lightning's `precision` argument, such as `16-mixed`"""
     torch_device: torch.device
+    faiss_gpu: bool
+    """whether evaluations search on the GPU"""
 
 
 def resolve_device(arguments: TrainingArguments) -> Device:
@@ -73,15 +74,16 @@ def resolve_device(arguments: TrainingArguments) -> Device:
         raise InvalidRequest(
             "precision_unfit", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
         )
+    faiss_gpu = arguments.faiss_gpu and has_faiss_gpu()
     if accelerator != "gpu":
-        return Device(accelerator, 1, precision, torch.device(accelerator))
+        return Device(accelerator, 1, precision, torch.device(accelerator), faiss_gpu)
     if index >= torch.cuda.device_count():
         raise Misconfigured(
             "no_gpu",
             f"--devices [{index}] does not exist: this machine has {torch.cuda.device_count()} "
             "GPUs, numbered from 0.",
         )
-    return Device("gpu", [index], precision, torch.device("cuda", index))
+    return Device("gpu", [index], precision, torch.device("cuda", index), faiss_gpu)
 
 
 def _resolve_accelerator(requested: str) -> str:
@@ -94,8 +96,7 @@ def _resolve_accelerator(requested: str) -> str:
             raise Misconfigured(
                 "no_gpu",
                 "PyTorch finds no CUDA GPU (--accelerator gpu is the default). Train on the CPU "
-                "with --accelerator cpu --faiss_gpu False, or install the driver and a CUDA build "
-                "of PyTorch.",
+                "with --accelerator cpu, or install the driver and a CUDA build of PyTorch.",
             )
         return "gpu"
     if requested == "mps" and not torch.backends.mps.is_available():
@@ -153,19 +154,38 @@ def check_loggers(names: tuple[str, ...]) -> None:
 Json = dict[str, Any]
 
 
-def check_environment(arguments: TrainingArguments) -> Device:
-    """Check device, loggers and faiss, and return the device.
+def check_environment(arguments: TrainingArguments, display: Display) -> Device:
+    """Check device and loggers, and return the device; warn if faiss can't use the GPU.
 
     Raises:
-        Misconfigured: `no_gpu`, `faiss_gpu_missing`, `logger_missing`.
+        Misconfigured: `no_gpu`, `logger_missing`.
         InvalidRequest: as `resolve_device`.
     """
     device = resolve_device(arguments)
     check_loggers(arguments.logger)
-    if arguments.faiss_gpu:
-        row = np.ones((1, 1), np.float32)
-        exact_knn(row, row, 1, faiss_gpu=True)
+    if arguments.faiss_gpu and not device.faiss_gpu:
+        display.warn(
+            "Evaluations search on the CPU, with the same results: faiss can't use a GPU here "
+            "(--faiss_gpu False omits this warning)."
+        )
     return device
+
+
+def list_changed_meanings(arguments: TrainingArguments) -> list[str]:
+    """Return a line for each argument whose value had another effect in the GSV-Cities code."""
+    notes = []
+    if arguments.optimizer == "adam" and arguments.weight_decay > 0:
+        notes.append(
+            "--optimizer adam is Adam. The GSV-Cities script ran AdamW by this name: for the same "
+            "training use --optimizer adamw."
+        )
+    if arguments.experiment_phase != "train" and arguments.test_image_size == "same":
+        height, width = arguments.image_size
+        notes.append(
+            f"Test photos are resized to {height} x {width} pixels. The GSV-Cities script tested "
+            "them at their own size: for the same figures use --test_image_size native."
+        )
+    return notes
 
 
 def resolve_arguments(

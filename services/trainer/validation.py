@@ -9,6 +9,7 @@ import torch
 
 from services.trainer.arguments import TrainingArguments
 from services.trainer.model_describer import ModelDescriber
+from services.trainer.resolve import Device
 from services.trainer.run_control import StopRequest
 from shared.datasets.dataset import EvaluationSet
 from shared.evaluation.ranking import Recalls, evaluate_recall
@@ -27,7 +28,7 @@ class Validator:
     def __init__(
         self,
         arguments: TrainingArguments,
-        device: torch.device,
+        device: Device,
         on_progress: ProgressCallback,
         stop: StopRequest,
     ) -> None:
@@ -54,7 +55,7 @@ class Validator:
         """
         size = self._test_size() if for_tests else self._arguments.image_size
         describe = ModelDescriber(
-            model, self._device, size, batch_photos=1 if size is None else BATCH_PHOTOS
+            model, self._device.torch_device, size, batch_photos=1 if size is None else BATCH_PHOTOS
         )
         recalls = {}
         for each in sets:
@@ -64,7 +65,7 @@ class Validator:
                 self._on_progress(f"{name}: {what}", done, total)
 
             result = evaluate_recall(
-                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=on_progress
+                describe, each, faiss_gpu=self._device.faiss_gpu, on_progress=on_progress
             )
             recalls[each.name] = result.recalls
         return recalls

@@ -10,7 +10,7 @@ from uuid import UUID
 from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
+from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
 from shared.catalog.generations import Generation, active_generation
 from shared.errors import Conflict
 from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES

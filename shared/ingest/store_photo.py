@@ -18,9 +18,9 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from shared.catalog.api_keys import count_photos_of_key
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo, PhotoRole, find_photo_by_sha256
-from shared.catalog.session import Catalog
 from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields

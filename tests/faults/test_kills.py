@@ -13,7 +13,7 @@ import httpx2
 import psutil
 
 from benchmarks.chaos.run import check_invariants, count_unfinished_jobs
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess

@@ -200,9 +200,9 @@ def _wait_for_jobs(
     waiting: PendingJobs = []
     for photo, job_id in pending:
         try:
-            for job in client.watch(job_id, poll_seconds=POLL_SECONDS):
-                if job.waiting_for:
-                    break
+            job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
+            while not job.finished and not job.waiting_for:
+                job = client.job(job_id, POLL_SECONDS)
         except NotFound:  # recorded in the journal and deleted since
             progress.advance(bar)
             continue

@@ -44,8 +44,8 @@ from shared.catalog.batch_items import (
     sync_item_states,
     update_batch_progress,
 )
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import WaitingFor, claimable_condition
-from shared.catalog.session import Catalog
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable

@@ -14,8 +14,9 @@ from uuid import UUID
 from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session, aliased
 
-from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.catalog.chunks import Descriptor, estimate_described
+from shared.catalog.database.base import Condition, db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -26,7 +27,6 @@ from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.processes import delete_dead_search_workers, list_lagging_workers
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, vocabulary_standing
 from shared.catalog.webhooks import EventKind, enqueue_event
 from shared.errors import Conflict

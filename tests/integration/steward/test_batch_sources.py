@@ -11,8 +11,8 @@ import pytest
 from services.extractor.worker import ExtractorWorker
 from services.gateway.routes.batches import validate_prefix
 from services.steward.tasks.garbage_collection import collect_job_files
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unprocessable
 from shared.jobs import JobKind

@@ -252,8 +252,7 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
         ({"miner_name": "BestMiner"}, "unknown_miner", "BatchHardMiner"),
         ({"monitor": "other/R1"}, "unknown_metric", "known: "),
         ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
-        ({"faiss_gpu": True}, "faiss_gpu_missing", "--faiss_gpu False"),
-        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "nowhere"),
+        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "(--weights)"),
     ],
 )
 def test_what_is_not_there_is_named_with_what_is_known(
@@ -286,7 +285,8 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
     out = tmp_path / "grid"
     command = ["grid", str(file), "--out", str(out)]
     dry = CliRunner().invoke(build_app(["grid"]), [*command, "--dry-run", "--json"])
-    assert dry.exit_code == 0, dry.output
+    assert dry.exit_code == 1, dry.output
+    assert "wrong can't start: bad_agg_config" in dry.stderr
     assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
         ("AVG", "waiting"),
         ("GeM", "waiting"),

@@ -17,7 +17,7 @@ from services.gateway.authentication import ApiKeyAuthenticator, Authenticator, 
 from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_connections import ConnectionLimits, Connections
 from services.http_server import PEER_ADDRESS, http_server, listen
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Forbidden, Unauthorized
 from shared.security.api_keys import ALL_SCOPES, Scope, hash_api_key
