@@ -34,6 +34,8 @@ class Photo(Answer):
     image_id: UUID
     image_path: str
     original_filename: str
+    relative_path: str | None = None
+    """Path in the folder or archive that it was uploaded from; None if unknown."""
     upload_time: datetime
     file_size: int
     width: int

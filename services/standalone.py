@@ -29,7 +29,7 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -37,6 +37,8 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
+from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
@@ -45,8 +47,6 @@ from shared.catalog.processes import (
     delete_processes,
     process_heartbeat,
 )
-from shared.catalog.schema import migrate, sqlite_file
-from shared.catalog.session import Catalog, TransactionTimeouts
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home

@@ -42,8 +42,8 @@ from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started

@@ -27,7 +27,7 @@ from fastapi import Depends, Request
 from services.gateway.authentication import Caller, get_caller
 from services.gateway.dependencies import GatewayDep, get_map_name
 from services.http_connections import address_group
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests

@@ -35,8 +35,8 @@ from shared.catalog.api_keys import (
     authenticate_api_key,
     record_key_use,
 )
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.session import Catalog
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.session import Catalog
 from shared.errors import Forbidden, PlacewiseError, Unauthorized
 from shared.http.problem_details import problem_response
 from shared.security.api_keys import ALL_SCOPES, expand_scopes, hash_api_key, is_loopback

@@ -32,7 +32,7 @@ from uuid import UUID
 from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid, and_, or_, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Condition,
     JsonValue,

@@ -20,7 +20,8 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
+from shared.catalog.database.base import (
     Base,
     Journaled,
     JsonValue,
@@ -32,7 +33,6 @@ from shared.catalog.base import (
     get_or_insert,
     page_newest_first,
 )
-from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import Job, WaitingFor
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos

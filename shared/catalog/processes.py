@@ -26,10 +26,17 @@ from sqlalchemy import Integer, String, Text, Uuid, and_, delete, or_, select, u
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
 from shared.catalog.chunks import Chunk
-from shared.catalog.database_errors import OutageLog
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    affected_rows,
+    db_now,
+    db_now_plus,
+)
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.config.shards import Shard
 from shared.ids import new_id
 

@@ -10,6 +10,7 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from shared.config.lists import split_list
+from shared.config.sizes import Size
 
 MIN_ADMIN_KEY_CHARACTERS = 16
 
@@ -72,7 +73,7 @@ class GatewaySettings(BaseSettings):
     key_requests_per_minute: int | None = Field(
         None, ge=1, description="rate limit of one key, requests per minute; unset: no limit"
     )
-    key_upload_bytes_per_day: int | None = Field(
+    key_upload_bytes_per_day: Size | None = Field(
         None,
         ge=1,
         description="bytes of request bodies that one key may send in 24 hours, whether or not "
@@ -99,11 +100,11 @@ class GatewaySettings(BaseSettings):
     )
 
     # Upload limits.
-    max_file_size: int = Field(10_485_760, gt=0, description="maximum bytes of one photo")
+    max_file_size: Size = Field(100_000_000, gt=0, description="maximum bytes of one photo")
     max_image_pixels: int = Field(
-        50_000_000, gt=0, description="maximum width x height of one photo"
+        200_000_000, gt=0, description="maximum width x height of one photo"
     )
-    max_archive_size: int = Field(
+    max_archive_size: Size = Field(
         10_737_418_240,
         gt=0,
         description="maximum bytes of one batch: of its archive, packed and unpacked, or of all "
@@ -118,10 +119,10 @@ class GatewaySettings(BaseSettings):
         "imports/",
         description="key prefix of the objects that a batch may import from the object store",
     )
-    max_vocabulary_bytes: int = Field(
+    max_vocabulary_bytes: Size = Field(
         64_000_000, gt=0, description="maximum bytes of an imported vocabulary"
     )
-    max_model_bytes: int = Field(
+    max_model_bytes: Size = Field(
         2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
     )
     presign_seconds: int = Field(
@@ -152,7 +153,7 @@ class GatewaySettings(BaseSettings):
     max_concurrent_uploads_per_caller: int = Field(
         16, ge=1, description="concurrent uploads of one key, and of one address"
     )
-    min_free_bytes: int = Field(
+    min_free_bytes: Size = Field(
         500_000_000,
         ge=0,
         description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads are "

@@ -236,6 +236,8 @@ class EvaluationResult:
     """published results on the same set and protocol"""
     suspects: tuple[SuspectLabel, ...] = ()
     """confident first matches that count as wrong but are just outside the positive criterion"""
+    places: dict[str, Any] | None = None
+    """answers at the levels of places (`measure_places`)"""
 
     @property
     def scores(self) -> Scores | None:
@@ -263,6 +265,7 @@ class EvaluationResult:
             "against": self.against.as_json() if self.against else None,
             "published": [each.as_json() for each in self.published],
             "suspects": [asdict(suspect) for suspect in self.suspects],
+            "places": self.places,
         }
 
 

@@ -49,6 +49,7 @@ class ReportOptions:
     grids: int
     only_wrong: bool
     faiss_gpu: bool
+    place_labels_are_paths: bool
     as_json: bool
 
 
@@ -154,6 +155,13 @@ def evaluate(
         bool, typer.Option("--only-wrong", help="Show only failed queries in the report.")
     ] = False,
     faiss_gpu: FaissGpuOption = False,
+    place_labels_are_paths: Annotated[
+        bool,
+        typer.Option(
+            "--place-labels-are-paths",
+            help="With --data: `/` separates the levels of place labels.",
+        ),
+    ] = False,
     sample: Annotated[
         int | None,
         typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
@@ -179,12 +187,21 @@ def evaluate(
     set. With --predictions, evaluate a file of predictions.
     """
     report_options = ReportOptions(
-        out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json
+        out,
+        against,
+        pairs,
+        depth,
+        grids,
+        only_wrong,
+        faiss_gpu,
+        place_labels_are_paths,
+        as_json,
     )
     map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
+        "--place-labels-are-paths": place_labels_are_paths,
     }  # fmt: skip
     file_options: OptionValues = {
         "--ground-truth": ground_truth,

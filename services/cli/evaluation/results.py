@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
-from services.cli.output import console, print_json, printable_path
+from services.cli.evaluation.live_map import answers_table
+from services.cli.output import Json, Table, console, print_json, print_table, printable_path
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
@@ -60,6 +61,7 @@ def evaluate_rankings(
     *,
     has_scores: bool,
     about: dict[str, object],
+    places: Json | None = None,
 ) -> EvaluationResult:
     """Compute all metrics of one set, and the comparison with an earlier run, if requested.
 
@@ -70,6 +72,7 @@ def evaluate_rankings(
         options: Output options.
         has_scores: Whether the scores of `ranked` are meaningful.
         about: Further figures to report, such as the descriptor dimension.
+        places: Answers at the levels of places (`measure_places`), if they were measured.
     """
     measured = compute_metrics(
         ranked.indices,
@@ -111,6 +114,7 @@ def evaluate_rankings(
             if evaluation_set.database
             else ()
         ),
+        places=places,
     )
 
 
@@ -165,7 +169,7 @@ def _print_result(result: EvaluationResult) -> None:
     table.add_row(
         f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
     )
-    console.print(table)
+    print_table(table)
     console.print(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; "
@@ -178,6 +182,8 @@ def _print_result(result: EvaluationResult) -> None:
         soft_wrap=True,
         markup=False,
     )
+    if result.places is not None:
+        print_table(answers_table(result.places))
     if result.against is not None:
         for k, difference in result.against.differences.items():
             bounds = difference.interval_in_points()

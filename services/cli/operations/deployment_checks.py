@@ -15,12 +15,12 @@ import httpx2
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.base import db_now, db_now_plus
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.schema import check_schema
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, Job
 from shared.catalog.processes import ProcessStatus, list_processes
-from shared.catalog.schema import check_schema
-from shared.catalog.session import Catalog
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError, Unavailable

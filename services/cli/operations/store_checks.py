@@ -8,7 +8,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.installation import Installation
 from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others

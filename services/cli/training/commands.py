@@ -22,10 +22,18 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.environment import require_packages
-from services.cli.output import JsonOption, console, err_console, print_json, report_errors
+from services.cli.output import (
+    JsonOption,
+    Table,
+    console,
+    err_console,
+    print_json,
+    print_table,
+    report_errors,
+)
 from services.cli.training.options import given_options, with_training_options
 from services.trainer.arguments import build_arguments, load_yaml
 from shared.errors import InvalidRequest
@@ -106,7 +114,7 @@ def print_summary(report: Json) -> None:
                 str(set_info["queries"]),
                 f"{set_info['fingerprint'][:12]} {set_info['protocol']}, {set_info['rule']}",
             )
-        console.print(table)
+        print_table(table)
     best = report["best"]
     console.print(
         f"Checkpoint: {best['path']} ({best['dimension']} dimensions, {best['fingerprint'][:12]})",
@@ -279,4 +287,4 @@ def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
     table = Table(*columns)
     for row in rows:
         table.add_row(*(row.get(column, "") for column in columns))
-    console.print(table)
+    print_table(table)

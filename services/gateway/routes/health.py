@@ -14,7 +14,7 @@ from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKin
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import is_job_overdue
 from shared.catalog.maps import Map, list_extractors_in_use, list_maps_without_vocabulary
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes

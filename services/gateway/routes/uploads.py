@@ -50,6 +50,10 @@ UPLOAD_FORM = multipart_schema(
     place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},
     tags={**_TEXT_SCHEMA, "description": "separated by commas"},
     metadata={**_TEXT_SCHEMA, "description": "a JSON object"},
+    relative_path={
+        **_TEXT_SCHEMA,
+        "description": "path in its folder or archive, such as Day 2/IMG_2078.jpg",
+    },
     role={
         "type": "string",
         "enum": list(PhotoRole),

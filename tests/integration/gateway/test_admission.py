@@ -15,10 +15,10 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway import admission as room_module
 from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
 from services.gateway.authentication import Caller
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Priority
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ids import new_id

@@ -8,7 +8,7 @@ from uuid import UUID
 
 import pytest
 
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
 from tests.integration.in_process_api import Service

@@ -12,11 +12,11 @@ from alembic import command
 from alembic.config import Config
 from sqlalchemy import MetaData, Table, func, select, text
 
-from shared.catalog import schema
-from shared.catalog.base import db_now
+from shared.catalog.database import schema
+from shared.catalog.database.base import db_now
+from shared.catalog.database.schema import check_schema, migrate, wait_for_schema
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.photos import Photo
-from shared.catalog.schema import check_schema, migrate, wait_for_schema
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
 from tests.support.catalog_rows import made_up_photo

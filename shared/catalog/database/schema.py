@@ -22,15 +22,15 @@ from pathlib import Path
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from shared.catalog.database_errors import DAMAGED, get_sqlstate, reason_of, to_unavailable
-from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.catalog.database.errors import DAMAGED, get_sqlstate, reason_of, to_unavailable
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.config.disk_space import RELEASE_BELOW_BYTES
 from shared.config.private_files import FILE_MODE, make_private_folder
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 
 log = logging.getLogger(__name__)
 
-MIGRATIONS = Path(__file__).parent / "migrations"
+MIGRATIONS = Path(__file__).parent.parent / "migrations"
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
 # While a migration waits for a table's exclusive lock, all later statements on the table wait, too:

@@ -15,7 +15,7 @@ from psycopg.abc import RV, PQGen
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
 
-from shared.catalog.session import PoolConfig, TransactionTimeouts
+from shared.catalog.database.session import PoolConfig, TransactionTimeouts
 
 # Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
 ANSWER_MARGIN_SECONDS = 2.0
