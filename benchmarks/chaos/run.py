@@ -20,10 +20,10 @@ from benchmarks.chaos.traffic import Traffic
 from benchmarks.fleet import Fleet, start_servers
 from benchmarks.report import Report
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import UNFINISHED_STATES, JobKind, JobState
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.jobs import Job
 from shared.storage import ObjectStore

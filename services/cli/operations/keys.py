@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import UUID
 
 import typer
-from rich.table import Table
 
 from placewise.answers import CreatedKey, Key
 from placewise.client import Client
@@ -22,9 +21,10 @@ from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
-    console,
+    Table,
     print_json,
     print_result,
+    print_table,
     report_errors,
 )
 from shared.errors import Conflict, NotFound
@@ -33,7 +33,7 @@ from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
     from shared.catalog.api_keys import ApiKey
-    from shared.catalog.session import Catalog
+    from shared.catalog.database.session import Catalog
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -102,7 +102,7 @@ def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
                 f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
                 _key_status(item),
             )
-        console.print(table)
+        print_table(table)
 
 
 @app.command("revoke")
@@ -158,7 +158,7 @@ def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _Catalo
             yield client
         return
     # Imported here: the clients of a server need no database.
-    from shared.catalog.schema import wait_for_schema
+    from shared.catalog.database.schema import wait_for_schema
     from shared.catalog.tables import open_catalog
 
     settings = read_settings()

@@ -169,10 +169,27 @@ def test_report_is_one_file_that_fetches_nothing(
         "Recall@k",
         "Precision and recall of the first match",
         "Distance of the first match",
+        "Reliability of the probabilities of levels",
         "Map of queries and their first matches",
     ]
     assert town.fingerprint in text
     assert "No published results are shown" in text
+
+
+def test_answers_at_the_levels_are_reported(city: Path, tmp_path: Path) -> None:
+    given = ["--data", city, "--extractor", "test-tiny-avg"]
+    places = run_json("evaluate", *given, "--out", tmp_path)["places"]
+    assert places["source"] == "prior", "ten photos are too few to fit the model on"
+    assert places["samples"] == 6
+    assert [each["certainty"] for each in places["answers"]] == [0.8, 0.9, 0.95, 0.99]
+    assert [each["level"] for each in places["levels"]] == [0, 1, 2, 3], "four radii"
+    stored = json.loads((tmp_path / "metrics.json").read_text())["sets"]["town"]
+    assert stored["places"] == places
+    assert "Levels of places" in (tmp_path / "report.html").read_text()
+    refused = run_json(
+        "evaluate", "--data", city, "--server", "http://x", "--place-labels-are-paths", code=1
+    )
+    assert refused["code"] == "options_contradict"
 
 
 def test_only_wrong_leaves_right_queries_out_of_the_report(city: Path, tmp_path: Path) -> None:
@@ -263,7 +280,7 @@ def test_set_that_is_not_there_is_named(city: Path) -> None:
 
 def test_people_are_shown_a_table(city: Path) -> None:
     shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg")
-    for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m"):
+    for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m", "certainty", "0.95"):
         assert part in shown
 
 

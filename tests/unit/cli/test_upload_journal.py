@@ -138,7 +138,8 @@ def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:
 def test_a_list_names_photos_beside_it_with_what_is_said_of_them(tmp_path: Path) -> None:
     data = manifest(tmp_path, {"filename": "1.jpg", "tags": ["a", "b"], "role": "query"})
     [found] = read_photo_manifest(tmp_path / "list.jsonl", data)
-    assert found == LocalPhoto(tmp_path / "1.jpg", {"tags": "a,b", "role": "query"})
+    fields = {"tags": "a,b", "role": "query"}
+    assert found == LocalPhoto(tmp_path / "1.jpg", fields, relative_path="1.jpg")
 
 
 def test_a_list_that_names_a_missing_photo_is_refused_by_its_line(tmp_path: Path) -> None:
