@@ -34,6 +34,8 @@ class Photo(Answer):
     image_id: UUID
     image_path: str
     original_filename: str
+    relative_path: str | None = None
+    """Path in the folder or archive that it was uploaded from; None if unknown."""
     upload_time: datetime
     file_size: int
     width: int
@@ -349,6 +351,7 @@ class Stats(Answer):
     feature_dimension: int | None
     max_images_per_chunk: int
     extractor: str
+    device: str | None
     vocabulary: str | None
     total_searches: int
     recent_uploads_24h: int

@@ -68,7 +68,7 @@ class Client(Transport):
             photo: The file.
             filename: Name to store; None for the file's own name.
             fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
-                `place`, `tags`, `metadata`, `role`.
+                `place`, `tags`, `metadata`, `role`, `relative_path`.
 
         Raises:
             Conflict: `photo_differs` if the map contains the same image with other metadata.

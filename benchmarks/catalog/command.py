@@ -31,11 +31,11 @@ from services.search.catalog_sync import read_generation_versions
 from services.steward.evaluation_search import read_geotagged_photos
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.jobs import STEWARD_JOBS
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
 from shared.catalog.processes import upsert_search_worker
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.errors import Misconfigured, PlacewiseError

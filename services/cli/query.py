@@ -11,7 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Column
 
 from placewise.answers import Estimate, EstimateLevel, Explanation
-from services.cli.client import connect
+from services.cli.client import connect, describe_target
 from services.cli.output import (
     JsonOption,
     KeyOption,
@@ -105,6 +105,7 @@ def query(
                 word_weights=None if word_weights else False,
                 certainty=certainty,
             )
+            target = describe_target(client, server, map_name)
         if as_json:
             print_json(answer)
             return
@@ -143,8 +144,10 @@ def query(
             console.print(_format_estimate(answer.estimate), soft_wrap=True, markup=False)
         console.print(
             f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
-            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}",
+            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
+            f"Searched {target}",
             soft_wrap=True,
+            markup=False,
         )
 
 

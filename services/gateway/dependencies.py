@@ -23,9 +23,9 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Authenticator
 from services.http_connections import ConnectionLimits, Connections
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import DEFAULT_MAP
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import NotFound, PlacewiseError, invalid_field_error
 from shared.jobs import Job, Wakeups

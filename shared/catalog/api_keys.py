@@ -13,7 +13,14 @@ from uuid import UUID
 from sqlalchemy import BigInteger, Integer, String, Text, Uuid, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, count_rows, db_now, db_now_plus
+from shared.catalog.database.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    count_rows,
+    db_now,
+    db_now_plus,
+)
 from shared.catalog.photos import Photo
 from shared.errors import NotFound, Unauthorized
 from shared.ids import new_id

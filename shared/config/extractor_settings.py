@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
+from shared.config.sizes import Size
 from shared.errors import Misconfigured
 from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
 from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
@@ -61,7 +62,7 @@ class ExtractorSettings(BaseSettings):
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's, downloaded "
         "from the Hugging Face hub",
     )
-    model_cache_bytes: int = Field(
+    model_cache_bytes: Size = Field(
         10_000_000_000,
         ge=0,
         description="size of an extractor's cache of models fetched from a bucket, under "
@@ -69,7 +70,7 @@ class ExtractorSettings(BaseSettings):
     )
     batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
     decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
-    decode_memory_bytes: int = Field(
+    decode_memory_bytes: Size = Field(
         2_000_000_000, ge=500_000_000, description="memory limit of one decoding process, bytes"
     )
     decode_timeout_seconds: float = Field(
@@ -78,7 +79,7 @@ class ExtractorSettings(BaseSettings):
     batch_ahead_photos: int = Field(
         500, ge=1, description="queued photos at which batch uploads wait for the extractors"
     )
-    descriptor_cache_bytes: int = Field(
+    descriptor_cache_bytes: Size = Field(
         20_000_000_000,
         ge=0,
         description="size of the descriptor cache of `evaluate` and `compare`, in "

@@ -3,7 +3,7 @@
 The fields are declared in groups, one base class a group, in the modules beside this one. Each
 field is an environment variable of the same name in capitals. Names of durations end in
 `_seconds`, names of sizes in `_bytes`, except where AnyLoc's name is kept (`MAX_FILE_SIZE`, in
-bytes).
+bytes). Sizes may have a unit: `100MB`.
 """
 
 from __future__ import annotations

@@ -36,6 +36,8 @@ from shared.imaging.file_formats import (
 from shared.imaging.photo_header import ROTATED_ORIENTATIONS
 from shared.imaging.preprocessing import Pixels, Preprocessing
 
+# Larger JPEGs are decoded at half their size. The results of smaller ones stay as they always were.
+FULL_DECODE_PIXELS = 50_000_000
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
 EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright
@@ -63,7 +65,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     """Decode and preprocess a photo, and make its upright thumbnail.
 
     Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
-    eight bits.
+    eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
+    which bounds the memory; no preprocessing needs as many pixels.
 
     Args:
         data: The file's bytes.
@@ -79,6 +82,9 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
             warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
             with _open_image(data) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
+                if image.width * image.height > FULL_DECODE_PIXELS:
+                    # None keeps the mode; other formats than JPEG ignore the call.
+                    image.draft(None, (image.width // 2, image.height // 2))
                 image.load()
                 as_stored = to_rgb(image)
                 upright = apply_exif_orientation(image, as_stored)
@@ -97,7 +103,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     except MemoryError as error:
         raise Unprocessable(
             "undecodable_photo",
-            "Decoding the photo needs more memory than the limit for one photo.",
+            "Decoding the photo needs more memory than the limit for one photo "
+            "(DECODE_MEMORY_BYTES). Send a smaller photo, or a JPEG.",
         ) from error
 
 
@@ -110,7 +117,8 @@ def _open_image(data: bytes) -> Image.Image:
         raise Unprocessable(
             "no_heic_decoder",
             "This server's extractor has no decoder for HEIC. Install the extra `heic` there "
-            "(pip install 'placewise[heic]') and retry the job, or send the photo as JPEG.",
+            "(uv pip install '.[heic]' in the repository) and retry the job, or send the photo as "
+            "JPEG.",
         ) from error
     pillow_heif.options.DECODE_THREADS = 1  # the pool has as many children as there are cores
     pillow_heif.register_heif_opener(thumbnails=False)

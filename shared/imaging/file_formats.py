@@ -97,6 +97,8 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
         raise Unprocessable(
             "too_many_pixels",
-            f"The photo has {width} x {height} pixels; "
-            f"the limit is {max_pixels} pixels in total (MAX_IMAGE_PIXELS).",
+            f"The photo has {width} x {height} pixels, {width * height / 1e6:.4g} megapixels; the "
+            f"limit of this server is {max_pixels / 1e6:.4g} megapixels. Its administrator can "
+            "raise the limit: MAX_IMAGE_PIXELS in the environment of the server, or in the file "
+            ".env of the folder where it starts.",
         )

@@ -30,11 +30,13 @@ EXTRAS = {
 # What every image's command imports, whatever service it runs.
 COMMAND = [
     "services.cli.main",
+    "services.cli.operations.installation_checks",
+    "services.cli.operations.maintenance",
     "shared.catalog.installation",
     "shared.telemetry.heartbeat",
     # Imported at their first use.
     "alembic.command",
-    "shared.catalog.postgres",
+    "shared.catalog.database.postgres",
     "shared.storage.s3",
 ]
 HINTS = ["shared.jobs.celery_wakeups", "shared.jobs.celery_wakeups"]

@@ -33,7 +33,7 @@ from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
     from shared.catalog.api_keys import ApiKey
-    from shared.catalog.session import Catalog
+    from shared.catalog.database.session import Catalog
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -158,7 +158,7 @@ def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _Catalo
             yield client
         return
     # Imported here: the clients of a server need no database.
-    from shared.catalog.schema import wait_for_schema
+    from shared.catalog.database.schema import wait_for_schema
     from shared.catalog.tables import open_catalog
 
     settings = read_settings()

@@ -30,7 +30,7 @@ from services.gateway.schemas import (
 from services.gateway.similarity.estimate import add_levels, estimate_place, locate_hits
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, Search, get_map
 from shared.catalog.photos import Photo, get_live_photos, get_photo

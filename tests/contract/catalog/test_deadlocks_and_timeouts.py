@@ -13,14 +13,14 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.maps import Map, lock_map
-from shared.catalog.session import (
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.session import (
     MAX_TRANSACTION_ATTEMPTS,
     Catalog,
     PoolConfig,
     TransactionTimeouts,
 )
+from shared.catalog.maps import Map, lock_map
 from tests.support.catalog_rows import add_map
 from tests.support.servers import PostgresServer
 

@@ -12,7 +12,8 @@ from sqlalchemy import func, select, update
 
 from services.steward.tasks import maintenance as retention
 from services.steward.tasks.maintenance import delete_expired_idempotency_keys
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import (
     IdempotencyRecord,
     RequestIdentity,
@@ -21,7 +22,6 @@ from shared.catalog.idempotency import (
     release_idempotency_key,
     store_response,
 )
-from shared.catalog.session import Catalog
 from shared.errors import Conflict, Unprocessable
 
 CALL = RequestIdentity("someone", "key-1", "POST /api/v1/maps", "f" * 64)

@@ -10,11 +10,11 @@ from uuid import UUID
 
 from sqlalchemy import text
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.photo_search import MetadataFilter, search_photos
 from shared.catalog.photos import (
     Photo,
 )
-from shared.catalog.session import Catalog
 from shared.search_api.photo_filter import PhotoFilter
 from tests.contract.catalog.test_session import MOMENT
 from tests.support.catalog_rows import add_job, add_map, add_photo

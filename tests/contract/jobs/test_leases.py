@@ -14,11 +14,11 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import OperationalError
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import get_job
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import (
     Job,

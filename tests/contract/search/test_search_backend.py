@@ -10,8 +10,8 @@ from uuid import UUID
 import numpy as np
 import pytest
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import PhotoRole
-from shared.catalog.session import Catalog
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import Box, Circle

@@ -12,8 +12,8 @@ from services.search import executor, gpu
 from services.search import worker as worker_module
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.search_api.protocol import SearchBackend

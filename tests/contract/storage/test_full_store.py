@@ -17,9 +17,9 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import StorageFull, Unavailable
 from shared.jobs import InProcessWakeups, Job

@@ -14,7 +14,7 @@ from redis import Redis
 from sqlalchemy import func, select
 
 from services.steward.tasks.maintenance import resend_wakeups
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import Job, JobState

@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
 from benchmarks.catalog.explain import Explainer
 from benchmarks.catalog.fill import fill_catalog
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.

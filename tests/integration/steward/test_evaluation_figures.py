@@ -12,8 +12,8 @@ import sqlalchemy as sql
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
-from shared.catalog.session import Catalog
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
 from tests.integration.town import Town, Watched

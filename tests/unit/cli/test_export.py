@@ -107,6 +107,14 @@ def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused(
     assert caught.value.code == "ambiguous_names"
 
 
+def test_pairs_name_photos_of_one_name_by_their_paths(server: FakeServer, client: Client) -> None:
+    first = photo("1.jpg", relative_path="day-1/1.jpg")
+    second = photo("1.jpg", relative_path="day-2/1.jpg")
+    will_list(server, first, photo("2.jpg", "query", relative_path=None))
+    server.will_answer(200, {**SIMILAR, "similar_images": [{**second, "similarity_score": 0.5}]})
+    assert pairs_of(client, PairNames.PATH)[0] == "2.jpg day-2/1.jpg\n"
+
+
 def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     server: FakeServer, client: Client
 ) -> None:
@@ -124,6 +132,7 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     one, query, estimate = found["features"]
     assert one["geometry"] == {"type": "Point", "coordinates": [7.25, 45.5]}
     assert one["properties"]["tags"] == ["é"]
+    assert one["properties"]["relative_path"] == "Day 2/street.jpg"
     assert query["geometry"] is None
     assert estimate["properties"]["query"] == query["id"]
     assert estimate["geometry"]["coordinates"] == [7.25, 45.5]

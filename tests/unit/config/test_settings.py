@@ -64,6 +64,14 @@ def test_catalog_is_sqlite_below_the_home_unless_a_database_is_named(
     assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
 
 
+@pytest.mark.parametrize("scheme", ["postgres", "postgresql", "postgresql+psycopg"])
+def test_urls_of_postgresql_may_have_its_usual_schemes(
+    monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    monkeypatch.setenv("DATABASE_URL", f"{scheme}://me:secret@db/places")
+    assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
+
+
 def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://me:hunter2@db/places")
     settings = Settings()
@@ -93,6 +101,46 @@ def test_values_out_of_range_are_refused_by_name(
     monkeypatch.setenv(name, value)
     with pytest.raises(ValidationError, match=name.lower()):
         Settings()
+
+
+@pytest.mark.parametrize(
+    ("written", "size_bytes"),
+    [("10MB", 10_000_000), ("2 GiB", 2 * 2**30), ("1.5kB", 1500), ("123", 123), (" 123 ", 123)],
+)
+def test_sizes_may_have_a_unit(
+    monkeypatch: pytest.MonkeyPatch, written: str, size_bytes: int
+) -> None:
+    monkeypatch.setenv("MAX_FILE_SIZE", written)
+    assert Settings().max_file_size == size_bytes
+
+
+def test_camera_photos_are_accepted_by_default() -> None:
+    settings = Settings()
+    assert (settings.max_file_size, settings.max_image_pixels) == (100_000_000, 200_000_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("PORT", "abc", "PORT=abc: expected a whole number (listening port; 0 picks a free port)"),
+        ("PORT", "70000", "PORT=70000: expected a value less than or equal to 65535"),
+        ("MAX_FILE_SIZE", "big", "MAX_FILE_SIZE=big: expected a size such as 100MB"),
+        ("MAX_FILE_SIZE", "-1", "MAX_FILE_SIZE=-1: expected a value greater than 0"),
+        ("MAX_FILE_SIZE", "10 parsecs", "MAX_FILE_SIZE=10 parsecs: expected a size such as"),
+        ("DEBUG", "perhaps", "DEBUG=perhaps: expected true or false"),
+        ("LEASE_SECONDS", "soon", "LEASE_SECONDS=soon: expected a number"),
+        ("DEVICE", "tpu", "DEVICE=tpu: expected 'auto'"),
+        ("DATABASE_URL", "mysql://me:s3cret@db/x", "DATABASE_URL: the scheme 'mysql' is not known"),
+        ("DATABASE_URL", "s3cret", "DATABASE_URL: it has no scheme; expected postgresql://"),
+        ("ADMIN_KEY", "s3cret", "ADMIN_KEY: a key has at least 16 printable"),
+    ],
+)
+def test_a_bad_setting_is_named_with_its_value_and_what_is_expected(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
+    detail = refusal(monkeypatch, **{name: value})
+    assert detail.startswith(message)
+    assert "s3cret" not in detail
 
 
 S3 = {"S3_ENDPOINT": "s3:8333", "S3_ACCESS_KEY": "placewise", "S3_SECRET_KEY": "a secret"}
@@ -289,7 +337,7 @@ def test_what_says_how_dino_is_used_is_refused_without_it(
             ),
         ),
         ({**PREDECESSORS, "DESC_LAYER": "-1"}, "DESC_LAYER=-1 with DINO_MODEL=dinov2_vitg14"),
-        ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER: Input should be a valid integer"),
+        ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER=last: expected a whole number"),
         ({**PREDECESSORS, "DESC_FACET": "values"}, "query, key, value, token"),
         ({**PREDECESSORS, "VLAD_CLUSTERS": "0"}, "VLAD_CLUSTERS=0 with DINO_MODEL=dinov2_vitg14"),
     ],

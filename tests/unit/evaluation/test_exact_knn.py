@@ -75,6 +75,6 @@ def test_progress_ends_where_it_said_it_would() -> None:
 
 def test_gpu_that_faiss_does_not_have_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faiss, "get_num_gpus", lambda: 0)
-    with pytest.raises(Misconfigured, match="--faiss_gpu False") as refused:
+    with pytest.raises(Misconfigured, match="Omit --faiss-gpu") as refused:
         exact_knn(unit_rows(2, 4, 8), unit_rows(2, 4, 9), 1, faiss_gpu=True)
     assert refused.value.code == "faiss_gpu_missing"

@@ -185,7 +185,10 @@ def test_file_over_the_limit_is_refused_without_reading_the_rest(store: FolderSt
 def test_limit_is_inclusive(store: FolderStore) -> None:
     assert receive(store, file() + END, max_bytes=len(PHOTO)).size_bytes == len(PHOTO)
     store.delete(KEY)
-    assert refused(store, file() + END, max_bytes=len(PHOTO) - 1).code == "file_too_large"
+    error = refused(store, file() + END, max_bytes=len(PHOTO) - 1)
+    assert error.code == "file_too_large"
+    assert f"larger than {(len(PHOTO) - 1) / 1e6:g} MB" in error.detail
+    assert "MAX_FILE_SIZE in the environment of the server, or in the file .env" in error.detail
 
 
 def test_declared_length_over_the_limit_is_refused_before_anything_is_read(

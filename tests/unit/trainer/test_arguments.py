@@ -20,6 +20,7 @@ from services.trainer.arguments import (
     save_yaml,
 )
 from shared.errors import InvalidRequest, NotFound
+from tests.support.training_runs import PUBLISHED_COMMAND
 
 PREDECESSORS: dict[str, Any] = {
     "backbone_arch": "resnet18",
@@ -69,24 +70,6 @@ PREDECESSORS: dict[str, Any] = {
     "fast_dev_run": False,
 }
 
-# As the predecessor's README prints it; only the program's name is another.
-PUBLISHED = r"""
-   --batch_size 100 --img_per_place 4 --min_img_per_place 4 --shuffle_all False
-   --random_sample_from_each_place True --image_size "(320, 320)" --num_workers 8
-   --show_data_stats True --val_set_names '["sfxs_val"]'
-   --test_set_names '["sfxs_test", "tokyoxs_test"]' --backbone_arch "resnet18" --pretrained True
-   --layers_to_freeze -1 --layers_to_crop '[4]' --agg_arch "Gem" --agg_config '{"p":3}'
-   --lr 0.0002 --optimizer "adam" --weight_decay 0 --momentum 0.9 --warmpup_steps 600
-   --milestones '[5, 10, 15, 25]' --lr_mult 0.3 --loss_name "MultiSimilarityLoss"
-   --miner_name "BatchHardMiner" --miner_margin 0.1 --faiss_gpu True --monitor "sfxs_val/R1"
-   --filename "{self.backbone_arch}\_epoch({epoch:02d})\_step({step:04d})\_R1[{pitts30k_val/R1:.4f}]\_R5[{sfxs_val/R5:.4f}]"
-   --auto_insert_metric_name False --save_weights_only True --save_top_k 3 --mode "max"
-   --accelerator "gpu" --devices 1 --default_root_dir "./LOGS/{self.backbone_arch}"
-   --num_sanity_val_steps 0 --precision 32 --max_epochs 8 --check_val_every_n_epoch 1
-   --reload_dataloaders_every_n_epochs 1 --log_every_n_steps 20 --fast_dev_run False
-   --model_path '' --experiment_phase "train"
-"""  # noqa: E501
-
 
 def read(tokens: list[str]) -> TrainingArguments:
     """What the command makes of its tokens."""
@@ -109,7 +92,7 @@ def test_every_argument_of_the_predecessor_is_there_with_its_default(name: str) 
 
 
 def test_the_published_command_means_what_its_authors_ran() -> None:
-    arguments = read(shlex.split(PUBLISHED))
+    arguments = read(shlex.split(PUBLISHED_COMMAND))
     assert arguments.batch_size == 100
     assert arguments.image_size == (320, 320)
     assert arguments.val_set_names == ("sfxs_val",)
@@ -130,10 +113,13 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    answer = CliRunner().invoke(build_app(["train"]), ["train", *shlex.split(PUBLISHED)])
+    command = ["train", *shlex.split(PUBLISHED_COMMAND), "--pretrained", "False"]
+    answer = CliRunner().invoke(build_app(["train"]), command)
     assert answer.exit_code == 1
-    assert "no_gpu" in answer.output
-    assert "--accelerator cpu" in answer.output.replace("\n", " ")
+    shown = answer.output.replace("\n", " ")
+    assert "no_gpu" in shown
+    assert "--accelerator cpu" in shown
+    assert "data_root_missing" in shown, "every obstacle is listed at once"
 
 
 @pytest.mark.parametrize(
@@ -178,6 +164,8 @@ def test_hyphens_are_as_good_as_underscores() -> None:
         (["--logger", "none"], "logger", ()),
         (["--logger", "csv"], "logger", ("csv",)),
         (["--lr", "1e-3"], "lr", 1e-3),
+        (["--layers_to_crop", "4"], "layers_to_crop", (4,)),
+        (["--milestones", "5,10"], "milestones", (5, 10)),
     ],
 )
 def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: object) -> None:
@@ -187,7 +175,8 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("pretrained", "maybe", "valid boolean"),
+        ("pretrained", "maybe", "Expected True or False"),
+        ("layers_to_crop", "layer4", r"Expected a JSON list, such as \[4\]"),
         ("optimizer", "adams", "'adam', 'adamw' or 'sgd'"),
         ("batch_size", "many", "valid integer"),
         ("batch_size", "0", "greater than or equal to 1"),
@@ -201,6 +190,14 @@ def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: 
     with pytest.raises(InvalidRequest, match=said) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
+
+
+def test_a_word_after_a_boolean_option_is_its_value() -> None:
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--shuffle_all", "maybe"])
+    assert answer.exit_code == 1
+    shown = answer.output.replace("\n", " ")
+    assert "--shuffle_all" in shown
+    assert "Expected True or False (got 'maybe')" in shown
 
 
 def test_an_option_that_there_is_not_names_the_nearest() -> None:
@@ -237,7 +234,7 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_written_configuration_is_read_as_the_same_run(tmp_path: Path) -> None:
-    arguments = read(shlex.split(PUBLISHED))
+    arguments = read(shlex.split(PUBLISHED_COMMAND))
     save_yaml(arguments, tmp_path / "config.yaml")
     assert build_arguments(load_yaml(tmp_path / "config.yaml")) == arguments
 

@@ -117,6 +117,7 @@ class Runs:
 
     def __init__(self, out: Path, **endings: Exception | float) -> None:
         self.out, self.endings, self.calls = out, endings, list[str]()
+        self.obstacles: list[PlacewiseError] = []
 
     def begin(self, arguments: Any, display: Display, stop: StopRequest) -> dict[str, Any]:
         return self._end("begin", self.out / arguments.run_name, arguments)
@@ -141,6 +142,7 @@ class Runs:
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(run, "run", self.begin)
             patched.setattr(run, "resume", self.resume)
+            patched.setattr(run, "find_obstacles", lambda arguments: self.obstacles)
             return run_grid(plan, self.out, NullDisplay(), StopRequest(), lambda outcomes: None)
 
 
@@ -173,6 +175,14 @@ def test_a_failed_run_is_named_and_the_others_are_made(tmp_path: Path) -> None:
     ]
     assert outcomes[1].error == {"code": "RuntimeError", "detail": "out of memory"}
     assert "out of memory" in (tmp_path / "b" / "failed.json").read_text()
+
+
+def test_a_grid_stops_when_no_run_can_start_for_the_same_reason(tmp_path: Path) -> None:
+    runs = Runs(tmp_path, a=Misconfigured("no_gpu", "x"), b=0.5)
+    runs.obstacles = [Misconfigured("no_gpu", "x")]
+    outcomes = runs.go(plain_plan("a", "b"))
+    assert [outcome.state for outcome in outcomes] == [RunState.FAILED, RunState.WAITING]
+    assert runs.calls == ["begin a"]
 
 
 def test_a_grid_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -209,6 +219,13 @@ def test_the_leaderboard_is_ranked_by_the_best_epochs_and_names_failures(tmp_pat
     with (tmp_path / "leaderboard.csv").open() as file:
         assert list(csv.DictReader(file)) == rows
     assert (tmp_path / "leaderboard.md").read_text().count("\n") == 5
+
+
+def test_the_leaderboard_counts_epochs_and_not_validations(tmp_path: Path) -> None:
+    plan = plain_plan("a")
+    outcomes = Runs(tmp_path, a=0.5).go(plan)
+    outcomes[0].report["epochs"] = [{"number": 3, "figures": {}}, {"number": 7, "figures": {}}]
+    assert leaderboard(plan, outcomes)[0]["epochs"] == "8"
 
 
 @pytest.mark.parametrize(("fingerprint", "shown"), [("abc", True), ("abd", False), (None, False)])
