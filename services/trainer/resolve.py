@@ -6,10 +6,14 @@ read; creates the loggers and the checkpoint settings.
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import json
+import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch.loggers import (
@@ -116,15 +120,23 @@ def _device_index(devices: int | str | tuple[int, ...]) -> int:
     )
 
 
-def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
-    """Create Lightning loggers by name.
+def make_loggers(
+    names: tuple[str, ...], folder: Path, arguments: dict[str, Any], completed_steps: int = 0
+) -> list[Logger]:
+    """Create Lightning loggers by name; that of a resumed run continues its CSV file.
 
     Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`).
+
+    Args:
+        names: the loggers.
+        folder: the run's folder.
+        arguments: logged as hyperparameters.
+        completed_steps: steps of the checkpoint that the run resumes; later rows are dropped.
     """
     loggers: list[Logger] = []
     for name in names:
         if name == "csv":
-            loggers.append(CSVLogger(folder, name="csv"))
+            loggers.append(_continue_csv(folder, completed_steps))
         elif name == "tensorboard":
             loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
         elif name == "wandb":
@@ -134,6 +146,26 @@ def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]
     for logger in loggers:
         logger.log_hyperparams(arguments)
     return loggers
+
+
+def _continue_csv(folder: Path, completed_steps: int) -> CSVLogger:
+    """Create a CSV logger that begins with the rows that earlier parts of the run have logged."""
+    logger = CSVLogger(folder, name="csv")
+    earlier = sorted((folder / "csv").glob("version_*/metrics.csv"), key=os.path.getmtime)
+    rows: dict[str, dict[str, str]] = {}  # each once, also if a copy was interrupted
+    for file in earlier:
+        with file.open(newline="") as opened:
+            for row in csv.DictReader(opened):
+                if int(row["step"]) <= completed_steps:
+                    logged = {name: value for name, value in row.items() if value != ""}
+                    rows[json.dumps(logged, sort_keys=True)] = logged
+    for logged in rows.values():
+        # Values are written as they were read, so that an interrupted copy is recognised.
+        logger.log_metrics(cast("dict[str, float]", logged), int(logged["step"]))
+    logger.save()
+    for file in earlier:
+        shutil.rmtree(file.parent)
+    return logger
 
 
 def check_loggers(names: tuple[str, ...]) -> None:

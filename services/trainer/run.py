@@ -38,9 +38,10 @@ from services.trainer.run_folder import (
 )
 from services.trainer.summary import build_summary, print_data_sets
 from services.trainer.training_loop import TrainingLoop, TrainingRun
-from services.trainer.validation import Validator
+from services.trainer.validation import Validator, write_predictions
 from shared.descriptors.vpr_models.checkpoint import Checkpoint, load_checkpoint
 from shared.errors import Conflict, InvalidRequest, Misconfigured, PlacewiseError
+from shared.evaluation.ranking import RecallEvaluation
 
 Json = dict[str, Any]
 
@@ -195,13 +196,16 @@ def _train(
             validator.sanity_check(prepared.model, sets.validation, 1)
             display.info("One batch of training and validation succeeded; no files were written.")
             return {"fast_dev_run": True}
-        loop.fit(make_loggers(arguments.logger, folder, to_plain_dict(arguments)))
+        loop.fit(
+            make_loggers(arguments.logger, folder, to_plain_dict(arguments), loop.completed_steps)
+        )
         prepared.history.save(folder)
-        test_recalls = {}
+        tests: dict[str, RecallEvaluation] = {}
         if arguments.experiment_phase == "all":
             best_path = checkpoints.best_path or checkpoints.last_path
             best = load_checkpoint(best_path).model.to(device.torch_device)
-            test_recalls = validator.measure(best, sets.test, for_tests=True)
+            tests = validator.measure(best, sets.test, for_tests=True)
+            write_predictions(folder, tests)
     except RunStopped:
         if not checkpoints.last_path.is_file():
             raise RunStopped(
@@ -211,7 +215,7 @@ def _train(
             f"Stopped. {checkpoints.last_path} holds the full training state; resume with\n"
             f"  placewise train --resume {shlex.quote(str(folder))}"
         ) from None
-    report = build_summary(arguments, folder, prepared.history, checkpoints, sets, test_recalls)
+    report = build_summary(arguments, folder, prepared.history, checkpoints, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report
 
@@ -238,9 +242,10 @@ def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRe
         display.info(note)
     validator = Validator(arguments, device, display.progress, stop)
     model = checkpoint.model.to(device.torch_device)
-    test_recalls = validator.measure(model, sets.test, for_tests=True)
+    tests = validator.measure(model, sets.test, for_tests=True)
     folder = create_run_folder(arguments)
+    write_predictions(folder, tests)
     save_yaml(arguments, folder / CONFIG_FILE)
-    report = build_summary(arguments, folder, None, None, sets, test_recalls)
+    report = build_summary(arguments, folder, None, None, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report

@@ -19,11 +19,11 @@ from services.cli.output import Json, Table, console, print_json, print_table, p
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
-from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet
+from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet, open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
 from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.bootstrap import ConfidenceInterval, cluster_queries, singleton_clusters
-from shared.evaluation.exact_knn import Rankings
+from shared.evaluation.exact_knn import Indices, Rankings
 from shared.evaluation.ranking import DEFAULT_KS
 from shared.evaluation.report.page import render_report
 from shared.evaluation.results import (
@@ -240,11 +240,9 @@ def evaluate_predictions(
     """
     if (database is None) != (queries is None):
         raise InvalidRequest("one_list", "--database and --queries must be given together.")
-    if sets and len(sets) > 1:
-        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
     check_output_folders(options)
     ranked = read_predictions(predictions)
-    name = sets[0] if sets else ground_truth.stem
+    name = _only_set(sets) or ground_truth.stem
     rule = None
     photo_lists: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
     if database is not None and queries is not None:
@@ -271,6 +269,47 @@ def evaluate_predictions(
         rule=rule or f"given by {ground_truth.name}",
         protocol=PREDICTIONS_PROTOCOL,
     )
+    _output_predictions(predictions, ranked, evaluation_set, options)
+
+
+def evaluate_predictions_of_set(
+    predictions: Path,
+    data: Path,
+    sets: Sequence[str] | None,
+    protocol: str | None,
+    rule: str | None,
+    options: ReportOptions,
+) -> None:
+    """Evaluate a file of predictions on a set of a data set, with the set's own ground truth.
+
+    Args:
+        predictions: (queries, k) database indices, best first, `.npy`, in the order of the set.
+        data: Folder of the data set.
+        sets: At most one name; may be omitted if there is only one set.
+        protocol: One of the layout's protocols, or None.
+        rule: Positive-match criterion, or None.
+        options: Output options.
+
+    Raises:
+        InvalidRequest: `which_set`, and errors of opening the set and reading the predictions.
+        Misconfigured: `out_unwritable`.
+    """
+    evaluation_set = open_evaluation_set(data, _only_set(sets), protocol=protocol, rule=rule)
+    check_output_folders(options)
+    ranked = read_predictions(predictions)
+    check_predictions(predictions, ranked, evaluation_set.positives, len(evaluation_set.database))
+    _output_predictions(predictions, ranked, evaluation_set, options)
+
+
+def _only_set(sets: Sequence[str] | None) -> str | None:
+    if sets and len(sets) > 1:
+        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
+    return sets[0] if sets else None
+
+
+def _output_predictions(
+    predictions: Path, ranked: Indices, evaluation_set: EvaluationSet, options: ReportOptions
+) -> None:
     truncated = ranked[:, : options.depth]
     rankings = Rankings(truncated, np.zeros(truncated.shape, np.float32))
     result = evaluate_rankings(evaluation_set, rankings, options, has_scores=False, about={})

@@ -22,7 +22,6 @@ from services.trainer.arguments import (
 
 FIELDS = TrainingArguments.model_fields
 BOOLEANS = {name for name, field in FIELDS.items() if field.annotation is bool}
-BOOLEAN_WORDS = {"true", "false", "yes", "no", "on", "off", "1", "0"}
 SIZES = ("image_size", "test_image_size")
 
 
@@ -91,7 +90,8 @@ def add_values(tokens: Sequence[str]) -> list[str]:
     while remaining:
         token = remaining.pop(0)
         name = normalise_name(token.removeprefix("--")) if token.startswith("--") else ""
-        has_value = remaining and remaining[0].lower() in BOOLEAN_WORDS
+        # A word is its value, right or wrong; a path is the file of `placewise grid`.
+        has_value = remaining and remaining[0].isalnum()
         if name in BOOLEANS and not has_value:
             token = f"--{name}=true"
         elif name.startswith("no_") and name.removeprefix("no_") in BOOLEANS:

@@ -50,6 +50,18 @@ def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Pa
     assert code_of(missing) == "set_missing"
 
 
+def test_query_sets_of_sf_xl_share_a_database(tmp_path: Path) -> None:
+    pair(tmp_path / "SF_XL" / "test", [0, 25], [0])
+    (tmp_path / "SF_XL/test/queries").rename(tmp_path / "SF_XL/test/queries_v1")
+    second_queries = [utm_name(480_000 + metres, 4_880_000) for metres in (25, 500)]
+    write_photos(tmp_path / "SF_XL/test/queries_v2", second_queries)
+    assert evaluation_set_names(tmp_path / "SF_XL") == ("sfxl_test_v1", "sfxl_test_v2")
+    assert rows(open_evaluation_set(tmp_path / "SF_XL", "sfxl_test_v1")) == [[0, 1]]
+    second = open_evaluation_set(tmp_path / "SF_XL", "sfxl_test_v2")
+    assert rows(second) == [[0, 1], []]
+    assert second.queries[0].name.startswith("test/queries_v2/")
+
+
 def test_data_sets_of_one_name_are_told_apart(tmp_path: Path) -> None:
     pair(tmp_path / "my-city", [0], [0])
     pair(tmp_path / "my_city", [0, 1], [0])

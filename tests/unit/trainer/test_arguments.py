@@ -164,6 +164,8 @@ def test_hyphens_are_as_good_as_underscores() -> None:
         (["--logger", "none"], "logger", ()),
         (["--logger", "csv"], "logger", ("csv",)),
         (["--lr", "1e-3"], "lr", 1e-3),
+        (["--layers_to_crop", "4"], "layers_to_crop", (4,)),
+        (["--milestones", "5,10"], "milestones", (5, 10)),
     ],
 )
 def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: object) -> None:
@@ -173,7 +175,8 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("pretrained", "maybe", "valid boolean"),
+        ("pretrained", "maybe", "Expected True or False"),
+        ("layers_to_crop", "layer4", r"Expected a JSON list, such as \[4\]"),
         ("optimizer", "adams", "'adam', 'adamw' or 'sgd'"),
         ("batch_size", "many", "valid integer"),
         ("batch_size", "0", "greater than or equal to 1"),
@@ -187,6 +190,14 @@ def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: 
     with pytest.raises(InvalidRequest, match=said) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
+
+
+def test_a_word_after_a_boolean_option_is_its_value() -> None:
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--shuffle_all", "maybe"])
+    assert answer.exit_code == 1
+    shown = answer.output.replace("\n", " ")
+    assert "--shuffle_all" in shown
+    assert "Expected True or False (got 'maybe')" in shown
 
 
 def test_an_option_that_there_is_not_names_the_nearest() -> None:

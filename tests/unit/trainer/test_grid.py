@@ -221,6 +221,13 @@ def test_the_leaderboard_is_ranked_by_the_best_epochs_and_names_failures(tmp_pat
     assert (tmp_path / "leaderboard.md").read_text().count("\n") == 5
 
 
+def test_the_leaderboard_counts_epochs_and_not_validations(tmp_path: Path) -> None:
+    plan = plain_plan("a")
+    outcomes = Runs(tmp_path, a=0.5).go(plan)
+    outcomes[0].report["epochs"] = [{"number": 3, "figures": {}}, {"number": 7, "figures": {}}]
+    assert leaderboard(plan, outcomes)[0]["epochs"] == "8"
+
+
 @pytest.mark.parametrize(("fingerprint", "shown"), [("abc", True), ("abd", False), (None, False)])
 def test_a_published_figure_stands_only_beside_one_of_the_same_set(
     fingerprint: str | None, shown: bool, tmp_path: Path
