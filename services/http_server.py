@@ -12,10 +12,14 @@ from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.http_connections import Connections, LimitedProtocol
 from shared.errors import Misconfigured
 
+PEER_ADDRESS = "placewise.peer"
+"""Key of the ASGI scope: address of the connection, whatever the headers say."""
 BACKLOG = 2048  # connections that wait to be accepted
 # Connections accepted per wakeup. They are counted before more are accepted, so that a burst of
 # connections can't use up all file descriptors.
@@ -65,10 +69,11 @@ def http_server(
     proxies = [str(network) for network in connections.limits.trusted_proxies]
     server = NotifyingServer(
         uvicorn.Config(
-            app,
+            # Instead of uvicorn's own, which would replace the address before it can be recorded.
+            _record_peer(ProxyHeadersMiddleware(app, trusted_hosts=proxies)),
+            proxy_headers=False,
             loop="asyncio",
             http=partial(LimitedProtocol, connections),  # type: ignore[arg-type]
-            forwarded_allow_ips=proxies,
             backlog=ACCEPTED_AT_ONCE,
             log_config=None,
             access_log=False,  # `request_log` logs requests
@@ -79,6 +84,17 @@ def http_server(
     server.on_stop = on_stop
     server.connections = connections
     return server
+
+
+def _record_peer(app: ASGIApp) -> ASGIApp:
+    """Record the address of the connection in the scope, before `X-Forwarded-For` replaces it."""
+
+    async def recording(scope: Scope, receive: Receive, send: Send) -> None:
+        if client := scope.get("client"):
+            scope[PEER_ADDRESS] = client[0]
+        await app(scope, receive, send)
+
+    return recording
 
 
 @contextlib.contextmanager

@@ -25,6 +25,7 @@ from services.gateway.authentication import (
     LocalhostAuthenticator,
 )
 from services.gateway.dependencies import GatewayContext
+from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
@@ -219,7 +220,8 @@ def _create_authenticator(
 ) -> tuple[Authenticator, str | None, str | None]:
     """Return the authenticator, the first admin key if it is created now, and the local key."""
     # Both the configured name and the address it resolves to, which can change.
-    if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
+    needs_key = settings.admin_key is not None or settings.sign_in_networks
+    if not needs_key and is_loopback(settings.host) and is_loopback(host):
         return LocalhostAuthenticator(settings.allowed_origins), None, None
     local_key, first_admin_key = generate_local_key(), None
     admins = [hash_api_key(local_key)]
@@ -231,4 +233,5 @@ def _create_authenticator(
                 _, first_admin_key = create_api_key(
                     session, "made at the first start", [Scope.ADMIN]
                 )
-    return ApiKeyAuthenticator(catalog, *admins), first_admin_key, local_key
+    keys = with_proxy_sign_in(ApiKeyAuthenticator(catalog, *admins), settings)
+    return keys, first_admin_key, local_key

@@ -179,8 +179,9 @@ def run_chaos(
     """Upload `photos` in equal parts, one per fault; the seed determines the order of the faults.
 
     Faults that have a duration last `fault_seconds`. Queries are sent every
-    `query_interval_seconds`, and `queries_per_fault` more after each fault. The run ends at the first fault that leaves a
-    violation; the services' logs are then part of the result. `executed`: see `Fleet`.
+    `query_interval_seconds`, and `queries_per_fault` more after each fault. The run ends at the
+    first fault that leaves a violation; the services' logs are then part of the result. `executed`:
+    see `Fleet`.
     """
     moments = random.Random(seed)
     chosen = list(faults or all_faults())

@@ -186,9 +186,9 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     """The Unavailable error of a database failure; None for any other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.database.errors import to_unavailable  # few commands use a database
+    from shared.catalog.database.errors import explain_outage  # few commands use a database
 
-    return to_unavailable(error)
+    return explain_outage(error)
 
 
 def _print_error(error: PlacewiseError, as_json: bool) -> None:

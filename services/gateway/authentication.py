@@ -29,6 +29,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from services.http_server import PEER_ADDRESS
 from shared.catalog.api_keys import (
     LAST_USED_RESOLUTION_SECONDS,
     KeyLimits,
@@ -69,8 +70,12 @@ class Caller:
 class Authenticator(Protocol):
     """Authenticates requests before they are routed."""
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         """Return the caller of a request.
+
+        Args:
+            headers: The request's headers.
+            peer: Address of the connection, whatever the headers say; None if unknown.
 
         Raises:
             Unauthorized: `key_missing`, `key_unknown`, `key_revoked` or `key_expired`.
@@ -96,7 +101,7 @@ class LocalhostAuthenticator:
         """`trusted_origins` (CORS_ORIGINS) are origins of web pages that are accepted."""
         self._trusted = trusted_origins
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         for name in FORWARDED:
             if name in headers:
                 raise Forbidden(
@@ -113,18 +118,23 @@ class LocalhostAuthenticator:
                 "Without a key only requests to localhost are accepted; this one is to "
                 f"{host[:100]!r} (Host header). Set ADMIN_KEY to accept other host names.",
             )
-        origin = headers.get("origin", f"http://{host}")
-        if origin.partition("://")[2] != host and origin not in self._trusted:
-            raise Forbidden(
-                "foreign_page",
-                "Without a key web pages of other origins are refused; this one is of "
-                f"{origin[:100]!r} (Origin header). Add the origin to CORS_ORIGINS, or set "
-                "ADMIN_KEY.",
-            )
+        check_same_origin(headers, self._trusted)
         return Caller("this machine", ALL_SCOPES)
 
     async def record_use(self, caller: Caller) -> None:
         pass
+
+
+def check_same_origin(headers: Headers, trusted_origins: Container[str]) -> None:
+    """Raise Forbidden (`foreign_page`) if a web page of another origin sends the request."""
+    host = headers.get("host", "")
+    origin = headers.get("origin", f"http://{host}")
+    if origin.partition("://")[2] != host and origin not in trusted_origins:
+        raise Forbidden(
+            "foreign_page",
+            "Without a key web pages of other origins are refused; this one is of "
+            f"{origin[:100]!r} (Origin header). Add the origin to CORS_ORIGINS, or send a key.",
+        )
 
 
 def _host_name(host: str) -> str:
@@ -150,7 +160,7 @@ class ApiKeyAuthenticator:
             MAX_REMEMBERED_USES, LAST_USED_RESOLUTION_SECONDS
         )
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         key_sha256 = hash_api_key(parse_bearer(headers.get("authorization")))
         # In constant time, against timing attacks.
         if any(hmac.compare_digest(key_sha256, admin) for admin in self._admins):
@@ -236,7 +246,9 @@ class AuthenticationMiddleware:
             return
         request = Request(scope)
         try:
-            caller = await self._authenticator.authenticate(request.headers)
+            caller = await self._authenticator.authenticate(
+                request.headers, scope.get(PEER_ADDRESS)
+            )
         except PlacewiseError as error:
             log.debug("%s %s: %s", request.method, request.url.path, error.code)
             await problem_response(error, request)(scope, receive, send)

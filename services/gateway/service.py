@@ -7,6 +7,7 @@ import contextlib
 from services.gateway.app import create_app
 from services.gateway.authentication import ApiKeyAuthenticator
 from services.gateway.dependencies import GatewayContext
+from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
 from services.service_process import Announce, service_process
 from shared.catalog.api_keys import has_admin_key
@@ -41,7 +42,8 @@ def serve_gateway(settings: Settings, announce: Announce) -> None:
             get_or_create_default_map(session, settings.new_map_extractor)
         store = open_installation_store(catalog, settings, exclusive=False)
         requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
-        authenticator = ApiKeyAuthenticator(requests, *admin_key_hashes)
+        keys = ApiKeyAuthenticator(requests, *admin_key_hashes)
+        authenticator = with_proxy_sign_in(keys, settings)
         context = GatewayContext(requests, store, wakeups, search, settings, authenticator)
         server = http_server(
             create_app(context), context.connections, on_stop=context.job_notifier.begin_shutdown

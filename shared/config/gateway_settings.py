@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings
 
 from shared.config.lists import split_list
 from shared.config.sizes import Size
+from shared.security.api_keys import Scope
 
 MIN_ADMIN_KEY_CHARACTERS = 16
 
@@ -52,6 +53,23 @@ class GatewaySettings(BaseSettings):
         description="addresses or networks of trusted reverse proxies, separated by commas: "
         "10.0.0.5, 192.168.0.0/16. Their `X-Forwarded-For` is trusted, and their connections are "
         "not limited per address; unset: none",
+    )
+    sign_in_proxies: str | None = Field(
+        None,
+        description="addresses or networks of proxies that sign users in, separated by commas. "
+        "Their headers name the user of a request without a key; unset: none",
+    )
+    sign_in_user_header: str = Field(
+        "X-Forwarded-User", description="header of SIGN_IN_PROXIES with the user's name"
+    )
+    sign_in_groups_header: str = Field(
+        "X-Forwarded-Groups",
+        description="header of SIGN_IN_PROXIES with the user's groups, separated by commas",
+    )
+    sign_in_scopes: str = Field(
+        "",
+        description="scopes of the groups of signed-in users, separated by commas; `*` is every "
+        "user: *:read, editors:write, vpr-admins:admin",
     )
     request_head_seconds: float = Field(
         20.0, gt=0, description="timeout for receiving the head of a request"
@@ -195,7 +213,7 @@ class GatewaySettings(BaseSettings):
                 )
         return value
 
-    @field_validator("trusted_proxies")
+    @field_validator("trusted_proxies", "sign_in_proxies")
     @classmethod
     def _check_networks(cls, value: str | None) -> str | None:
         for address in split_list(value):
@@ -205,6 +223,24 @@ class GatewaySettings(BaseSettings):
                 raise ValueError(
                     f"{error}; expected an address or network such as 10.0.0.5 or 10.0.0.0/8"
                 ) from None
+        return value
+
+    @field_validator("sign_in_user_header", "sign_in_groups_header")
+    @classmethod
+    def _check_header_name(cls, value: str) -> str:
+        if not re.fullmatch(r"[A-Za-z0-9-]+", value):
+            raise ValueError("expected the name of a header, such as X-Forwarded-User")
+        return value
+
+    @field_validator("sign_in_scopes")
+    @classmethod
+    def _check_group_scopes(cls, value: str) -> str:
+        for entry in split_list(value):
+            group, separator, scope = entry.rpartition(":")
+            if not (separator and group and scope in set(Scope)):
+                raise ValueError(
+                    f"{entry!r} is not GROUP:SCOPE with one of the scopes {', '.join(Scope)}"
+                )
         return value
 
     @field_validator("map_tiles")
@@ -234,6 +270,20 @@ class GatewaySettings(BaseSettings):
     def allowed_origins(self) -> tuple[str, ...]:
         """Origins other than the server's own whose pages may call the API."""
         return tuple(dict.fromkeys(split_list(self.cors_origins)))
+
+    @property
+    def sign_in_networks(self) -> list[str]:
+        """Addresses and networks of the proxies that sign users in."""
+        return split_list(self.sign_in_proxies)
+
+    @property
+    def sign_in_scopes_by_group(self) -> dict[str, frozenset[Scope]]:
+        """The scopes of each group of signed-in users; those of `*` belong to all of them."""
+        scopes: dict[str, frozenset[Scope]] = {}
+        for entry in split_list(self.sign_in_scopes):
+            group, _, scope = entry.rpartition(":")
+            scopes[group] = scopes.get(group, frozenset()) | {Scope(scope)}
+        return scopes
 
     @property
     def proxy_addresses(self) -> list[str]:

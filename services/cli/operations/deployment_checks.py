@@ -16,7 +16,7 @@ from sqlalchemy import func, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database.base import db_now, db_now_plus
-from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.errors import explain_outage
 from shared.catalog.database.schema import check_schema
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, Job
@@ -202,7 +202,7 @@ def _names_by_release(processes: list[ProcessStatus]) -> str:
 
 
 def _catalog_error(error: SQLAlchemyError) -> PlacewiseError:
-    return to_unavailable(error) or Misconfigured(
+    return explain_outage(error) or Misconfigured(
         "catalog_unreadable",
         f"The catalog can't be queried ({type(error).__name__}). See the check postgresql.",
     )
@@ -235,7 +235,7 @@ def check_postgres(settings: Settings) -> str:
             )
         check_schema(catalog)
     except SQLAlchemyError as error:
-        raise to_unavailable(error) or Misconfigured(
+        raise explain_outage(error) or Misconfigured(
             "catalog_unreadable",
             f"PostgreSQL rejected the query ({type(error).__name__}). Check DATABASE_URL and the "
             "privileges of its user.",

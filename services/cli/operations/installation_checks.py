@@ -32,7 +32,7 @@ from services.cli.operations.deployment_checks import (
     check_steward,
 )
 from services.cli.operations.store_checks import collection_check, permissions_check
-from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.errors import explain_outage
 from shared.catalog.database.schema import check_pages, check_schema
 from shared.catalog.photos import Photo
 from shared.catalog.tables import open_catalog
@@ -259,7 +259,7 @@ def _check_journal(settings: Settings) -> str:
         check_schema(catalog)
         lag = catalog_lag(catalog, open_store(settings, exclusive=False))
     except SQLAlchemyError as error:
-        raise to_unavailable(error) or Misconfigured(
+        raise explain_outage(error) or Misconfigured(
             "catalog_unreadable",
             f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
             "restore it from a backup.",

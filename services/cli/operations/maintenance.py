@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from shared.backup.create import create_backup
 from shared.backup.folder import BackupManifest, BackupProgress, open_backup
 from shared.backup.restore import RestoreResult, restore_backup
-from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.errors import explain_outage
 from shared.catalog.database.schema import check_schema, migrate, opening
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import (
@@ -71,7 +71,7 @@ def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, Ow
             check_schema(catalog)
         yield catalog, open_installation_store(catalog, settings, exclusive=False)
     except SQLAlchemyError as error:
-        unavailable = to_unavailable(error)
+        unavailable = explain_outage(error)
         if unavailable is None:
             raise
         raise unavailable from error

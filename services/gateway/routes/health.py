@@ -19,7 +19,7 @@ from shared.catalog.jobs import is_job_overdue
 from shared.catalog.maps import Map, list_extractors_in_use, list_maps_without_vocabulary
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
-from shared.errors import PlacewiseError, StorageFull
+from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 
 probe_router = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
@@ -77,7 +77,7 @@ class ExtractorsStatus(ComponentStatus):
 class LoadResponse(ResponseModel):
     """Load and limits of this gateway.
 
-    At a limit, requests are refused (429, 507), but the service is not unhealthy.
+    At a limit, requests are refused (429, 507), and the service is degraded, not unhealthy.
     """
 
     waiting_jobs: int = Field(description="queued jobs, without queries and jobs of model changes")
@@ -145,7 +145,7 @@ def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response
     """Get the health of each component; 503 unless all are healthy.
 
     `degraded`: chunks or shards can't be searched, photos can't be described, or uploads are
-    refused because the disk is full.
+    refused because the disk or the job queue is full.
     """
     components: dict[str, ExtractorsStatus | ComponentStatus] = {
         **_check_components(gateway, admission),
@@ -188,6 +188,7 @@ def _check_components(
         "catalog": _check_catalog(gateway),
         "object_store": _check_object_store(gateway, admission),
         "search": _check_search(gateway),
+        "uploads": _check_uploads(admission),
     }
 
 
@@ -210,6 +211,16 @@ def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) ->
         return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
+    return ComponentStatus(status="healthy")
+
+
+def _check_uploads(admission: AdmissionControl) -> ComponentStatus:
+    try:
+        admission.check_queue()
+    except TooManyRequests as error:
+        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
+    except SQLAlchemyError:
+        return ComponentStatus(status="degraded", detail="uploads are refused: see catalog")
     return ComponentStatus(status="healthy")
 
 

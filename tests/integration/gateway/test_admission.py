@@ -99,6 +99,10 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
     assert upload(service, 2, "city").status_code == 202
     queue_full(upload(service, 3))
     queue_full(upload(service, 3, "city"))
+    health = service("GET", "/health").json()
+    assert health["status"] == health["parts"]["uploads"]["status"] == "degraded"
+    assert "2 jobs are waiting, the limit is 2" in health["parts"]["uploads"]["detail"]
+    assert service("GET", "/../../readyz").status_code == 200
     for call in ("/vocabularies", "/evaluations"):
         queue_full(service("POST", call))
     for number in range(3):

@@ -64,6 +64,14 @@ def test_catalog_is_sqlite_below_the_home_unless_a_database_is_named(
     assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
 
 
+@pytest.mark.parametrize("scheme", ["postgres", "postgresql", "postgresql+psycopg"])
+def test_urls_of_postgresql_may_have_its_usual_schemes(
+    monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    monkeypatch.setenv("DATABASE_URL", f"{scheme}://me:secret@db/places")
+    assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
+
+
 def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://me:hunter2@db/places")
     settings = Settings()
@@ -122,6 +130,8 @@ def test_camera_photos_are_accepted_by_default() -> None:
         ("DEBUG", "perhaps", "DEBUG=perhaps: expected true or false"),
         ("LEASE_SECONDS", "soon", "LEASE_SECONDS=soon: expected a number"),
         ("DEVICE", "tpu", "DEVICE=tpu: expected 'auto'"),
+        ("DATABASE_URL", "mysql://me:s3cret@db/x", "DATABASE_URL: the scheme 'mysql' is not known"),
+        ("DATABASE_URL", "s3cret", "DATABASE_URL: it has no scheme; expected postgresql://"),
         ("ADMIN_KEY", "s3cret", "ADMIN_KEY: a key has at least 16 printable"),
     ],
 )

@@ -35,7 +35,8 @@ def make_photo(name: str, floor: int, room: int, *, view: int = 0) -> DatasetPho
 def unit_rows(rooms: Rows, noise: float, seed: int) -> Rows:
     drawn = np.random.default_rng(seed).standard_normal(rooms.shape).astype(np.float32)
     rows: Rows = rooms + noise * drawn / np.sqrt(rooms.shape[1])
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows
 
 
 @pytest.fixture(scope="module")
