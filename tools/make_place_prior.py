@@ -27,17 +27,15 @@ from shared.datasets.open_dataset import (
 )
 from shared.datasets.utm_filenames import FileNameLocation, parse_utm_file_name
 from shared.evaluation.place_evidence import PhotoLocation
-from shared.evaluation.place_levels import FEATURES, LevelScheme
-from shared.evaluation.place_probability import (
-    OUT_OF_MAP_SHARE,
-    PRIOR_FILE,
-    PlacePrior,
+from shared.evaluation.place_fit import (
     PlaceSample,
     RegressionTable,
     fit_map_estimate,
     not_in_map_table,
     sample_weights,
 )
+from shared.evaluation.place_levels import FEATURES, LevelScheme
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE, PRIOR_FILE, PlacePrior
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
 
 RADII_M = (25.0, 100.0, 500.0, 2000.0)
