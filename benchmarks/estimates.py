@@ -32,9 +32,9 @@ from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.place_fit import fit_place_model
+from shared.evaluation.place_fit import PlaceSample, fit_place_model
 from shared.evaluation.place_levels import LevelScheme
-from shared.evaluation.place_probability import PlaceEstimate, PlaceModel
+from shared.evaluation.place_probability import PlaceEstimate
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.ranking import describe_to_matrix
 from shared.place_paths import label_levels
@@ -135,45 +135,56 @@ def described_photos(
     )
 
 
+class TrialMap:
+    """A map of some of the photos of a set, searched in memory.
+
+    Args:
+        photos: The set.
+        in_map: (n,) which of its photos are in the map.
+    """
+
+    def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
+        self.members = np.flatnonzero(in_map)
+        self._photos = photos
+        self._rows = photos.rows[self.members]
+        scores = self._rows @ self._rows.T
+        self.locations = [photos.locations[index] for index in self.members]
+        self.own_photos = OwnPhotoSampler(
+            self.locations,
+            [photos.captured_at[index] for index in self.members],
+            photos.scheme,
+            photos.radius_m,
+            lambda photo: _rank(scores[photo], without=photo),
+        )
+
+    def own_samples(self) -> tuple[list[PlaceSample], float]:
+        """Return the samples of the map's photos, and their unit of score differences."""
+        own = range(len(self.members))
+        spread = self.own_photos.spread(own)
+        return list(self.own_photos.samples(own, spread)), spread
+
+    def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
+        """Return the ranking of a photo of the set, and that of the best photo in it."""
+        found, scores = _rank(self._rows @ self._photos.rows[query])
+        ranking = [
+            RankedPhoto(score, self.locations[index], index)
+            for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
+        ]
+        return ranking, self.own_photos.neighbours(int(found[0]))
+
+
 def fit_and_judge(photos: DescribedPhotos, in_map: Mask, queries: Mask) -> list[Judged]:
     """Fit the model of a map of some of the photos, and estimate the places of others."""
-    map_photos = np.flatnonzero(in_map)
-    map_rows = photos.rows[map_photos]
-    scores = map_rows @ map_rows.T
-    sampler = OwnPhotoSampler(
-        [photos.locations[index] for index in map_photos],
-        [photos.captured_at[index] for index in map_photos],
-        photos.scheme,
-        photos.radius_m,
-        lambda photo: _rank(scores[photo], without=photo),
-    )
-    own = range(len(map_photos))
-    spread = sampler.spread(own)
-    samples = list(sampler.samples(own, spread))
+    trial = TrialMap(photos, in_map)
+    samples, spread = trial.own_samples()
     model = fit_place_model(samples, [], photos.scheme, spread).model
-    return [
-        judged
-        for query in np.flatnonzero(queries).tolist()
-        if (judged := _judge(model, sampler, photos, map_photos, query))
-    ]
-
-
-def _judge(
-    model: PlaceModel,
-    sampler: OwnPhotoSampler,
-    photos: DescribedPhotos,
-    map_photos: NDArray[np.int64],
-    query: int,
-) -> Judged | None:
-    found, scores = _rank(photos.rows[map_photos] @ photos.rows[query])
-    ranking = [
-        RankedPhoto(score, photos.locations[map_photos[index]], index)
-        for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
-    ]
-    neighbours = sampler.neighbours(int(found[0]))
-    estimate = model.estimate(ranking, neighbours, photos.scheme, CERTAINTY, photos.radius_m)
-    truth = photos.locations[query]
-    return estimate and Judged(estimate, [level.is_right(truth) for level in estimate.levels])
+    judged = []
+    for query in np.flatnonzero(queries).tolist():
+        estimate = model.estimate(*trial.search(query), photos.scheme, CERTAINTY, photos.radius_m)
+        if estimate is not None:
+            truth = photos.locations[query]
+            judged.append(Judged(estimate, [level.is_right(truth) for level in estimate.levels]))
+    return judged
 
 
 def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:

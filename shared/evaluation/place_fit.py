@@ -170,14 +170,18 @@ def sample_weights(samples: Sequence[PlaceSample], share: float) -> list[float]:
 
 
 def fit_map_estimate(
-    table: RegressionTable, center: Coefficients, prior: PlacePrior | None = None
+    table: RegressionTable,
+    center: Coefficients,
+    prior: PlacePrior | None = None,
+    precision: float = PRIOR_PRECISION,
 ) -> Coefficients:
     """Fit a logistic regression by maximum a posteriori, with Newton's method.
 
     Args:
         table: The samples; without any, the result is `center`.
-        center: Mean of the Gaussian prior of the coefficients, with PRIOR_PRECISION.
+        center: Mean of the Gaussian prior of the coefficients.
         prior: Standardises the features; the shipped prior by default.
+        precision: Precision of the Gaussian prior of each coefficient.
     """
     design = (prior or shipped_prior()).design(table.features)
     mean = np.array(center)
@@ -186,14 +190,14 @@ def fit_map_estimate(
     def loss(beta: FloatArray) -> float:
         margin = np.where(table.target > 0.5, 1, -1) * (design @ beta)
         fit = float(table.weights @ np.logaddexp(0.0, -margin))
-        return fit + PRIOR_PRECISION / 2 * float(((beta - mean) ** 2).sum())
+        return fit + precision / 2 * float(((beta - mean) ** 2).sum())
 
     for _ in range(NEWTON_STEPS if len(design) else 0):
         probability = sigmoid(design @ beta)
         gradient = design.T @ (table.weights * (table.target - probability))
-        gradient -= PRIOR_PRECISION * (beta - mean)
+        gradient -= precision * (beta - mean)
         variance = table.weights * probability * (1 - probability)
-        hessian = (design.T * variance) @ design + PRIOR_PRECISION * np.eye(len(beta))
+        hessian = (design.T * variance) @ design + precision * np.eye(len(beta))
         step = np.linalg.solve(hessian, gradient)
         # A full step may overshoot where the prior's predictions are extreme.
         while loss(beta + step) > loss(beta) and float(np.abs(step).max()) > 1e-8:

@@ -240,9 +240,9 @@ def level_features(
         and all photos that lie inside; log of the summed margins of the first ten inside; log of
         the number of leading photos inside; first score minus last. Then the first score minus the
         best of a neighbour outside, and inside; log of the number of neighbours that are more
-        similar to the best photo than the query is; the first score minus the mean of the first ten neighbours;
-        share of the first 3, the first 10 and all neighbours that lie inside; and the shared
-        neighbours. The features of neighbours are 0 without them.
+        similar to the best photo than the query is; the first score minus the mean of the first
+        ten neighbours; share of the first 3, the first 10 and all neighbours that lie inside; and
+        the shared neighbours. The features of neighbours are 0 without them.
     """
     last = scores[-1]
     best_outside = scores[~inside].max(initial=last)
