@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
 from benchmarks.report import Report
 from services.cli.environment import read_settings
 from services.cli.evaluation.describers import extractor_describer
+from services.cli.output import Table
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
@@ -148,10 +148,10 @@ class TrialMap:
         self._photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.locations = [photos.locations[index] for index in self.members]
+        self.locations = [photos.locations[index] for index in self.members.tolist()]
         self.own_photos = OwnPhotoSampler(
             self.locations,
-            [photos.captured_at[index] for index in self.members],
+            [photos.captured_at[index] for index in self.members.tolist()],
             photos.scheme,
             photos.radius_m,
             lambda photo: _rank(scores[photo], without=photo),
