@@ -22,6 +22,7 @@ from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Authenticator, get_caller
+from services.gateway.similarity.neighbours import NeighbourCache
 from services.http_connections import ConnectionLimits, Connections
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES
@@ -227,6 +228,7 @@ class GatewayContext:
     started_monotonic: float = field(default_factory=time.monotonic)
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
+    neighbours: NeighbourCache = field(default_factory=NeighbourCache)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "job_notifier", JobNotifier(self.catalog))

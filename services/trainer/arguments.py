@@ -130,6 +130,9 @@ class TrainingArguments(BaseModel):
     layers_to_crop: IntList = _argument(
         MODEL, (), "JSON list of layers to remove: 4 removes layer4, 3 also removes layer3."
     )
+    backbone_norm: bool = _argument(
+        MODEL, True, "Apply the final norm of DINOv2 and Swin. False for BoQ's published DINOv2."
+    )
     agg_arch: str = _argument(MODEL, "AVG", "Name of the aggregator.")
     agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
         MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."

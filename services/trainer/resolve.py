@@ -161,7 +161,7 @@ def _continue_csv(folder: Path, completed_steps: int) -> CSVLogger:
                     rows[json.dumps(logged, sort_keys=True)] = logged
     for logged in rows.values():
         # Values are written as they were read, so that an interrupted copy is recognised.
-        logger.log_metrics(cast("dict[str, float]", logged), int(logged["step"]))
+        logger.log_metrics(cast("dict[str, Any]", logged), int(logged["step"]))
     logger.save()
     for file in earlier:
         shutil.rmtree(file.parent)

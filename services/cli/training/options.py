@@ -78,7 +78,22 @@ def _format_default(value: Any) -> str:
 
 
 class TrainingCommand(TyperCommand):
-    """Accepts booleans and sizes as GSV-Cities scripts write them."""
+    """Accepts booleans and sizes as GSV-Cities scripts write them; its help cuts no name."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        from rich.table import Table
+        from typer import rich_utils
+
+        class OptionsTable(Table):
+            """Wraps descriptions, but not the names in the first or second column."""
+
+            def add_row(self, *cells: Any, **styles: Any) -> None:
+                super().add_row(*cells, **styles)
+                for column in self.columns[:2]:
+                    column.no_wrap = True
+
+        rich_utils.Table = OptionsTable  # type: ignore[misc]
+        super().format_help(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, add_values(args))

@@ -383,6 +383,8 @@ def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbo
     name = config.backbone_arch
     backbone = _BUILDERS[name](name, config.pretrained, weights)
     assert len(backbone.stages) == STAGES[name]
+    if not config.backbone_norm:
+        backbone.norm = nn.Identity()
     backbone.crop(config.stages)
     backbone.freeze(config.layers_to_freeze)
     return backbone.eval()

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import typer
+from rich.table import Table
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
@@ -19,6 +20,7 @@ from services.trainer.arguments import (
     load_yaml,
     save_yaml,
 )
+from services.trainer.resolve import list_changed_meanings
 from shared.errors import InvalidRequest, NotFound
 from tests.support.training_runs import PUBLISHED_COMMAND
 
@@ -173,7 +175,7 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("pretrained", "maybe", "Expected True or False"),
         ("layers_to_crop", "layer4", r"Expected a JSON list, such as \[4\]"),
@@ -186,8 +188,8 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
         ("logger", "tensorbord", "'tensorboard', 'wandb'"),
     ],
 )
-def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: str) -> None:
-    with pytest.raises(InvalidRequest, match=said) as caught:
+def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, message: str) -> None:
+    with pytest.raises(InvalidRequest, match=message) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
 
@@ -239,9 +241,26 @@ def test_a_written_configuration_is_read_as_the_same_run(tmp_path: Path) -> None
     assert build_arguments(load_yaml(tmp_path / "config.yaml")) == arguments
 
 
-def test_the_help_shows_every_argument_in_its_group() -> None:
-    answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"], env={"COLUMNS": "200"})
+@pytest.mark.parametrize("columns", ["80", "200"])
+def test_the_help_shows_every_argument_in_its_group(
+    columns: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("typer.rich_utils.Table", Table)
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", int(columns))
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"])
     assert answer.exit_code == 0
     for name in TrainingArguments.model_fields:
         assert f"--{name} " in answer.output
     assert "Loss and miner" in answer.output
+
+
+def test_values_that_had_another_effect_in_the_predecessor_are_named() -> None:
+    published = read(shlex.split(PUBLISHED_COMMAND))
+    assert list_changed_meanings(published) == [], "without weight decay, Adam is AdamW"
+    differing = build_arguments(
+        {"optimizer": "adam", "weight_decay": 0.1, "experiment_phase": "all", "image_size": 224}
+    )
+    adam, size = list_changed_meanings(differing)
+    assert "--optimizer adamw" in adam
+    assert "224 x 224" in size
+    assert "--test_image_size native" in size
