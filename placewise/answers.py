@@ -395,6 +395,8 @@ class Key(Answer):
     name: str
     prefix: str
     scopes: list[str]
+    maps: list[str] | None = None
+    """Names of the only maps that it may use; None: all maps."""
     requests_per_minute: int | None
     upload_bytes_per_day: int | None
     max_photos: int | None

@@ -457,7 +457,7 @@ class AsyncClient(AsyncTransport):
         Args:
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
-            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+            limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}

@@ -452,7 +452,7 @@ class Client(Transport):
         Args:
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
-            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+            limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -67,10 +68,12 @@ def http_server(
             SHUTDOWN_GRACE_SECONDS to finish.
     """
     proxies = [str(network) for network in connections.limits.trusted_proxies]
+    # uvicorn types ASGI messages one by one, Starlette does not.
+    forwarded: Any = ProxyHeadersMiddleware(app, trusted_hosts=proxies)  # type: ignore[arg-type]
     server = NotifyingServer(
         uvicorn.Config(
             # Instead of uvicorn's own, which would replace the address before it can be recorded.
-            _record_peer(ProxyHeadersMiddleware(app, trusted_hosts=proxies)),
+            _record_peer(forwarded),
             proxy_headers=False,
             loop="asyncio",
             http=partial(LimitedProtocol, connections),  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import uvicorn
@@ -56,7 +56,9 @@ from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
+from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
+from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
@@ -94,6 +96,22 @@ class Standalone:
             self.server.run(sockets=[self.listener])
         if self.error is not None:
             raise self.error
+
+
+def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None]) -> None:
+    """Run all services until the process is stopped by a signal.
+
+    Args:
+        settings: The settings.
+        on_ready: Called once the server listens.
+
+    Raises:
+        PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
+    """
+    configure_logging(settings, "embedded")
+    with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
+        on_ready(running)
+        running.serve()
 
 
 @contextlib.contextmanager

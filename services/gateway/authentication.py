@@ -38,6 +38,7 @@ from shared.catalog.api_keys import (
 )
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.database.session import Catalog
+from shared.catalog.maps import DEFAULT_MAP
 from shared.errors import Forbidden, PlacewiseError, Unauthorized
 from shared.http.problem_details import problem_response
 from shared.security.api_keys import ALL_SCOPES, expand_scopes, hash_api_key, is_loopback
@@ -65,6 +66,26 @@ class Caller:
     key_id: UUID | None = None
     """None for keys that are not in the catalog: ADMIN_KEY and the local key of the CLI."""
     limits: KeyLimits = field(default=KeyLimits())
+    maps: frozenset[str] | None = None
+    """Names of the only maps that the caller may use; None: all maps."""
+
+    def check_map(self, name: str) -> None:
+        """Raise Forbidden (`map_not_allowed`) for a map that the caller may not use."""
+        if self.maps is not None and name not in self.maps:
+            raise Forbidden(
+                "map_not_allowed",
+                f"This key may only use the maps {', '.join(sorted(self.maps))}; the request is "
+                f"about the map {name!r}. Select one with ?map=NAME (commands: --map NAME).",
+            )
+
+    def check_all_maps(self) -> None:
+        """Raise Forbidden (`map_not_allowed`) if the caller may only use some maps."""
+        if self.maps is not None:
+            raise Forbidden(
+                "map_not_allowed",
+                f"This key may only use the maps {', '.join(sorted(self.maps))}; the request is "
+                "about all maps.",
+            )
 
 
 class Authenticator(Protocol):
@@ -185,6 +206,7 @@ class ApiKeyAuthenticator:
             scopes=expand_scopes([KeyScope(scope) for scope in key.scopes]),
             key_id=key.id,
             limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
+            maps=None if key.maps is None else frozenset(key.maps),
         )
 
     async def record_use(self, caller: Caller) -> None:
@@ -220,6 +242,8 @@ def parse_bearer(authorization: str | None) -> str:
 # Health probes, the web page and the API documentation: none of them exposes stored data.
 PUBLIC_PATHS = frozenset({"/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"})
 PUBLIC_PATH_PREFIX = "/console/"  # assets of the web page, where the user enters the key
+
+MAPS_PATH = "/api/v1/maps"
 
 # For the OpenAPI schema only: `AuthenticationMiddleware` checks the key, before routing.
 BEARER_SCHEME = HTTPBearer(
@@ -275,15 +299,21 @@ def _require_scope(
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    missing = set(scopes.scopes) - get_caller(request).scopes
+    caller = get_caller(request)
+    missing = set(scopes.scopes) - caller.scopes
     if missing:
         raise Forbidden(
             "scope_missing",
             f"This request needs a key with the scope {', '.join(sorted(missing))}; yours has "
-            f"{', '.join(sorted(get_caller(request).scopes))}. An admin can create one with "
+            f"{', '.join(sorted(caller.scopes))}. An admin can create one with "
             "placewise keys create.",
             needed=sorted(missing),
         )
+    # Each request selects its map by the query parameter, except those of /maps, which check it
+    # themselves, and those about all maps (`ALL_MAPS`), which refuse such keys.
+    if not request.scope["path"].startswith(MAPS_PATH):
+        for name in request.query_params.getlist("map") or [DEFAULT_MAP]:
+            caller.check_map(name)
 
 
 READ = Security(_require_scope, scopes=[KeyScope.READ.value])

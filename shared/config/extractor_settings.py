@@ -134,7 +134,7 @@ class ExtractorSettings(BaseSettings):
             config = get_extractor_config(
                 self.extractor, allow_test_extractors=self.allow_test_extractors
             )
-            check_extractor_is_shared(config)
+            _check_extractor_is_shared(config)
         except Misconfigured as error:
             raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
         selected = self.new_map_extractor
@@ -169,7 +169,7 @@ class ExtractorSettings(BaseSettings):
                 one machine.
         """
         config = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
-        check_extractor_is_shared(config)
+        _check_extractor_is_shared(config)
         if config.hub is not None and config.name not in self.allowed_hub_extractors:
             raise Misconfigured(
                 "torchhub_not_allowed",
@@ -189,7 +189,7 @@ class ExtractorSettings(BaseSettings):
         return tuple(dict.fromkeys(allowed))
 
 
-def check_extractor_is_shared(config: ExtractorConfig) -> None:
+def _check_extractor_is_shared(config: ExtractorConfig) -> None:
     """Raise Misconfigured (`model_not_added`) for a checkpoint that is a file of one machine."""
     if config.trained is not None and config.trained.file is not None:
         raise Misconfigured(

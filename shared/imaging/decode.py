@@ -86,8 +86,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
                     # None keeps the mode; other formats than JPEG ignore the call.
                     image.draft(None, (image.width // 2, image.height // 2))
                 image.load()
-                as_stored = to_rgb(image)
-                upright = apply_exif_orientation(image, as_stored)
+                as_stored = _to_rgb(image)
+                upright = _apply_exif_orientation(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             return DecodedPhoto(pixels=pixels, thumbnail=_thumbnail(upright))
     except UnidentifiedImageError as error:
@@ -125,7 +125,7 @@ def _open_image(data: bytes) -> Image.Image:
     return Image.open(io.BytesIO(data), formats=("HEIF",))
 
 
-def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
+def _apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     """Transpose `rgb` by the EXIF orientation of `image`.
 
     Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
@@ -138,7 +138,7 @@ def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     return rgb if method is None else rgb.transpose(method)
 
 
-def to_rgb(image: Image.Image) -> Image.Image:
+def _to_rgb(image: Image.Image) -> Image.Image:
     """Convert to 8-bit RGB on black; ValueError for modes without a defined brightness range."""
     if image.mode.startswith("I;16"):
         # Pillow would clip 16-bit samples at 255 and make the photo white.
@@ -187,7 +187,7 @@ def decode_resized(
                 check_pixel_count(image.width, image.height, max_pixels)
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
-                upright = apply_exif_orientation(image, to_rgb(image))
+                upright = _apply_exif_orientation(image, _to_rgb(image))
             return upright.resize((width, height), Image.Resampling.BILINEAR)
     except UnidentifiedImageError as error:
         raise Unprocessable(

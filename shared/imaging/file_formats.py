@@ -30,10 +30,10 @@ def detect_archive_format(first_bytes: bytes) -> ArchiveFormat | None:
         return ArchiveFormat.ZIP
     if first_bytes.startswith(b"\x1f\x8b\x08"):
         return ArchiveFormat.GZIP
-    return ArchiveFormat.TAR if is_tar_header(first_bytes[:ARCHIVE_SIGNATURE_BYTES]) else None
+    return ArchiveFormat.TAR if _is_tar_header(first_bytes[:ARCHIVE_SIGNATURE_BYTES]) else None
 
 
-def is_tar_header(block: bytes) -> bool:
+def _is_tar_header(block: bytes) -> bool:
     """Whether a block of 512 bytes is a tar header, by its checksum; `ustar` is optional."""
     if len(block) != ARCHIVE_SIGNATURE_BYTES:
         return False

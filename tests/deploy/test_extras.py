@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import subprocess
 import sys
@@ -78,6 +79,7 @@ def requirements(extra: str) -> set[str]:
     return names
 
 
+@functools.cache
 def installed_with(extra: str) -> set[str]:
     """Every distribution that would be in the image."""
     found: set[str] = set()

@@ -401,7 +401,7 @@ def test_a_command_that_describes_no_photo_never_imports_torch(tmp_path: Path) -
 def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path) -> None:
     photo = tmp_path / "photo.jpg"
     photo.write_bytes(photo_bytes(0))
-    # Hides the GPUs of this machine. It is read when torch is imported, so no process is forked.
+    # Hides the GPUs of this machine.
     env = {**environment(tmp_path / "home", device="cuda"), "CUDA_VISIBLE_DEVICES": ""}
     listed, indexed, served = (
         Run(run_command(*arguments, env=env, cwd=tmp_path))

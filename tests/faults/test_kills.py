@@ -19,7 +19,7 @@ from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
 
-PHOTOS = 300
+PHOTOS = 150
 KILLS = 10
 AGAIN_SECONDS = 0.05
 UPLOAD_SECONDS = 120.0

@@ -95,6 +95,7 @@ GENERATION: dict[str, Any] = {
     "ended_at": None,
 }
 STATS: dict[str, Any] = {
+    "device": None,
     "map": "default",
     "map_version": 1,
     "total_images": 2,

@@ -26,6 +26,7 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.ids import new_id
 from shared.search_api.workers import WorkerUnavailable, fetch_status
+from shared.storage.open_store import open_store
 
 # How long a lease may be expired before it counts as overdue. The steward checks every second.
 OVERDUE_LEASE_SECONDS = 30.0
@@ -304,8 +305,6 @@ def check_object_store(settings: Settings) -> str:
             `object_store_unfit` if it ignores ranges or prefixes; `clocks_differ`.
         Unavailable: The store can't be reached.
     """
-    from shared.storage.open_store import open_store  # importing the minio client is slow
-
     store = open_store(settings, exclusive=False)
     store.check()  # some servers create missing buckets on write: a misspelt name must fail here
     key = f"work/doctor-{new_id()}/probe"

@@ -41,6 +41,7 @@ from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, ExtractorConfig
 from shared.journal.outbox import catalog_lag
+from shared.storage.open_store import open_store
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -252,8 +253,6 @@ def _check_journal(settings: Settings) -> str:
     """Check that the catalog contains every change recorded in the object store's journal."""
     if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
         return "nothing is stored yet"
-    from shared.storage.open_store import open_store  # importing the minio client is slow
-
     catalog = open_catalog(settings, "doctor")
     try:
         check_schema(catalog)

@@ -1,14 +1,14 @@
 """Backup, recovery and repair of an installation, on its catalog and its object store directly.
 
-The commands in `backup` and `storage` import this module when they run. What decodes photos
-(`shared.rebuild`) and what belongs to the steward is imported where it is used, because not every
-image contains it.
+The commands in `backup` and `storage` import this module when they run. `shared.rebuild` is
+imported where it is used: it decodes photos, whose libraries not every image contains.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
 from shared.backup.create import create_backup
 from shared.backup.folder import BackupManifest, BackupProgress, open_backup
 from shared.backup.restore import RestoreResult, restore_backup
@@ -37,10 +38,16 @@ from shared.journal.outbox import Lag, catalog_lag
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
-from shared.storage.trash import Hold, HoldReason, measure_trash, read_hold, write_hold
+from shared.storage.trash import (
+    Hold,
+    HoldReason,
+    measure_trash,
+    read_hold,
+    restore_trash,
+    write_hold,
+)
 
 if TYPE_CHECKING:
-    from services.steward.tasks.orphans import StoreCount
     from shared.rebuild.recover import RecoveryReport
 
 UPLOAD_SECONDS = 3600.0  # an older original does not belong to an upload in progress
@@ -161,8 +168,6 @@ def verify_storage(
         originals: Whether to check the hashes of the original photos, too.
         repair: Whether to queue photos of damaged chunks and to recover missing records.
     """
-    from services.steward.tasks.orphans import find_orphans
-
     with open_storage(settings, "verify") as (catalog, store):
         lag, recovered = catalog_lag(catalog, store), None
         if lag is not None and repair:
@@ -201,8 +206,6 @@ def adopt_storage(settings: Settings, *, confirm: bool) -> StoreCount:
     Raises:
         Conflict: `already_owner`.
     """
-    from services.steward.tasks.orphans import count_store
-
     with contextlib.ExitStack() as stack:
         if settings.database_url is None:
             stack.enter_context(lock_home(settings.placewise_home))
@@ -241,8 +244,6 @@ def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, i
     Returns:
         The counts, the number of moved objects, and the hold on garbage collection, if any.
     """
-    from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
-
     with open_storage(settings, "storage") as (catalog, store):
         count, moved, hold = StoreCount(), 0, read_hold(store)
         for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
@@ -250,3 +251,13 @@ def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, i
         if confirm:
             moved = collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
     return count, moved, hold
+
+
+def restore_from_trash(settings: Settings, prefix: str) -> Counter[bool]:
+    """Move objects from the trash back to their keys.
+
+    Returns:
+        The number of restored objects (True), and of those whose key is in use again (False).
+    """
+    with open_storage(settings, "storage") as (_, store):
+        return Counter(was_restored for _, was_restored in restore_trash(store, prefix))

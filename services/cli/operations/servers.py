@@ -28,15 +28,10 @@ def serve() -> None:
     prints an admin key; `placewise keys` creates others.
     """
     with report_errors(as_json=False):
-        from services.standalone import run_standalone
-        from shared.telemetry.logs import configure_logging
-        from shared.telemetry.tracing import configure_tracing
+        from services.standalone import serve_standalone
 
         settings = read_settings()
-        configure_logging(settings, "embedded")
-        with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
-            err_console.print(_startup_message(running, settings), soft_wrap=True)
-            running.serve()
+        serve_standalone(settings, lambda running: _print(_startup_message(running, settings)))
 
 
 def _startup_message(running: Standalone, settings: Settings) -> str:

@@ -232,14 +232,10 @@ def restore(
     rebuilds a catalog from all objects.
     """
     with report_errors(as_json):
-        from services.cli.operations.maintenance import open_storage
-        from shared.storage.trash import restore_trash
+        from services.cli.operations.maintenance import restore_from_trash
 
-        restored, skipped = 0, 0
-        with open_storage(read_settings(), "storage") as (_, store):
-            for _, was_restored in restore_trash(store, prefix):
-                restored += was_restored
-                skipped += not was_restored
+        counts = restore_from_trash(read_settings(), prefix)
+    restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})
         return

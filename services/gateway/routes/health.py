@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
-from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
+from services.gateway.dependencies import ALL_MAPS, NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import is_job_overdue
@@ -22,7 +22,7 @@ from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 
 probe_router = APIRouter(tags=["operations"])
-router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
+router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS, ALL_MAPS])
 
 STATUSES_WORST_FIRST = ("unhealthy", "degraded", "healthy")
 

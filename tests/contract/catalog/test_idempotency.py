@@ -1,4 +1,4 @@
-"""Keys of calls in the catalog: who may do a call, what is kept of it, and when it is forgotten."""
+"""Idempotency keys in the catalog: claims, stored responses, expiry."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def expire(catalog: Catalog) -> None:
         session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
 
 
-def test_a_kept_answer_is_given_again_as_it_was(catalog: Catalog) -> None:
+def test_a_stored_response_is_replayed_unchanged(catalog: Catalog) -> None:
     keep(catalog, token(catalog))
     assert claim(catalog) == ANSWER
     assert claim(catalog) == ANSWER

@@ -103,7 +103,7 @@ def test_a_tags_case_matters_and_parts_do_not_match(catalog: Catalog, map_id: UU
     assert found(catalog, map_id, tags=("night",)) == set()
 
 
-def test_all_tags_are_wanted(catalog: Catalog, map_id: UUID) -> None:
+def test_all_tags_are_required(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         add_photo(session, map_id, filename="both", tags=["wet", "night"])
         add_photo(session, map_id, filename="one", tags=["night"])

@@ -1,4 +1,4 @@
-"""A catalog that is damaged, full or no catalog: said at the start, and at run time, in words."""
+"""Errors of a catalog that is damaged, full or no catalog, at the start and at run time."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_postgresql_without_room_is_full_and_not_away() -> None:
     assert isinstance(error, StorageFull)
 
 
-def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
+def test_a_full_disk_at_the_start_is_reported_with_the_free_bytes(
     file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:

@@ -229,12 +229,12 @@ def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
         np.concatenate(list(describe([shot.path for shot in shots])))
         for shots in (town.queries, town.database)
     )
-    wanted = recall_at_k(rank_by_similarity(queries, database, 5), town.positives, (1, 5))
-    assert answer["recall"]["1"] == pytest.approx(wanted[1])
-    assert answer["recall"]["5"] == pytest.approx(wanted[5])
+    expected = recall_at_k(rank_by_similarity(queries, database, 5), town.positives, (1, 5))
+    assert answer["recall"]["1"] == pytest.approx(expected[1])
+    assert answer["recall"]["5"] == pytest.approx(expected[5])
 
 
-def test_checkpoint_sees_photos_as_they_are_when_told_so(city: Path, checkpoint: Path) -> None:
+def test_checkpoint_sees_photos_unresized_with_that_option(city: Path, checkpoint: Path) -> None:
     """The photos have 64 x 64 pixels."""
     native = run_json(
         "evaluate", "--data", city, "--checkpoint", checkpoint, "--image-size", "native"
@@ -288,8 +288,8 @@ def test_descriptors_are_compared_by_recall_time_and_size(
     city: Path, tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlad = "test-tiny-vlad:clusters=3,preprocessing=demo1024+fit+pca4"
-    asked = f"test-tiny-avg,{vlad},{checkpoint}"
-    report = run_json("compare", city, "--extractors", asked, "--out", tmp_path / "out")
+    extractors = f"test-tiny-avg,{vlad},{checkpoint}"
+    report = run_json("compare", city, "--extractors", extractors, "--out", tmp_path / "out")
     sizes = [one["bytes_a_photo"] for one in report["extractors"]]
     assert sizes == [16 * 4, 4 * 4, 128 * 4]
     assert all(one["milliseconds_a_photo"] > 0 for one in report["extractors"])
@@ -302,7 +302,7 @@ def test_descriptors_are_compared_by_recall_time_and_size(
         assert one["extractor"] in "".join(charts[0][1].itertext())
     monkeypatch.setattr(ExtractorDescriber, "__call__", forbid)
     monkeypatch.setattr(ModelDescriber, "__call__", forbid)
-    again = run_json("compare", city, "--extractors", asked)
+    again = run_json("compare", city, "--extractors", extractors)
     assert [one["recall"] for one in again["extractors"]] == [
         one["recall"] for one in report["extractors"]
     ]

@@ -222,7 +222,7 @@ def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresS
     catalog.close()
 
 
-def test_jobs_are_listed_newest_first_and_by_what_is_wanted(catalog: Catalog, map_id: UUID) -> None:
+def test_jobs_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         other = add_map(session, "other").id
     queue(catalog, other)

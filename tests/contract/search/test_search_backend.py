@@ -259,7 +259,7 @@ class SearchPortContract:
             assert found(**filters) == {second[2]}
         assert found() == {*first, *second}
 
-    def test_labelled_queries_are_never_answered_and_can_be_asked_with(
+    def test_labelled_queries_are_never_returned_and_can_be_searched_with(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         photo_ids = places.add(unit_rows(1, 12))
@@ -381,7 +381,7 @@ class SearchPortContract:
             port().search(places.request(reference))
         assert caught.value.code == "chunk_unreadable"
 
-    def test_descriptor_that_is_no_longer_kept_is_gone(
+    def test_descriptor_that_is_no_longer_stored_is_gone(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         places.add(unit_rows(1, 3))

@@ -142,7 +142,7 @@ class TestSearchWorker(SearchPortContract):
 
 @whatever_the_catalog
 class TestSearchWorkerByCodes(TestSearchWorker):
-    """The same promises where rows are told apart by their codes first."""
+    """The same promises where sign codes select the rows first."""
 
     certificate = "statistical"
 
@@ -153,7 +153,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
 
 @whatever_the_catalog
 class TestSearchWorkerByInt8(TestSearchWorker):
-    """The same promises where rows of middle length are told apart by their int8 codes."""
+    """The same promises where int8 codes select the rows."""
 
     certificate = "bound"
 

@@ -1,4 +1,4 @@
-"""A store without room, or asked too much: said as such, and nothing of the object is left."""
+"""A full or overloaded store: the error says so, and nothing of the object is left."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class FullFile:
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EDQUOT], ids=["disk", "quota"])
-def test_a_full_disk_is_said_and_leaves_no_object(store: FolderStore, reason: int) -> None:
+def test_a_full_disk_is_reported_and_leaves_no_object(store: FolderStore, reason: int) -> None:
     writer = store.writer("originals/a")
     writer.write(b"some")
     writer._file.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 from uuid import UUID
 
 import pytest
@@ -174,7 +175,7 @@ def test_catalog_that_is_away_is_waited_for(catalog: Catalog) -> None:
     ],
 )
 def test_a_connection_that_can_never_work_is_not_waited_for(
-    postgres: PostgresServer, changed: dict[str, str], reason: str
+    postgres: PostgresServer, changed: dict[str, Any], reason: str
 ) -> None:
     url = make_url(postgres.new_database()).set(**changed)
     wrong = Catalog(url.render_as_string(hide_password=False))

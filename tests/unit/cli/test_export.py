@@ -83,7 +83,7 @@ def test_pairs_are_those_of_the_labelled_queries_best_match_first(
     text, report = pairs_of(client)
     assert text == "q.jpg b.jpg\nq.jpg a.jpg\n"
     assert report == {"asked": 1, "pairs": 2, "passed_over": 0}
-    assert "top_k=2" in server.asked[1][1]
+    assert "top_k=2" in server.requests[1][1]
 
 
 def test_a_map_without_queries_pairs_its_own_photos_and_passes_over_what_waits(
@@ -182,7 +182,7 @@ def test_descriptors_of_the_active_generation_can_be_mapped_into_memory(
     mapped = np.load(out / "descriptors.npy", mmap_mode="r")
     assert np.array_equal(mapped, rows)
     assert sorted(path.name for path in out.iterdir()) == sorted(files)
-    assert server.asked[1][1] == f"/api/v1/generations/{GENERATION_ID}/descriptors"
+    assert server.requests[1][1] == f"/api/v1/generations/{GENERATION_ID}/descriptors"
 
 
 def test_a_refused_export_leaves_no_file(
@@ -194,10 +194,10 @@ def test_a_refused_export_leaves_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_generation_that_is_no_id_is_refused_before_anything_is_asked(
+def test_a_generation_that_is_no_id_is_refused_before_any_request(
     server: FakeServer, client: Client, tmp_path: Path
 ) -> None:
     with pytest.raises(InvalidRequest) as caught:
         export_descriptors(client, tmp_path, "../maps", Progress(disable=True))
     assert caught.value.code == "bad_id"
-    assert server.asked == []
+    assert server.requests == []

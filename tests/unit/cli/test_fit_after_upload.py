@@ -21,7 +21,7 @@ def fits(**stats: Any) -> bool:
         for answer in (STARTED, {**JOB, "state": "succeeded"}, STATS):
             server.will_answer(200, answer)
         fit_vocabulary_if_needed(client, Stats(**{**STATS, **stats}), Progress(disable=True))
-        return any(path.endswith("/vocabularies") for _, path, _ in server.asked)
+        return any(path.endswith("/vocabularies") for _, path, _ in server.requests)
 
 
 @pytest.mark.parametrize("vocabulary", ["foreign", "provisional", None])

@@ -34,7 +34,7 @@ def test_create_makes_a_map_whose_labels_are_paths() -> None:
         arguments = ["create", "tower", "--place-labels-are-paths", "--server", server.url]
         result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    _, path, body = server.asked[0]
+    _, path, body = server.requests[0]
     assert path == "/api/v1/maps"
     assert json.loads(body) == {"name": "tower", "place_labels_are_paths": True}
 

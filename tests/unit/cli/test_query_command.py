@@ -54,7 +54,7 @@ def query(folder: Path, answer: dict[str, Any], *options: str, **photo: Any) -> 
             env={"TTY_COMPATIBLE": "1", "COLUMNS": "80"},
         )
     assert shown.exit_code == 0, shown.output
-    return shown.stdout, server.asked[0][1]
+    return shown.stdout, server.requests[0][1]
 
 
 def bars(output: str) -> list[int]:

@@ -90,7 +90,7 @@ def test_a_file_that_is_no_journal_is_refused_and_left_alone(path: Path) -> None
 
 
 def uploads(server: FakeServer) -> int:
-    return sum(asked[1].startswith("/api/v1/upload") for asked in server.asked)
+    return sum(request[1].startswith("/api/v1/upload") for request in server.requests)
 
 
 def test_a_run_that_was_broken_off_sends_only_the_rest(
@@ -125,7 +125,7 @@ def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(
     with Client(server.url) as client:
         report = upload_photos(client, [photo], False, Progress(disable=True))
     assert report["failed"] == []
-    polls = [path for _, path, _ in server.asked if path.startswith("/api/v1/jobs/")]
+    polls = [path for _, path, _ in server.requests if path.startswith("/api/v1/jobs/")]
     assert len(polls) == 2
     assert all("wait=0" in path for path in polls), polls
 

@@ -146,7 +146,7 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_expected(
 S3 = {"S3_ENDPOINT": "s3:8333", "S3_ACCESS_KEY": "placewise", "S3_SECRET_KEY": "a secret"}
 
 
-def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
+def test_s3_uses_https_with_a_bucket_of_its_own_by_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert Settings().s3_endpoint is None
@@ -159,7 +159,7 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"S3_ACCESS_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
         ({"S3_SECRET_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
@@ -174,9 +174,9 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
     ],
 )
 def test_settings_of_s3_that_can_not_work_are_refused(
-    monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], said: str
+    monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **{**S3, **changed})
+    assert message in refusal(monkeypatch, **{**S3, **changed})
 
 
 @pytest.mark.parametrize("endpoint", ["s3.example.com", "10.0.0.5:8333", "[::1]:9000", "minio"])
@@ -268,10 +268,10 @@ def test_extractor_of_new_maps_has_its_canonical_name(
 def test_an_unknown_extractor_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, extractor: str
 ) -> None:
-    said = refusal(monkeypatch, EXTRACTOR=extractor)
-    assert said.startswith(f"EXTRACTOR={extractor}: ")
+    message = refusal(monkeypatch, EXTRACTOR=extractor)
+    assert message.startswith(f"EXTRACTOR={extractor}: ")
     for known in ("efficientnet-lite0-vlad", "anyloc-vits14", "anyloc-vitg14"):
-        assert known in said
+        assert known in message
 
 
 @pytest.mark.usefixtures("production")
@@ -283,9 +283,9 @@ def test_extractors_for_tests_are_refused_where_they_are_not_allowed(
 
 @pytest.mark.usefixtures("production")
 def test_options_of_an_extractor_are_checked_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
-    assert "layer=12" in said
-    assert "0 to 11" in said
+    message = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
+    assert "layer=12" in message
+    assert "0 to 11" in message
 
 
 @pytest.mark.usefixtures("production")
@@ -293,9 +293,9 @@ def test_options_of_an_extractor_are_checked_at_the_start(monkeypatch: pytest.Mo
 def test_an_unknown_dino_model_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    said = refusal(monkeypatch, DINO_MODEL=model)
-    assert said.startswith(f"DINO_MODEL={model} is unknown")
-    assert "dinov2_vits14, dinov2_vitb14, dinov2_vitl14, dinov2_vitg14" in said
+    message = refusal(monkeypatch, DINO_MODEL=model)
+    assert message.startswith(f"DINO_MODEL={model} is unknown")
+    assert "dinov2_vits14, dinov2_vitb14, dinov2_vitl14, dinov2_vitg14" in message
 
 
 @pytest.mark.usefixtures("production")
@@ -303,13 +303,13 @@ def test_an_unknown_dino_model_is_refused_with_the_known_ones(
 def test_what_says_how_dino_is_used_is_refused_without_it(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    said = refusal(monkeypatch, **{name: PREDECESSORS[name]})
-    assert said.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
+    message = refusal(monkeypatch, **{name: PREDECESSORS[name]})
+    assert message.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
 
 
 @pytest.mark.usefixtures("production")
 @pytest.mark.parametrize(
-    ("variables", "said"),
+    ("variables", "message"),
     [
         (
             {"EXTRACTOR": "efficientnet-lite0-vlad", "DINO_MODEL": "dinov2_vitg14"},
@@ -343,9 +343,9 @@ def test_what_says_how_dino_is_used_is_refused_without_it(
     ],
 )
 def test_contradictions_are_refused_with_both_values(
-    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], said: str
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **variables)
+    assert message in refusal(monkeypatch, **variables)
 
 
 def test_settings_in_force_do_not_change(settings: Settings) -> None:
@@ -386,7 +386,7 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "said"),
+    ("variable", "value", "message"),
     [
         ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
         ("TORCHHUB_ALLOWED", f"{HUB},anyloc-vitb14", "after the repository comes the entry"),
@@ -399,6 +399,6 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
     ],
 )
 def test_code_that_is_not_pinned_is_refused_at_the_start(
-    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **{variable: value})
+    assert message in refusal(monkeypatch, **{variable: value})

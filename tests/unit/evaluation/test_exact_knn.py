@@ -65,7 +65,7 @@ def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
     assert found.indices.tolist() == full_product(queries, database, 5).tolist()
 
 
-def test_progress_ends_where_it_said_it_would() -> None:
+def test_progress_ends_at_the_announced_total() -> None:
     reported: list[tuple[int, int]] = []
     rows = unit_rows(10, 4, 7)
     exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: reported.append(heard))

@@ -47,7 +47,7 @@ END = f"--{BOUNDARY}--\r\n".encode()
 
 
 class Body:
-    """What a client sends, piece by piece; knows how much of it was asked for."""
+    """What a client sends, piece by piece; counts the bytes that were read."""
 
     def __init__(self, pieces: Iterable[bytes], *, cut_off: bool = False) -> None:
         self._pieces = list(pieces)
@@ -119,7 +119,7 @@ def test_file_of_any_size_is_stored_and_opened_whole(
     assert received.sha256 == hashlib.sha256(data).hexdigest()
     with received.open(store) as opened:
         assert opened.read() == data
-    assert (received.content is None) == (beyond >= 0), "no more of it is kept in memory"
+    assert (received.content is None) == (beyond >= 0), "only the beginning stays in memory"
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 1000, 10**9])
@@ -344,7 +344,7 @@ def test_what_was_there_under_the_key_survives_a_refused_body(store: FolderStore
         ("TIFF", "image/tiff"),
     ],
 )
-def test_media_type_is_told_by_the_content(media: str, expected: str) -> None:
+def test_media_type_is_detected_from_the_content(media: str, expected: str) -> None:
     assert check_photo_signature(photo_bytes(1, media)[:16]) == expected
 
 

@@ -77,7 +77,7 @@ def test_of_a_long_path_the_end_is_kept() -> None:
     assert path.endswith("/deep/1.jpg")
 
 
-def test_what_is_empty_or_left_out_is_not_said() -> None:
+def test_empty_and_missing_fields_are_left_out() -> None:
     assert read_form_fields({}) == PhotoFields()
     assert read_form_fields({"latitude": "", "place": "  ", "tags": "", "metadata": ""}) == (
         PhotoFields()

@@ -175,7 +175,7 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
         ("pretrained", "maybe", "Expected True or False"),
         ("layers_to_crop", "layer4", r"Expected a JSON list, such as \[4\]"),
@@ -188,8 +188,8 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
         ("logger", "tensorbord", "'tensorboard', 'wandb'"),
     ],
 )
-def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: str) -> None:
-    with pytest.raises(InvalidRequest, match=said) as caught:
+def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, message: str) -> None:
+    with pytest.raises(InvalidRequest, match=message) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
 

@@ -62,7 +62,7 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "said"),
+    ("text", "code", "message"),
     [
         ("bases: {}", "bad_grid", "Did you mean base"),
         ("base: {lr: 1}", "bad_grid", "nothing to train"),
@@ -78,12 +78,12 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
     ],
 )
 def test_a_grid_that_can_not_be_is_refused_before_its_first_run(
-    text: str, code: str, said: str, tmp_path: Path
+    text: str, code: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(PlacewiseError) as caught:
         plan_of(tmp_path, text)
     assert caught.value.code == code
-    assert said in caught.value.detail
+    assert message in caught.value.detail
 
 
 def test_the_predecessors_grid_is_its_28_published_runs() -> None:
@@ -113,7 +113,7 @@ def plain_plan(*names: str) -> GridPlan:
 
 
 class Runs:
-    """Trainer whose runs end as they are told to, at once."""
+    """Trainer whose runs end at once with the given outcome."""
 
     def __init__(self, out: Path, **endings: Exception | float) -> None:
         self.out, self.endings, self.calls = out, endings, list[str]()
