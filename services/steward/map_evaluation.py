@@ -29,10 +29,10 @@ from services.steward.evaluation_search import (
     RankPhoto,
     read_geotagged_photos,
 )
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
-from shared.catalog.session import Catalog
 from shared.evaluation.calibration import (
     Calibration,
     auroc,
