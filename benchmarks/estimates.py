@@ -27,7 +27,6 @@ from rich.table import Table
 
 from benchmarks.report import Report
 from services.cli.environment import read_settings
-from services.cli.evaluation.describers import extractor_describer
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
@@ -36,7 +35,6 @@ from shared.evaluation.place_fit import PlaceSample, fit_place_model
 from shared.evaluation.place_levels import LevelScheme
 from shared.evaluation.place_probability import PlaceEstimate
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.ranking import describe_to_matrix
 from shared.place_paths import label_levels
 
 if TYPE_CHECKING:
@@ -106,6 +104,10 @@ def measure(progress: Progress, *, folders: Sequence[Path], splits: int) -> Repo
 
 def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
     """Describe an evaluation set as a new map would be."""
+    # Decoder processes import the program, and their memory limit leaves no room for torch.
+    from services.cli.evaluation.describers import extractor_describer
+    from shared.evaluation.ranking import describe_to_matrix
+
     settings = read_settings()
     dataset = open_evaluation_set(folder)
     photos = [*dataset.database, *dataset.queries]
