@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
 from benchmarks.report import Report
 from services.cli.environment import read_settings
+from services.cli.output import Table
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
@@ -145,7 +145,7 @@ class TrialMap:
     """
 
     def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
-        self.members = np.flatnonzero(in_map)
+        self.members = np.flatnonzero(in_map).tolist()
         self._photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
