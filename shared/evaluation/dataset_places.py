@@ -103,7 +103,7 @@ def measure_places(
             each[number, :EVIDENCE_DEPTH].tolist() for each in (ranked.indices, ranked.scores)
         )
         ranking = [
-            RankedPhoto(score, locations[index])
+            RankedPhoto(score, locations[index], index)
             for index, score in zip(indices, scores, strict=True)
         ]
         unit = model.unit(ranking)
