@@ -149,10 +149,10 @@ class TrialMap:
         self._photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.locations = [photos.locations[index] for index in self.members.tolist()]
+        self.locations = [photos.locations[index] for index in self.members]
         self.own_photos = OwnPhotoSampler(
             self.locations,
-            [photos.captured_at[index] for index in self.members.tolist()],
+            [photos.captured_at[index] for index in self.members],
             photos.scheme,
             photos.radius_m,
             lambda photo: _rank(scores[photo], without=photo),
