@@ -131,14 +131,6 @@ def read_published_checkpoint(
         raise ValueError("its tensors are not those of a known network") from error
 
 
-def is_vpr_checkpoint(stored: object) -> bool:
-    """Whether a loaded file is a checkpoint of a VPR model, and not of a backbone alone."""
-    return isinstance(stored, Mapping) and (
-        not {"state_dict", "model_state_dict"}.isdisjoint(stored)
-        or any(str(name).startswith("backbone.") for name in stored)
-    )
-
-
 def _rename(tensors: Mapping[str, Any]) -> tuple[str, Tensors]:
     """Return the aggregator's name and the network's tensors by our names."""
     # OpenVPRLab splits a ResNet's layers in two lists, which both begin with 0.
