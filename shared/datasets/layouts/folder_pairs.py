@@ -1,4 +1,6 @@
-"""Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
+"""Layouts of two folders: the common one, and that of VPR-Bench.
+
+The common one has `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
 Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL).
 
@@ -6,21 +8,27 @@ Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfold
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
 one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
 deep-visual-geo-localization-benchmark)
+
+VPR-Bench has `ref/` and `query/` with numbered photos, and their ground truth in
+`ground_truth_new.npy`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.ground_truth_files import read_numbered_ground_truth
 from shared.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
 from shared.datasets.photo_lists import add_exif_positions, photo_from_filename
 from shared.datasets.utm_coordinates import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
+NUMBERED_GROUND_TRUTH = "ground_truth_new.npy"
 VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
@@ -52,6 +60,38 @@ class FolderPairs:
                 for photos in (database, queries)
             )
         return ListedSet(database, queries, _default_rule(database + queries))
+
+
+class VprBench:
+    """Evaluation sets as two folders of numbered photos and a ground truth."""
+
+    name = "VPR-Bench"
+    protocols = (PLACEWISE_PROTOCOL,)
+
+    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
+        parts = (base / "ref", base / "query", base / NUMBERED_GROUND_TRUTH)
+        return {prefix: "."} if all(part.exists() for part in parts) else {}
+
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        database, queries = (
+            tuple(
+                photo_from_filename(path, path.relative_to(base).as_posix())
+                for path in sorted(photos_below(base / folder), key=_numeric_order)
+            )
+            for folder in ("ref", "query")
+        )
+        positives = read_numbered_ground_truth(
+            base / NUMBERED_GROUND_TRUTH,
+            database=[photo.name for photo in database],
+            queries=[photo.name for photo in queries],
+        )
+        return ListedSet(database, queries, f"given by {NUMBERED_GROUND_TRUTH}", tuple(positives))
+
+
+def _numeric_order(path: Path) -> list[tuple[int, str]]:
+    """Sort key by which `9.jpg` precedes `10.jpg`; the ground truth counts in this order."""
+    parts = re.split(r"(\d+)", path.as_posix())
+    return [(int(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:
