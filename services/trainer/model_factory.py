@@ -79,11 +79,12 @@ def _check_same_network(path: Path, stored: VprModelConfig, described: VprModelC
 
 
 def _describe_network(config: VprModelConfig) -> dict[str, object]:
-    """Return what decides the tensors; the map's size at `image_size` is in `agg_config`."""
+    """Return what decides the tensors; the size of photos does so for MixVPR only."""
     return {
         "backbone_arch": config.backbone_arch,
         "layers_to_crop": config.stages,
         "backbone_norm": config.backbone_norm,
         "agg_arch": config.agg_arch,
         "agg_config": config.agg_config,
+        "image_size": config.image_size if config.agg_arch == "MixVPR" else None,
     }

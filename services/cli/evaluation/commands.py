@@ -74,7 +74,9 @@ def evaluate(
     checkpoint: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="Checkpoint of `placewise train` to evaluate (.ckpt)."
+            exists=True,
+            dir_okay=False,
+            help="Checkpoint of a trained or published network to evaluate.",
         ),
     ] = None,
     image_size: Annotated[
@@ -320,8 +322,8 @@ def compare(
         str,
         typer.Option(
             help="Comma-separated extractor names with options as in EXTRACTOR, or checkpoints "
-            "(.ckpt). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` reduces "
-            "descriptors to 512 dimensions by PCA whitening.",
+            "(.ckpt, .pth). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` "
+            "reduces descriptors to 512 dimensions by PCA whitening.",
         ),
     ],
     set_name: Annotated[

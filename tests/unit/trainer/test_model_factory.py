@@ -11,6 +11,7 @@ import torch
 from services.trainer.arguments import build_arguments
 from services.trainer.model_factory import build_model_config, make_model
 from services.trainer.run_control import NullDisplay
+from shared.descriptors.vpr_models.checkpoint import checkpoint_state
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
 from shared.errors import Conflict, Misconfigured
 
@@ -68,6 +69,19 @@ def test_a_checkpoint_of_another_network_names_the_arguments_to_pass(published: 
     assert refused.value.code == "run_differs"
     assert "--layers_to_crop '[3]'" in refused.value.detail
     assert '"out_channels": 8' in refused.value.detail
+
+
+def test_the_size_of_photos_is_a_difference_for_mixvpr_only(tmp_path: Path) -> None:
+    for aggregator in ("MixVPR", "GeM"):
+        arguments = build_arguments(
+            NETWORK | {"pretrained": False, "agg_arch": aggregator, "agg_config": {}}
+        )
+        stored = build_vpr_model(build_model_config(arguments))
+        torch.save(checkpoint_state(stored), tmp_path / f"{aggregator}.ckpt")
+    other = {"agg_config": {}, "image_size": [96, 96]}
+    make(weights=str(tmp_path / "GeM.ckpt"), agg_arch="GeM", **other)
+    with pytest.raises(Conflict, match=r"--image_size '\[64, 64\]'"):
+        make(weights=str(tmp_path / "MixVPR.ckpt"), agg_arch="MixVPR", **other)
 
 
 def test_weights_that_are_not_there_are_named(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import torch
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.descriptors.vpr_models.published_checkpoints import read_published_checkpoint
 from shared.errors import Unprocessable
 
 RESNET_OF_GSV = {
@@ -91,7 +92,7 @@ def make_model(backbone: str, aggregator: str, arguments: dict[str, Any], side: 
                 "layers_to_crop": [4]
                 if backbone == "resnet18" and aggregator != "CosPlace"
                 else [],
-                "backbone_norm": backbone == "resnet18" or aggregator == "SALAD",
+                "backbone_norm": backbone.startswith("res") or aggregator == "SALAD",
                 "agg_arch": aggregator,
                 "agg_config": arguments,
                 "image_size": (side, side),
@@ -184,6 +185,21 @@ def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size(
         "epoch": 3,
     }
     assert_loads_as(tmp_path / "epoch.ckpt", state, model, 288)
+
+
+@pytest.mark.parametrize(
+    "backbone",
+    ["resnet34", "resnet50", "resnet101", "resnext50_32x4d", "dinov2_vitb14", "dinov2_vitl14"],
+)
+def test_the_backbone_is_recognised_by_its_tensors(backbone: str) -> None:
+    is_resnet = not backbone.startswith("dinov2")
+    with torch.device("meta"):
+        model = make_model(backbone, "BoQ", {"proj_channels": 64, "num_queries": 4}, 42)
+    names = RESNET_OF_BOQ if is_resnet else dinov2("dino")
+    config, tensors = read_published_checkpoint({}, rename(model, names | BOQ))
+    assert config.backbone_arch == backbone
+    assert config.stages == model.config.stages
+    assert tensors.keys() == model.state_dict().keys()
 
 
 def test_a_training_checkpoint_of_cosplace_is_loaded(tmp_path: Path) -> None:
