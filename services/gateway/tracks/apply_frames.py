@@ -15,9 +15,6 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from shared.tracks.belief import Belief
-from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, frame_evidence
-from shared.tracks.filter import TrackFilter
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
@@ -44,6 +41,9 @@ from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import query_expired_error
+from shared.tracks.belief import Belief
+from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, frame_evidence
+from shared.tracks.filter import TrackFilter
 
 START_ACCURACY_M = 50.0
 START_PROBABILITY = 0.9  # of the photos at a stated start, together

@@ -12,7 +12,6 @@ from datetime import UTC, datetime, timedelta
 from uuid import UUID
 
 import numpy as np
-from shared.tracks.photo_graph import PhotoTable
 from sqlalchemy import and_, or_, select
 from sqlalchemy.orm import Session
 
@@ -22,6 +21,7 @@ from shared.catalog.photo_search import filter_conditions
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.geodesy import distances_m
 from shared.search_api.photo_filter import Circle, PhotoFilter
+from shared.tracks.photo_graph import PhotoTable
 
 CELL_DEGREES = 0.001  # sources within a cell of this size share one condition
 CONDITIONS_PER_QUERY = 100

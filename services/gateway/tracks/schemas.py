@@ -7,14 +7,14 @@ from typing import Annotated, Any, Literal, Self
 from uuid import UUID
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-from shared.tracks.evidence import Odometry, PositionFix
-from shared.tracks.motion import DEFAULT_MOTION, MotionModel, motion_model
-from shared.tracks.state import TrackState
 
 from services.gateway.dependencies import NO_NUL_PATTERN
 from services.gateway.schemas import EstimateLevelResponse, RequestModel, ResponseModel
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
+from shared.tracks.evidence import Odometry, PositionFix
+from shared.tracks.motion import DEFAULT_MOTION, MotionModel, motion_model
+from shared.tracks.state import TrackState
 
 Latitude = Annotated[float | None, Field(ge=-90, le=90)]
 Longitude = Annotated[float | None, Field(ge=-180, le=180)]

@@ -9,7 +9,6 @@ import pytest
 
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
-from tests.support.problems import problem
 
 BEGIN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 STREET = range(6)
@@ -36,7 +35,9 @@ def street(service: Service) -> Service:
 
 
 def begin(service: Service, **params: Any) -> str:
-    return str(service.json("POST", "/tracks", 201, json={"motion": "bicycle", **params})["track_id"])
+    return str(
+        service.json("POST", "/tracks", 201, json={"motion": "bicycle", **params})["track_id"]
+    )
 
 
 def send(service: Service, track_id: str, number: int, status: int = 202, **fields: Any) -> Any:
