@@ -126,7 +126,7 @@ class TrackFilter:
             belief, self._graph.photos(belief.photos), self._scheme, self._motion.typical_speed_mps
         )
 
-    def smooth(self, frames: Sequence[FrameEvidence]) -> list[Belief]:
+    def smooth(self, frames: Sequence[FrameEvidence], start: Belief | None = None) -> list[Belief]:
         """Return the belief at each frame given all frames, earlier and later.
 
         This is the forward-backward algorithm (Rabiner 1989) on the sparse beliefs of the forward
@@ -134,10 +134,11 @@ class TrackFilter:
 
         Args:
             frames: In the order of time.
+            start: The belief before the first frame; None if nothing is known.
         """
         steps: list[_Step] = []
         for frame in frames:
-            before = steps[-1].belief if steps else _start(frame.time)
+            before = steps[-1].belief if steps else start or _start(frame.time)
             steps.append(self._step(before, frame))
         return _backward(steps, self._graph.photo_count)
 

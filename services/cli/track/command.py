@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence, Sized
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Annotated
+from uuid import UUID
 
 import typer
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Column, Table
 
-from placewise.answers import OneTrack, Photo, TrackFrame
+from placewise.answers import OneTrack, TrackFrame
 from placewise.client import Client
 from services.cli.client import connect
 from services.cli.output import (
@@ -26,6 +27,7 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    printable_path,
     progress_bar,
     report_errors,
 )
@@ -40,6 +42,7 @@ from services.cli.track.track_files import (
     PICTURE_SUFFIXES,
     WRITERS,
     check_track_files,
+    track_row,
     write_track_file,
 )
 from shared.errors import InvalidRequest
@@ -98,7 +101,7 @@ def track(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Use the positions in the photos' EXIF, with this accuracy (68 %). Without it they "
+            help="Use the positions in the EXIF, with this accuracy (68 %). Without it they "
             "are ignored.",
         ),
     ] = None,
@@ -128,14 +131,13 @@ def track(
             progress_bar() as progress,
             tempfile.TemporaryDirectory() as folder,
         ):
-            if source.is_dir():
-                frames: Iterable[SourceFrame] = read_photo_frames(source, timing)
-                total = len(list(frames))
-            else:
-                frames, total = read_video_frames(source, timing, Path(folder)), None
+            frames = (
+                read_photo_frames(source, timing)
+                if source.is_dir()
+                else read_video_frames(source, timing, Path(folder))
+            )
             begun = client.begin_track(motion=motion, max_speed_mps=max_speed)
-            bar = progress.add_task("frames", total=total)
-            _send_frames(client, begun.track_id, frames, gps_accuracy, progress, bar)
+            _send_frames(client, begun.track_id, frames, gps_accuracy, progress)
             result = client.track(begun.track_id, smoothed=smoothed)
             draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
             photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
@@ -145,3 +147,82 @@ def track(
             print_json(result)
         else:
             _print_track(result, files)
+
+
+def _send_frames(
+    client: Client,
+    track_id: UUID,
+    frames: Iterable[SourceFrame],
+    gps_accuracy_m: float | None,
+    progress: Progress,
+) -> None:
+    """Send frames, up to FRAMES_AHEAD before the first of them is applied, and wait for all."""
+    total = len(frames) if isinstance(frames, Sized) else None
+    bar = progress.add_task("frames", total=total)
+    ahead: deque[TrackFrame] = deque()
+    version = 0
+    for frame in frames:
+        has_fix = gps_accuracy_m is not None and frame.latitude is not None
+        sent = client.add_frame(
+            track_id,
+            frame.path,
+            frame.captured_at,
+            wait=False,
+            expected_version=version,
+            latitude=frame.latitude if has_fix else None,
+            longitude=frame.longitude if has_fix else None,
+            accuracy_m=gps_accuracy_m if has_fix else None,
+        )
+        version = sent.version
+        ahead.append(sent)
+        if len(ahead) > FRAMES_AHEAD:
+            _wait_for_frame(client, track_id, ahead.popleft(), progress)
+            progress.advance(bar)
+    for sent in ahead:
+        _wait_for_frame(client, track_id, sent, progress)
+        progress.advance(bar)
+    if not version:
+        raise InvalidRequest("no_frames", "The video has no frames.")
+
+
+def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame, progress: Progress) -> None:
+    while frame.status == "pending":
+        frame = client.track_frame(track_id, frame.frame_id, wait_seconds=WAIT_SECONDS)
+    if frame.error is not None:
+        progress.console.print(
+            f"[red]{frame.error['code']}[/red] {escape(frame.filename)}: "
+            f"{escape(str(frame.error['detail']))}",
+            soft_wrap=True,
+        )
+
+
+def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
+    table = Table(
+        "time",
+        Column("photo", overflow="fold"),
+        "status",
+        Column("probability", justify="right"),
+        Column("latitude", no_wrap=True),
+        Column("longitude", no_wrap=True),
+        "place",
+    )
+    for frame in track.frames:
+        row = track_row(frame)
+        table.add_row(
+            f"{frame.captured_at:%H:%M:%S}",
+            escape(frame.filename),
+            row["status"],
+            "" if row["probability"] is None else f"{100 * row['probability']:.1f} %",
+            "" if row["latitude"] is None else f"{row['latitude']:.6f}",
+            "" if row["longitude"] is None else f"{row['longitude']:.6f}",
+            escape(row["place"] or ""),
+        )
+    console.print(table)
+    states = [frame.state for frame in track.frames if frame.state is not None]
+    tracked = sum(state.status == "tracking" for state in states)
+    err_console.print(
+        f"{tracked} of {len(track.frames)} frames are tracked. Track {track.track_id}"
+        f"{''.join(f', {printable_path(file)}' for file in files)}",
+        soft_wrap=True,
+        markup=False,
+    )

@@ -127,7 +127,9 @@ def _to_geojson(track: OneTrack, photos: Sequence[Photo]) -> bytes:
         position = [row["longitude"], row["latitude"]]
         properties = {name: _plain(value) for name, value in row.items()}
         features.append(
-            _feature("Point", None if None in position else position, {"kind": "frame", **properties})
+            _feature(
+                "Point", None if None in position else position, {"kind": "frame", **properties}
+            )
         )
     collection = {"type": "FeatureCollection", "features": features}
     return json.dumps(collection, ensure_ascii=False, indent=1).encode()
