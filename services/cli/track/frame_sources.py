@@ -9,6 +9,8 @@ from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 
+from PIL import Image
+
 from services.cli.ingest.geotags import list_photos
 from services.cli.output import printable_path
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
@@ -112,7 +114,7 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
                     continue
                 due += timing.every_seconds * (1 + (seconds - due) // timing.every_seconds)
                 path = folder / f"frame-{seconds:010.3f}.jpg"
-                frame.to_image().save(path, quality=JPEG_QUALITY)
+                Image.fromarray(frame.to_ndarray(format="rgb24")).save(path, quality=JPEG_QUALITY)
                 yield SourceFrame(path, path.name, first + timedelta(seconds=seconds))
     except av.FFmpegError as error:
         raise InvalidRequest(

@@ -61,34 +61,25 @@ def _draw_positions(axes: Axes, track: OneTrack, photos: Sequence[Photo]) -> Non
     """Draw the photos of the map, the circles of 68 %, the line, and the frames."""
     from matplotlib.patches import Ellipse
 
-    on_map = [photo for photo in photos if photo.latitude is not None]
-    axes.scatter(
-        [photo.longitude for photo in on_map],
-        [photo.latitude for photo in on_map],
-        s=6,
-        color=MAP_COLOR,
-        label="photos of the map",
-    )
+    on_map = [_position(photo) for photo in photos if photo.latitude is not None]
+    _scatter(axes, on_map, MAP_COLOR, "photos of the map", size=6)
     stretch = 1.0
     for segment in located_segments(track):
-        points = [(state.longitude, state.latitude or 0.0) for _, state in segment]
+        points = [_position(state) for _, state in segment]
         stretch = 1 / max(math.cos(math.radians(points[0][1])), 0.01)
         axes.plot(*zip(*points, strict=True), color=COLOR_OF_STATUS["tracking"], linewidth=1)
         for (_, state), point in zip(segment, points, strict=True):
-            degrees = 2 * (state.radius_68_m or 0.0) / METRES_PER_DEGREE
-            axes.add_patch(
-                Ellipse(
-                    point,
-                    degrees * stretch,
-                    degrees,
-                    color=COLOR_OF_STATUS[state.status],
-                    alpha=0.08,
-                    linewidth=0,
-                )
-            )
+            height = 2 * (state.radius_68_m or 0.0) / METRES_PER_DEGREE
+            color = COLOR_OF_STATUS[state.status]
+            axes.add_patch(Ellipse(point, height * stretch, height, color=color, alpha=0.08, lw=0))
     states = [frame.state for frame in track.frames if frame.state is not None]
-    located = [state for state in states if state.latitude is not None]
-    _scatter(axes, located, [(state.longitude, state.latitude) for state in located])
+    for status, color in COLOR_OF_STATUS.items():
+        _scatter(
+            axes,
+            [_position(s) for s in states if s.status == status and s.latitude is not None],
+            color,
+            status,
+        )
     axes.set_xlabel("longitude")
     axes.set_ylabel("latitude")
     axes.ticklabel_format(useOffset=False)
@@ -96,15 +87,26 @@ def _draw_positions(axes: Axes, track: OneTrack, photos: Sequence[Photo]) -> Non
 
 
 def _draw_places(axes: Axes, states: Sequence[LocatedFrame]) -> None:
-    points = [(frame.captured_at, state.place or "unknown") for frame, state in states]
-    _scatter(axes, [state for _, state in states], points)
+    for status, color in COLOR_OF_STATUS.items():
+        points = [
+            (frame.captured_at, state.place or "unknown")
+            for frame, state in states
+            if state.status == status
+        ]
+        _scatter(axes, points, color, status)
     axes.set_xlabel("time")
     axes.set_ylabel("place")
 
 
-def _scatter(axes: Axes, states: Sequence[TrackState], points: Sequence[tuple[Any, Any]]) -> None:
-    """Draw the points in the colours of their states; one entry of the legend for each."""
-    for status, color in COLOR_OF_STATUS.items():
-        of_status = [p for state, p in zip(states, points, strict=True) if state.status == status]
-        if of_status:
-            axes.scatter(*zip(*of_status, strict=True), s=14, color=color, label=status, zorder=3)
+def _position(located: Photo | TrackState) -> tuple[float, float]:
+    assert located.longitude is not None
+    assert located.latitude is not None
+    return located.longitude, located.latitude
+
+
+def _scatter(
+    axes: Axes, points: Sequence[tuple[Any, Any]], color: str, label: str, size: float = 14
+) -> None:
+    if points:
+        x, y = zip(*points, strict=True)
+        axes.scatter(x, y, s=size, color=color, label=label, zorder=3)
