@@ -258,9 +258,9 @@ def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
         begin(street, latitude=latitude_of(0), longitude=7, accuracy_m=20),
         begin(street),
     )
-    fix = {"latitude": latitude_of(0), "longitude": 7, "accuracy_m": 10}
+    fix: dict[str, Any] = {"latitude": latitude_of(0), "longitude": 7, "accuracy_m": 10}
     send(street, placed, 0, **fix)
-    odometry = {"distance_m": 80, "distance_accuracy_m": 5, "turn_degrees": 10}
+    odometry: dict[str, Any] = {"distance_m": 80, "distance_accuracy_m": 5, "turn_degrees": 10}
     send(street, placed, 1, **odometry)
     ride(street, alone, 0, 1)
     ride(street, told, 0, 1)
