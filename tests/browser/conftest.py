@@ -142,7 +142,7 @@ class Visitor:
             self.foreign.append(request.url)
 
     def visit(self, view: str) -> Page:
-        """Open the view anew: `ask`, `photos`, `photo/ID`, `tracks`, `tracks/ID`, `add`, `model` or `status`."""
+        """Open the view anew: `ask`, `photos`, `photo/ID`, `tracks`, `tracks/ID`, `add`, ..."""
         self.page.goto("about:blank")
         self.page.goto(f"{self.url}/#/{view}")
         expect(self.page.locator("h1")).to_be_visible()

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence, Sized
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from uuid import UUID
 
 import typer
@@ -45,7 +45,7 @@ from services.cli.track.track_files import (
     track_row,
     write_track_file,
 )
-from shared.errors import InvalidRequest
+from shared.errors import InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
 from shared.tracks.motion import MOTION_MODELS
 
 FRAMES_AHEAD = 8  # stored before the first of them must be applied: they are described as a batch
@@ -163,16 +163,23 @@ def _send_frames(
     version = 0
     for frame in frames:
         has_fix = gps_accuracy_m is not None and frame.latitude is not None
-        sent = client.add_frame(
-            track_id,
-            frame.path,
-            frame.captured_at,
-            wait=False,
-            expected_version=version,
-            latitude=frame.latitude if has_fix else None,
-            longitude=frame.longitude if has_fix else None,
-            accuracy_m=gps_accuracy_m if has_fix else None,
-        )
+        try:
+            sent = client.add_frame(
+                track_id,
+                frame.path,
+                frame.captured_at,
+                wait=False,
+                expected_version=version,
+                latitude=frame.latitude if has_fix else None,
+                longitude=frame.longitude if has_fix else None,
+                accuracy_m=gps_accuracy_m if has_fix else None,
+            )
+        except (Unprocessable, UnsupportedMedia, TooLarge) as error:
+            if error.code == "invalid_field":
+                raise
+            _print_failure(progress, frame.name, error.as_problem())
+            progress.advance(bar)
+            continue
         version = sent.version
         ahead.append(sent)
         if len(ahead) > FRAMES_AHEAD:
@@ -182,18 +189,21 @@ def _send_frames(
         _wait_for_frame(client, track_id, sent, progress)
         progress.advance(bar)
     if not version:
-        raise InvalidRequest("no_frames", "The video has no frames.")
+        raise InvalidRequest("no_frames", "No frame could be sent.")
 
 
 def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame, progress: Progress) -> None:
     while frame.status == "pending":
         frame = client.track_frame(track_id, frame.frame_id, wait_seconds=WAIT_SECONDS)
     if frame.error is not None:
-        progress.console.print(
-            f"[red]{frame.error['code']}[/red] {escape(frame.filename)}: "
-            f"{escape(str(frame.error['detail']))}",
-            soft_wrap=True,
-        )
+        _print_failure(progress, frame.filename, frame.error)
+
+
+def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> None:
+    progress.console.print(
+        f"[red]{problem['code']}[/red] {escape(name)}: {escape(str(problem['detail']))}",
+        soft_wrap=True,
+    )
 
 
 def _print_track(track: OneTrack, files: Sequence[Path]) -> None:

@@ -15,6 +15,7 @@ CLIENT_COMMANDS = (
     "models",
     "pca",
     "query",
+    "track",
     "vocabulary",
 )
 
