@@ -7,29 +7,42 @@ coordinates.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import and_, or_, select
+from sqlalchemy import Float, and_, cast, func, literal, literal_column, or_, select
+from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import Condition
 from shared.catalog.maps import CachedMapStatistics
-from shared.catalog.photo_search import filter_conditions
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
-from shared.geodesy import distances_m
-from shared.search_api.photo_filter import Circle, PhotoFilter
+from shared.geodesy import distances_m, latitude_bounds, longitude_half_width
 from shared.tracks.photo_graph import PhotoTable
 
-CELL_DEGREES = 0.001  # sources within a cell of this size share one condition
+CELL_DEGREES = 0.001  # photos within a cell of this size are looked up together
 CONDITIONS_PER_QUERY = 100
+COLUMNS = (
+    Photo.id,
+    Photo.latitude,
+    Photo.longitude,
+    Photo.heading,
+    Photo.place,
+    Photo.captured_at,
+)
 SEQUENCE = "map"
 """Name of the sequence of all photos that have a time."""
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 MIN_SECONDS = (datetime.min.replace(tzinfo=UTC) - EPOCH).total_seconds()
 MAX_SECONDS = (datetime.max.replace(tzinfo=UTC) - EPOCH).total_seconds() - 1
+
+Box = tuple[float, float, float, float]
+"""South, north, west, east in degrees; west is not greater than east."""
 
 
 class CatalogPhotoGraph:
@@ -39,7 +52,7 @@ class CatalogPhotoGraph:
         self._session = session
         self._map_id = map_id
 
-    @property
+    @cached_property
     def photo_count(self) -> int:
         """Number of photos; of a large map, as of the last count."""
         cached = self._session.get(CachedMapStatistics, self._map_id)
@@ -53,14 +66,19 @@ class CatalogPhotoGraph:
 
     def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
         """Return the photos with coordinates within a radius."""
-        return self._select([_within(latitude, longitude, radius_m)])
+        found = self._inside(_boxes_around(latitude, latitude, longitude, longitude, radius_m))
+        away = distances_m(latitude, longitude, found.latitudes, found.longitudes)
+        return found.take(away <= radius_m)
 
     def labelled(self, place: str) -> PhotoTable:
         """Return the photos with exactly this place label."""
         return self._select([Photo.place == place])
 
     def around(self, photos: PhotoTable, reach_m: float, reach_seconds: float) -> PhotoTable:
-        """Return all photos near any of `photos`; see `PhotoGraph.around`."""
+        """Return all photos near any of `photos`; see `PhotoGraph.around`.
+
+        Some that are a little farther than `reach_m` are among them.
+        """
         located = ~np.isnan(photos.latitudes)
         found = self._around_points(photos.take(located), reach_m)
         if located.all():
@@ -73,25 +91,48 @@ class CatalogPhotoGraph:
         return found.union(chain)
 
     def _around_points(self, points: PhotoTable, reach_m: float) -> PhotoTable:
-        cells: dict[tuple[int, int], list[int]] = {}
-        for row, (latitude, longitude) in enumerate(
-            zip(points.latitudes, points.longitudes, strict=True)
+        cells: dict[tuple[float, float], list[int]] = {}
+        for row, cell in enumerate(
+            zip(points.latitudes // CELL_DEGREES, points.longitudes // CELL_DEGREES, strict=True)
         ):
-            cell = (int(latitude // CELL_DEGREES), int(longitude // CELL_DEGREES))
             cells.setdefault(cell, []).append(row)
-        conditions = []
+        boxes: list[Box] = []
         for rows in cells.values():
-            latitude, longitude = points.latitudes[rows[0]], points.longitudes[rows[0]]
-            spread_m = distances_m(
-                latitude, longitude, points.latitudes[rows], points.longitudes[rows]
-            ).max()
-            conditions.append(_within(latitude, longitude, float(reach_m + spread_m)))
-        found = self._select(conditions)
-        distance_m = np.full(len(found), np.inf)
-        for latitude, longitude in zip(points.latitudes, points.longitudes, strict=True):
-            to_point = distances_m(latitude, longitude, found.latitudes, found.longitudes)
-            np.minimum(distance_m, to_point, out=distance_m)
-        return found.take(distance_m <= reach_m)
+            latitudes, longitudes = points.latitudes[rows], points.longitudes[rows]
+            boxes += _boxes_around(
+                latitudes.min(), latitudes.max(), longitudes.min(), longitudes.max(), reach_m
+            )
+        return self._inside(boxes)
+
+    def _inside(self, boxes: Sequence[Box]) -> PhotoTable:
+        """Return the photos inside any of the boxes."""
+        # The boxes are one parameter: building and parsing a condition for each takes far longer.
+        if self._session.get_bind().dialect.name == "postgresql":
+            rows = func.jsonb_array_elements(literal(list(boxes), JSONB)).table_valued("value")
+            south, north, west, east = (
+                cast(rows.c.value.op("->>")(literal_column(str(i))), Float) for i in range(4)
+            )
+        else:
+            rows = func.json_each(json.dumps(boxes)).table_valued("value")
+            south, north, west, east = (
+                func.json_extract(rows.c.value, f"$[{i}]") for i in range(4)
+            )
+        # An outer join, because SQLite would scan the photos of the map for an inner one.
+        found = self._session.execute(
+            select(*COLUMNS)
+            .select_from(rows)
+            .outerjoin(
+                Photo,
+                and_(
+                    Photo.map_id == self._map_id,
+                    Photo.latitude.between(south, north),
+                    Photo.longitude.between(west, east),
+                    Photo.deleted_at.is_(None),
+                    Photo.role == PhotoRole.DATABASE,
+                ),
+            )
+        )
+        return PhotoTable.of_rows(_table_row(row) for row in found if row.id).union()
 
     def _same_label(self, photos: PhotoTable) -> PhotoTable:
         labels = sorted({place for place in photos.places.tolist() if place is not None})
@@ -118,46 +159,38 @@ class CatalogPhotoGraph:
         """Return the photos that match any of the conditions, each once."""
         tables = [PhotoTable.of_rows([])]
         for begin in range(0, len(any_of), CONDITIONS_PER_QUERY):
+            # The map in each alternative, so that each uses an index, which begins with it.
+            alternatives = (
+                and_(Photo.map_id == self._map_id, condition)
+                for condition in any_of[begin : begin + CONDITIONS_PER_QUERY]
+            )
             rows = self._session.execute(
-                select(
-                    Photo.id,
-                    Photo.latitude,
-                    Photo.longitude,
-                    Photo.heading,
-                    Photo.place,
-                    Photo.captured_at,
-                ).where(
-                    Photo.deleted_at.is_(None),
-                    Photo.role == PhotoRole.DATABASE,
-                    # In each alternative, so that each uses an index, which begins with the map.
-                    or_(
-                        *(
-                            and_(Photo.map_id == self._map_id, condition)
-                            for condition in any_of[begin : begin + CONDITIONS_PER_QUERY]
-                        )
-                    ),
+                select(*COLUMNS).where(
+                    Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE, or_(*alternatives)
                 )
             )
-            tables.append(
-                PhotoTable.of_rows(
-                    (
-                        str(photo_id),
-                        latitude,
-                        longitude,
-                        heading,
-                        place,
-                        None if taken is None else SEQUENCE,
-                        None if taken is None else taken.timestamp(),
-                    )
-                    for photo_id, latitude, longitude, heading, place, taken in rows
-                )
-            )
+            tables.append(PhotoTable.of_rows(map(_table_row, rows)))
         return tables[0].union(*tables[1:])
 
 
-def _within(latitude: float, longitude: float, radius_m: float) -> Condition:
-    circle = Circle(latitude=float(latitude), longitude=float(longitude), radius_m=radius_m)
-    return and_(*filter_conditions(PhotoFilter(near=circle)))
+def _table_row(row: Any) -> tuple[Any, ...]:
+    """Return the row of a `PhotoTable` for a row of COLUMNS."""
+    photo_id, latitude, longitude, heading, place, taken = row
+    sequence = (None, None) if taken is None else (SEQUENCE, taken.timestamp())
+    return str(photo_id), latitude, longitude, heading, place, *sequence
+
+
+def _boxes_around(
+    south: float, north: float, west: float, east: float, margin_m: float
+) -> list[Box]:
+    """Return boxes that contain a box and all points within a margin of it."""
+    low, high = latitude_bounds(south, margin_m)[0], latitude_bounds(north, margin_m)[1]
+    width = longitude_half_width(max(abs(south), abs(north)), margin_m)
+    if width is None:
+        return [(float(low), float(high), -180.0, 180.0)]
+    west, east = float(west - width), float(east + width)
+    parts = [(west, east), (west + 360, 180.0), (-180.0, east - 360)]
+    return [(float(low), float(high), a, b) for a, b in parts if a <= b and a <= 180 and b >= -180]
 
 
 def _to_time(seconds: float) -> datetime:
