@@ -26,7 +26,7 @@ from shared.geodesy import distances_m, latitude_bounds, longitude_half_width
 from shared.tracks.photo_graph import PhotoTable
 
 CELL_DEGREES = 0.001  # photos within a cell of this size are looked up together
-CONDITIONS_PER_QUERY = 100
+INTERVALS_PER_QUERY = 100
 COLUMNS = (
     Photo.id,
     Photo.latitude,
@@ -62,7 +62,8 @@ class CatalogPhotoGraph:
 
     def photos(self, ids: Sequence[str]) -> PhotoTable:
         """Return the photos that have one of these ids and are still in the map."""
-        return self._select([Photo.id.in_([UUID(photo_id) for photo_id in ids])])
+        # Without the map, to which they belong: SQLite would scan its photos.
+        return self._select(Photo.id.in_([UUID(photo_id) for photo_id in ids]))
 
     def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
         """Return the photos with coordinates within a radius."""
@@ -72,7 +73,7 @@ class CatalogPhotoGraph:
 
     def labelled(self, place: str) -> PhotoTable:
         """Return the photos with exactly this place label."""
-        return self._select([Photo.place == place])
+        return self._select(Photo.map_id == self._map_id, Photo.place == place)
 
     def around(self, photos: PhotoTable, reach_m: float, reach_seconds: float) -> PhotoTable:
         """Return all photos near any of `photos`; see `PhotoGraph.around`.
@@ -136,7 +137,9 @@ class CatalogPhotoGraph:
 
     def _same_label(self, photos: PhotoTable) -> PhotoTable:
         labels = sorted({place for place in photos.places.tolist() if place is not None})
-        return self._select([and_(Photo.place.in_(labels), Photo.latitude.is_(None))])
+        return self._select(
+            Photo.map_id == self._map_id, Photo.place.in_(labels), Photo.latitude.is_(None)
+        )
 
     def _taken_within(self, photos: PhotoTable, reach_seconds: float) -> PhotoTable:
         intervals: list[tuple[float, float]] = []
@@ -145,32 +148,27 @@ class CatalogPhotoGraph:
                 intervals[-1] = (intervals[-1][0], second + reach_seconds)
             else:
                 intervals.append((second - reach_seconds, second + reach_seconds))
-        return self._select(
-            [
-                and_(
-                    Photo.captured_at.between(_to_time(first), _to_time(last)),
-                    Photo.latitude.is_(None),
-                )
-                for first, last in intervals
-            ]
-        )
+        # The map in each alternative, so that each uses an index, which begins with it.
+        alternatives = [
+            and_(
+                Photo.map_id == self._map_id,
+                Photo.captured_at.between(_to_time(first), _to_time(last)),
+            )
+            for first, last in intervals
+        ]
+        found = photos.take(np.zeros(0, dtype=np.int64))
+        for begin in range(0, len(alternatives), INTERVALS_PER_QUERY):
+            any_of = or_(*alternatives[begin : begin + INTERVALS_PER_QUERY])
+            found = found.union(self._select(any_of, Photo.latitude.is_(None)))
+        return found
 
-    def _select(self, any_of: Sequence[Condition]) -> PhotoTable:
-        """Return the photos that match any of the conditions, each once."""
-        tables = [PhotoTable.of_rows([])]
-        for begin in range(0, len(any_of), CONDITIONS_PER_QUERY):
-            # The map in each alternative, so that each uses an index, which begins with it.
-            alternatives = (
-                and_(Photo.map_id == self._map_id, condition)
-                for condition in any_of[begin : begin + CONDITIONS_PER_QUERY]
+    def _select(self, *conditions: Condition) -> PhotoTable:
+        rows = self._session.execute(
+            select(*COLUMNS).where(
+                Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE, *conditions
             )
-            rows = self._session.execute(
-                select(*COLUMNS).where(
-                    Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE, or_(*alternatives)
-                )
-            )
-            tables.append(PhotoTable.of_rows(map(_table_row, rows)))
-        return tables[0].union(*tables[1:])
+        )
+        return PhotoTable.of_rows(map(_table_row, rows))
 
 
 def _table_row(row: Any) -> tuple[Any, ...]:
