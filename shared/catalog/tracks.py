@@ -18,7 +18,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, defer, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Condition,
     JsonValue,

@@ -33,7 +33,12 @@ __all__ = [
     "open_training_set",
 ]
 
-PART_FOLDERS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
+PART_FOLDERS = frozenset(
+    {
+        *("database", "queries", "queries_v1", "queries_v2"),
+        *("train", "val", "test", "train_val", "images"),
+    }
+)
 """Subfolders of datasets that are never datasets of their own"""
 LAYOUTS_HELP = "See docs/how-to/data-sets.md for all layouts."
 

@@ -14,6 +14,7 @@ CELL_SECONDS = 850  # of a busy machine
 
 SMALL = {
     "train": """
+DATA = "city"
 PLACES = 6
 SIZE = "64x64"
 IMAGE_SIZE = [64, 64]
@@ -22,7 +23,7 @@ MAX_STEPS = 1
 ACCELERATOR = "cpu"
 """,
     "pictures": """
-DATA = None
+DATA = SET = PREDICTIONS = CHECKPOINT = None
 PLACES = 4
 SIZE = "64x64"
 EXTRACTOR = "test-tiny-avg"

@@ -41,7 +41,7 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     done = server.finished(job["job_id"])
     assert done["state"] == "succeeded"
     assert done["result"] == {**done["result"], "photos": 17, "clusters": 64, "failed": 0}
-    own = ranks(server, real_photos, "own")
+    own = ranks(server, real_photos, "provisional")
     print("rank of the true place, foreign vocabulary:", foreign, "own:", own)
     for query in EASY:
         assert foreign[query] == 1

@@ -137,8 +137,8 @@ def test_ladder_has_six_rungs_with_recalls_that_grow_with_k(command: Command) ->
         "colour histogram",
         "thumbnail 16x16",
         "untrained network",
-        "efficientnet-lite0-vlad, shipped vocabulary",
-        "efficientnet-lite0-vlad, fitted vocabulary",
+        "efficientnet-lite0-vlad128, shipped vocabulary",
+        "efficientnet-lite0-vlad128, fitted vocabulary",
     ]
     for rung in rungs:
         for kind in ("recall", "recall_in_map", "recall_other_way"):

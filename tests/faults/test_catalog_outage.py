@@ -21,15 +21,15 @@ from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, find_descriptor
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_or_create_default_map, lock_map
 from shared.catalog.photos import Photo
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.search_api.protocol import SearchRequest

@@ -41,8 +41,8 @@ from services.gateway.tracks.schemas import (
     parse_frame_form,
 )
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.catalog.tracks import (
     Track,
     TrackFrame,

@@ -19,7 +19,7 @@ from sqlalchemy import Float, and_, cast, func, literal, literal_column, or_, se
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import Condition
+from shared.catalog.database.base import Condition
 from shared.catalog.maps import CachedMapStatistics
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.geodesy import distances_m, latitude_bounds, longitude_half_width

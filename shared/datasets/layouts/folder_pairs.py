@@ -1,5 +1,7 @@
 """Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
+Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL).
+
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
 one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
@@ -24,28 +26,32 @@ VME_PROTOCOL = "vme"
 
 
 class FolderPairs:
-    """Evaluation sets as pairs of folders, named by the dataset's folder and the split."""
+    """Evaluation sets as pairs of folders, named by dataset folder, split and query version."""
 
     name = "database and queries folders"
     protocols = (PLACEWISE_PROTOCOL, VME_PROTOCOL)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        splits = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
-        return {prefix: ".", **splits} if _is_pair(base) else splits
+        homes = {prefix: base, **{f"{prefix}_{split}": base / split for split in SPLITS}}
+        return {
+            f"{name}{queries.name.removeprefix('queries')}": queries.relative_to(base).as_posix()
+            for name, home in homes.items()
+            if (home / "database").is_dir()
+            for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
+            if queries.is_dir()
+        }
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         folder = base / key
-        database, queries = (_read_photos(folder / name, base) for name in ("database", "queries"))
+        database, queries = (
+            _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
+        )
         if protocol == VME_PROTOCOL:
             database, queries = (
                 tuple(replace(photo, zone=None) for photo in photos)
                 for photos in (database, queries)
             )
         return ListedSet(database, queries, _default_rule(database + queries))
-
-
-def _is_pair(folder: Path) -> bool:
-    return (folder / "database").is_dir() and (folder / "queries").is_dir()
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:

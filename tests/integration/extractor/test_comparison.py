@@ -16,8 +16,8 @@ from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_ended_generations, collect_queries
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, reclaim_expired_leases

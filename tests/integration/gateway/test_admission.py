@@ -15,10 +15,10 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway import admission as room_module
 from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
 from services.gateway.authentication import Caller
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Priority
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ids import new_id
@@ -99,6 +99,10 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
     assert upload(service, 2, "city").status_code == 202
     queue_full(upload(service, 3))
     queue_full(upload(service, 3, "city"))
+    health = service("GET", "/health").json()
+    assert health["status"] == health["parts"]["uploads"]["status"] == "degraded"
+    assert "2 jobs are waiting, the limit is 2" in health["parts"]["uploads"]["detail"]
+    assert service("GET", "/../../readyz").status_code == 200
     for call in ("/vocabularies", "/evaluations"):
         queue_full(service("POST", call))
     for number in range(3):

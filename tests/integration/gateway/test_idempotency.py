@@ -14,10 +14,10 @@ from sqlalchemy import func, select, update
 from services.extractor.worker import ExtractorWorker
 from services.gateway import idempotency as once
 from services.gateway.routes import model_changes
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.imaging.photo_header import read_photo_header

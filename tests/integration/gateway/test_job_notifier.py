@@ -11,8 +11,8 @@ from sqlalchemy.exc import OperationalError
 
 from services.gateway import dependencies as job_watch
 from services.gateway.dependencies import Change, JobNotifier, WatchedState
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobState
 from tests.support.catalog_rows import add_job, add_map, set_columns

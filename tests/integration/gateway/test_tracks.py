@@ -17,9 +17,9 @@ from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_queries
 from services.steward.tasks.maintenance import delete_old_tracks
 from shared.catalog import tracks as tracks_table
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job
-from shared.catalog.session import Catalog
 from shared.catalog.tracks import Track, TrackFrame
 from shared.storage.keys import query_key, query_vector_key
 from tests.integration.in_process_api import Service

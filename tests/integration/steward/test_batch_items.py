@@ -13,7 +13,7 @@ from services.steward.batches import worker as worker_module
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_job_files
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from shared.storage.keys import ARCHIVES
 from tests.integration.in_process_api import Service

@@ -25,8 +25,8 @@ from services.steward.webhooks import (
     WebhookDispatcher,
     retry_delay_seconds,
 )
-from shared.catalog.base import db_now
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.webhooks import Delivery, EventKind, Webhook, enqueue_event
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobState

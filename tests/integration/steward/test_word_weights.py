@@ -19,9 +19,9 @@ from services.steward.tasks import auto_evaluation as auto_evaluate
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.config.settings import Settings
 from shared.ids import new_id
