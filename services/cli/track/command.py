@@ -14,7 +14,7 @@ from uuid import UUID
 import typer
 from rich.markup import escape
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import OneTrack, TrackFrame
 from placewise.client import Client
@@ -24,9 +24,10 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    console,
+    Table,
     err_console,
     print_json,
+    print_table,
     printable_path,
     progress_bar,
     report_errors,
@@ -209,7 +210,7 @@ def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> No
 def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
     table = Table(
         "time",
-        Column("photo", overflow="fold"),
+        "photo",
         "status",
         Column("probability", justify="right"),
         Column("latitude", no_wrap=True),
@@ -227,7 +228,7 @@ def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
             "" if row["longitude"] is None else f"{row['longitude']:.6f}",
             escape(row["place"] or ""),
         )
-    console.print(table)
+    print_table(table)
     states = [frame.state for frame in track.frames if frame.state is not None]
     tracked = sum(state.status == "tracking" for state in states)
     err_console.print(
