@@ -61,6 +61,9 @@ MAX_PHOTOS = 1000
 ALWAYS_KEPT = 50
 MIN_GAIN = 1.5
 """A photo of a belief is at least this much more probable than one elsewhere"""
+SMOOTHED_AT_ONCE = 200
+LATER_FRAMES = 100
+"""Frames after those that are smoothed at once"""
 FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
@@ -130,17 +133,22 @@ class TrackFilter:
         """Return the belief at each frame given all frames, earlier and later.
 
         This is the forward-backward algorithm (Rabiner 1989) on the sparse beliefs of the forward
-        pass; a photo that the forward pass gave up stays given up.
+        pass; a photo that the forward pass gave up stays given up. In a long track, at least
+        LATER_FRAMES later frames count, so that memory does not grow with its length.
 
         Args:
             frames: In the order of time.
             start: The belief before the first frame; None if nothing is known.
         """
         steps: list[_Step] = []
+        smoothed: list[Belief] = []
         for frame in frames:
             before = steps[-1].belief if steps else start or _start(frame.time)
             steps.append(self._step(before, frame))
-        return _backward(steps, self._graph.photo_count)
+            if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
+                smoothed += _backward(steps, self._graph.photo_count)[:SMOOTHED_AT_ONCE]
+                del steps[:SMOOTHED_AT_ONCE]
+        return smoothed + _backward(steps, self._graph.photo_count)
 
     def _step(self, before: Belief, evidence: FrameEvidence) -> _Step:
         seconds = (evidence.time - before.time).total_seconds()

@@ -46,7 +46,7 @@ from services.cli.track.track_files import (
     track_row,
     write_track_file,
 )
-from shared.errors import InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
+from shared.errors import Conflict, InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
 from shared.tracks.motion import MOTION_MODELS
 
 FRAMES_AHEAD = 8  # stored before the first of them must be applied: they are described as a batch
@@ -139,7 +139,13 @@ def track(
             )
             begun = client.begin_track(motion=motion, max_speed_mps=max_speed)
             _send_frames(client, begun.track_id, frames, gps_accuracy, progress)
-            result = client.track(begun.track_id, smoothed=smoothed)
+            try:
+                result = client.track(begun.track_id, smoothed=smoothed)
+            except Conflict as error:
+                if error.code != "track_too_long":
+                    raise
+                err_console.print(error.detail, soft_wrap=True, markup=False)
+                result = client.track(begun.track_id)
             draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
             photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
         for file in files:

@@ -44,6 +44,7 @@ from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
 from shared.catalog.tracks import (
+    MAX_SMOOTHED_FRAMES,
     Track,
     TrackFrame,
     add_frame,
@@ -54,6 +55,7 @@ from shared.catalog.tracks import (
     list_tracks,
     select_frames,
 )
+from shared.errors import Conflict
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.validation import StoredUpload, check_photo_signature
@@ -178,13 +180,19 @@ def read_track(
     """Get a track with all frames; `smoothed=true` also uses the later frames for each state.
 
     Frames whose photos have been described since are applied first. `pending` counts those that
-    remain.
+    remain. 409 (`track_too_long`) if more than 3,000 frames are to be smoothed.
     """
     with gateway.catalog.read() as session:
         get_track(session, get_map(session, query.map).id, track_id)
     apply_pending_frames(gateway, track_id, APPLY_SECONDS)
     with gateway.catalog.read() as session:
         track = get_track(session, get_map(session, query.map).id, track_id)
+        if query.smoothed and track.version > MAX_SMOOTHED_FRAMES:
+            raise Conflict(
+                "track_too_long",
+                f"The track has {track.version} frames; up to {MAX_SMOOTHED_FRAMES} can be "
+                "smoothed. Read it without `smoothed`.",
+            )
         frames = list(session.scalars(select_frames(track_id, with_evidence=query.smoothed)))
     last = next((frame for frame in reversed(frames) if frame.state is not None), None)
     smoothed = smooth_states(gateway, track, frames) if query.smoothed else {}

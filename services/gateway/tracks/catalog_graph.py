@@ -8,7 +8,7 @@ coordinates.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from typing import Any
@@ -41,16 +41,24 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 MIN_SECONDS = (datetime.min.replace(tzinfo=UTC) - EPOCH).total_seconds()
 MAX_SECONDS = (datetime.max.replace(tzinfo=UTC) - EPOCH).total_seconds() - 1
 
+PhotoRow = tuple[
+    str, float | None, float | None, float | None, str | None, str | None, float | None
+]
+"""A row of a `PhotoTable`."""
 Box = tuple[float, float, float, float]
 """South, north, west, east in degrees; west is not greater than east."""
 
 
 class CatalogPhotoGraph:
-    """`shared.tracks.photo_graph.PhotoGraph` of the live photos of a map."""
+    """`shared.tracks.photo_graph.PhotoGraph` of the live photos of a map, as of one session.
+
+    Photos that were read before are not read again: frames of a track show the same ones.
+    """
 
     def __init__(self, session: Session, map_id: UUID) -> None:
         self._session = session
         self._map_id = map_id
+        self._read: dict[str, PhotoRow | None] = {}
 
     @cached_property
     def photo_count(self) -> int:
@@ -62,8 +70,13 @@ class CatalogPhotoGraph:
 
     def photos(self, ids: Sequence[str]) -> PhotoTable:
         """Return the photos that have one of these ids and are still in the map."""
-        # Without the map, to which they belong: SQLite would scan its photos.
-        return self._select(Photo.id.in_([UUID(photo_id) for photo_id in ids]))
+        unread = [photo_id for photo_id in ids if photo_id not in self._read]
+        if unread:
+            self._read.update(dict.fromkeys(unread))
+            # Without the map, to which they belong: SQLite would scan its photos.
+            self._select(Photo.id.in_([UUID(photo_id) for photo_id in unread]))
+        rows = (self._read[photo_id] for photo_id in ids)
+        return PhotoTable.of_rows(row for row in rows if row is not None)
 
     def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
         """Return the photos with coordinates within a radius."""
@@ -133,7 +146,7 @@ class CatalogPhotoGraph:
                 ),
             )
         )
-        return PhotoTable.of_rows(_table_row(row) for row in found if row.id).union()
+        return self._table(row for row in found if row.id)
 
     def _same_label(self, photos: PhotoTable) -> PhotoTable:
         labels = sorted({place for place in photos.places.tolist() if place is not None})
@@ -168,14 +181,17 @@ class CatalogPhotoGraph:
                 Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE, *conditions
             )
         )
-        return PhotoTable.of_rows(map(_table_row, rows))
+        return self._table(rows)
 
-
-def _table_row(row: Any) -> tuple[Any, ...]:
-    """Return the row of a `PhotoTable` for a row of COLUMNS."""
-    photo_id, latitude, longitude, heading, place, taken = row
-    sequence = (None, None) if taken is None else (SEQUENCE, taken.timestamp())
-    return str(photo_id), latitude, longitude, heading, place, *sequence
+    def _table(self, rows: Iterable[Any]) -> PhotoTable:
+        """Return the photos of rows of COLUMNS, each once."""
+        found: dict[str, PhotoRow] = {}
+        for photo_id, latitude, longitude, heading, place, taken in rows:
+            name, seconds = (None, None) if taken is None else (SEQUENCE, taken.timestamp())
+            key = str(photo_id)
+            found[key] = (key, latitude, longitude, heading, place, name, seconds)
+        self._read.update(found)
+        return PhotoTable.of_rows(found.values())
 
 
 def _boxes_around(

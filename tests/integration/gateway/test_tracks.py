@@ -411,3 +411,6 @@ def test_a_full_track_takes_no_more(service: Service, monkeypatch: pytest.Monkey
     track_id = begin(service)
     send(service, track_id, 0)
     assert refused(service, track_id, "track_full", 1)["status"] == 409
+    monkeypatch.setattr("services.gateway.routes.tracks.MAX_SMOOTHED_FRAMES", 0)
+    answer = service("GET", f"/tracks/{track_id}", params={"smoothed": True})
+    problem(answer, 409, "track_too_long")
