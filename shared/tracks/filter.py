@@ -61,13 +61,13 @@ MAX_PHOTOS = 1000
 ALWAYS_KEPT = 50
 MIN_GAIN = 1.5
 """A photo of a belief is at least this much more probable than one elsewhere"""
-SMOOTHED_AT_ONCE = 200
-LATER_FRAMES = 100
-"""Frames after those that are smoothed at once"""
 FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
 """Weight of photos that look in a direction which the odometry excludes"""
+SMOOTHED_AT_ONCE = 200
+LATER_FRAMES = 100
+"""Frames after those that are smoothed at once"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

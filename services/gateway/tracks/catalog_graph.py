@@ -15,7 +15,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import Float, and_, cast, func, literal, literal_column, or_, select
+from sqlalchemy import ColumnElement, Float, and_, cast, func, literal, literal_column, or_, select
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session
 
@@ -121,16 +121,14 @@ class CatalogPhotoGraph:
     def _inside(self, boxes: Sequence[Box]) -> PhotoTable:
         """Return the photos inside any of the boxes."""
         # The boxes are one parameter: building and parsing a condition for each takes far longer.
+        sides: list[ColumnElement[float]]
         if self._session.get_bind().dialect.name == "postgresql":
             rows = func.jsonb_array_elements(literal(list(boxes), JSONB)).table_valued("value")
-            south, north, west, east = (
-                cast(rows.c.value.op("->>")(literal_column(str(i))), Float) for i in range(4)
-            )
+            sides = [cast(rows.c.value.op("->>")(literal_column(str(i))), Float) for i in range(4)]
         else:
             rows = func.json_each(json.dumps(boxes)).table_valued("value")
-            south, north, west, east = (
-                func.json_extract(rows.c.value, f"$[{i}]") for i in range(4)
-            )
+            sides = [func.json_extract(rows.c.value, f"$[{i}]") for i in range(4)]
+        south, north, west, east = sides
         # An outer join, because SQLite would scan the photos of the map for an inner one.
         found = self._session.execute(
             select(*COLUMNS)
