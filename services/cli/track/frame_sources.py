@@ -93,8 +93,9 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
     except ImportError as error:
         raise Misconfigured(
             "no_video_decoder",
-            f"Reading the video {printable_path(video)} needs PyAV: pip install "
-            "'placewise[tracks]'. Or extract photos from it and pass their folder.",
+            f"Reading the video {printable_path(video)} needs PyAV. Install the extra "
+            "`tracks` (uv pip install '.[tracks]' in the repository), or extract photos from the "
+            "video and pass their folder.",
         ) from error
     try:
         with av.open(str(video)) as container:

@@ -53,8 +53,8 @@ def check_track_files(files: Sequence[Path]) -> None:
         if file.suffix.lower() in PICTURE_SUFFIXES and find_spec("matplotlib") is None:
             raise Misconfigured(
                 "no_matplotlib",
-                f"Drawing {printable_path(file)} needs matplotlib: pip install "
-                "'placewise[tracks]'.",
+                f"Drawing {printable_path(file)} needs matplotlib. Install the extra "
+                "`tracks`: uv pip install '.[tracks]' in the repository.",
             )
 
 

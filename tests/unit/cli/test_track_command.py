@@ -106,7 +106,7 @@ def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
         list(read_video_frames(text, BY_FILE, tmp_path))
     assert refusal.value.code == "unreadable_video"
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(Misconfigured, match=r"pip install 'placewise\[tracks\]'"):
+    with pytest.raises(Misconfigured, match=r"uv pip install '\.\[tracks\]'"):
         list(read_video_frames(text, BY_FILE, tmp_path))
 
 
