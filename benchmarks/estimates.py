@@ -17,17 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
 from benchmarks.report import Report
 from services.cli.environment import read_settings
 from services.cli.evaluation.describers import extractor_describer
+from services.cli.output import Table
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
-UTM_TIME_FIELD = 13  # of an @UTM@ file name, split at each @
 Mask = NDArray[np.bool_]
 
 
@@ -128,7 +127,7 @@ def described_photos(
         name,
         rows,
         [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
-        [_capture_time(photo.path.name) for photo in photos],
+        [photo.captured_at for photo in photos],
         np.arange(len(photos)) >= database,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
@@ -148,10 +147,10 @@ class TrialMap:
         self._photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.locations = [photos.locations[index] for index in self.members]
+        self.locations = [photos.locations[index] for index in self.members.tolist()]
         self.own_photos = OwnPhotoSampler(
             self.locations,
-            [photos.captured_at[index] for index in self.members],
+            [photos.captured_at[index] for index in self.members.tolist()],
             photos.scheme,
             photos.radius_m,
             lambda photo: _rank(scores[photo], without=photo),
@@ -247,10 +246,3 @@ def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanki
 def _right_percent(judged: Sequence[Judged]) -> float:
     known = [right for j in judged if (right := j.is_answer_right) is not None]
     return 100 * float(np.mean(known)) if known else 100.0
-
-
-def _capture_time(file_name: str) -> datetime | None:
-    fields = file_name.split("@")
-    if len(fields) <= UTM_TIME_FIELD or not fields[UTM_TIME_FIELD]:
-        return None
-    return datetime.strptime(fields[UTM_TIME_FIELD], "%Y%m%d%H%M%S").replace(tzinfo=UTC)

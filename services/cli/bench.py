@@ -169,6 +169,19 @@ def train(
     )
 
 
+@app.command("estimates")
+def estimates(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(help="Evaluation sets with coordinates or places.", exists=True),
+    ],
+    splits: Annotated[int, typer.Option(min=0, help="Random splits of each set.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how often place estimates answer, how often they are right, and their calibration."""
+    _run_benchmark("estimates", as_json, folders=folders, splits=splits)
+
+
 @app.command("query-latency")
 def query_latency(
     backlog: Annotated[int, typer.Option(min=1, help="Number of queued uploads.")] = 5000,

@@ -19,9 +19,10 @@ from shared.evaluation.place_figures import (
     answer_figures,
     reliability_figures,
 )
+from shared.evaluation.place_fit import fit_place_model
 from shared.evaluation.place_levels import LevelScheme, candidate_levels
-from shared.evaluation.place_probability import HeldOutEstimate, fit_place_model
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.place_thresholds import HeldOutEstimate
 
 SAMPLED_PHOTOS = 1000
 """Database photos that the model is fitted on; as many as an evaluation of a live map draws"""
@@ -102,7 +103,7 @@ def measure_places(
             each[number, :EVIDENCE_DEPTH].tolist() for each in (ranked.indices, ranked.scores)
         )
         ranking = [
-            RankedPhoto(score, locations[index])
+            RankedPhoto(score, locations[index], index)
             for index, score in zip(indices, scores, strict=True)
         ]
         unit = model.unit(ranking)

@@ -113,7 +113,7 @@ def test_every_call_is_described_once(server: ServerProcess) -> None:
     assert form["required"] == ["file"]
     assert set(form["properties"]) == {
         *("file", "latitude", "longitude", "heading"),
-        *("captured_at", "place", "tags", "metadata", "role"),
+        *("captured_at", "place", "tags", "metadata", "role", "relative_path"),
     }
 
 

@@ -51,7 +51,7 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     assert sum(own.values()) <= 25
 
 
-def test_what_makes_real_places_similar_is_said_and_reranking_keeps_the_easy_ones_first(
+def test_what_makes_real_places_similar_is_explained_and_reranking_keeps_the_easy_ones_first(
     server: ServerProcess, real_photos: Path
 ) -> None:
     for name in EASY:

@@ -67,7 +67,7 @@ def test_answer_counts_what_lies_on_disk(city: dict[str, Any], out: Path) -> Non
     assert len(list((out / "queries").iterdir())) == 10
 
 
-def test_every_photo_has_a_name_of_the_convention_and_the_size_asked_for(out: Path) -> None:
+def test_every_photo_has_a_name_of_the_convention_and_the_requested_size(out: Path) -> None:
     photos = list(out.rglob("*.jpg"))
     assert len(photos) == 48 + 10 + 48
     for path in photos:

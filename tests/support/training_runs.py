@@ -41,6 +41,7 @@ def run_arguments(places: Path, out: Path, **others: Any) -> Json:
         "data_root": str(places),
         "accelerator": "cpu",
         "faiss_gpu": False,
+        "backbone_arch": "resnet18",
         "pretrained": False,
         "layers_to_freeze": -1,
         "layers_to_crop": [2],

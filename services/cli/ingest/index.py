@@ -244,8 +244,8 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     )
     if report.get("other_files") or report.get("without_coordinates"):
         err_console.print(
-            f"{report['other_files']} other files skipped, "
-            f"{report['without_coordinates']} photos without coordinates.",
+            f"{_count(report['other_files'], 'other file')} skipped, "
+            f"{_count(report['without_coordinates'], 'photo')} without coordinates.",
             soft_wrap=True,
         )
     print_failures(report, "refused", "failed")
@@ -253,3 +253,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
     err_console.print(f"Next: {sys.argv[0]} {command}{options}", soft_wrap=True)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -92,7 +92,7 @@ class TrainingCommand(TyperCommand):
                 for column in self.columns[:2]:
                     column.no_wrap = True
 
-        rich_utils.Table = OptionsTable  # type: ignore[misc]
+        rich_utils.Table = OptionsTable  # type: ignore[attr-defined]
         super().format_help(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -87,7 +87,7 @@ def test_first_photos_are_ordered_by_their_rerank_scores_and_the_others_follow(
     assert searches(service) == 2, "one for each question, however often its answer is fetched"
 
 
-def test_best_of_more_reranked_photos_than_are_wanted_are_answered(service: Service) -> None:
+def test_best_k_of_the_reranked_photos_are_returned(service: Service) -> None:
     query = service.indexed(*range(7))[0]
     all_six = compared(service, query, top_k=6, rerank=6)
     best = compared(service, query, top_k=2, rerank=6)

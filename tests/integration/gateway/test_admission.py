@@ -152,7 +152,9 @@ def test_a_refused_call_keeps_its_key_for_the_next_try(make_service: Make) -> No
     assert (answer.status_code, "idempotent-replayed" in answer.headers) == (202, False)
 
 
-def test_what_waits_for_something_else_or_was_not_asked_for_is_no_queue(catalog: Catalog) -> None:
+def test_jobs_that_wait_for_something_else_or_run_in_the_background_are_no_queue(
+    catalog: Catalog,
+) -> None:
     with catalog.write() as session:
         one, other = add_map(session, "one").id, add_map(session, "other").id
         add_job(session, one)

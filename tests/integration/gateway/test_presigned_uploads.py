@@ -249,7 +249,7 @@ def test_what_is_no_photo_is_refused_and_leaves_no_original(
     assert (photos(catalog), keys(store, "originals/")) == (0, set())
 
 
-def test_nothing_sent_yet_is_said(service: Service) -> None:
+def test_an_upload_without_bytes_is_reported(service: Service) -> None:
     upload = presign(service)
     problem(complete(service, upload), 409, "upload_incomplete")
     assert put(upload) == 200

@@ -102,7 +102,7 @@ def test_refusals_at_the_door_have_the_headers_too(door: Door) -> None:
     checked(refused.headers)
 
 
-def test_https_alone_is_asked_for_where_it_is_set(
+def test_hsts_is_sent_where_it_is_set(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     strict = settings.model_copy(update={"hsts_seconds": 31_536_000})

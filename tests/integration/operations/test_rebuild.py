@@ -93,7 +93,7 @@ def two_maps(service: Service) -> dict[str, str]:
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
 
-def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
+def test_every_photo_is_searchable_again_with_its_metadata(
     service: Service,
     store: FolderStore,
     settings: Settings,

@@ -162,7 +162,7 @@ def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[Search
     return requests
 
 
-def test_every_shard_answers_at_least_the_version_that_is_asked_for(
+def test_every_shard_answers_at_least_the_requested_version(
     places: SmallMap, tier_of: OpenTier
 ) -> None:
     tier = tier_of(1, 2, 1)

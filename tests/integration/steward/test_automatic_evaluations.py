@@ -66,7 +66,7 @@ def test_a_map_is_evaluated_by_itself_once_per_change(town: Town) -> None:
     assert not automatic(town), "too few again"
 
 
-def test_queries_that_can_not_be_asked_do_not_count_as_a_change(town: Town) -> None:
+def test_queries_that_can_not_be_searched_do_not_count_as_a_change(town: Town) -> None:
     """They would be one for ever: no evaluation asks with them."""
     town.publish([(n, at(n)) for n in range(LEAST)])
     assert automatic(town)

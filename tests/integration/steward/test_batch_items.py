@@ -122,7 +122,7 @@ def test_other_jobs_have_no_items(batches: Batches) -> None:
     problem(batches.service("GET", f"/jobs/{UUID(int=1)}/items"), 404, "job_not_found")
 
 
-def test_the_same_bytes_of_which_something_else_is_said_are_refused(batches: Batches) -> None:
+def test_the_same_bytes_with_other_metadata_are_rejected(batches: Batches) -> None:
     batches.service.indexed(1, place="hall")
     manifest = lines({"filename": "1.jpg", "place": "yard"})
     job_id = batches.start(*files(1), manifest=manifest)

@@ -238,7 +238,7 @@ def test_a_body_that_is_no_batch_is_refused_and_leaves_nothing(
     assert batches.keys() == set()
 
 
-def test_limits_of_a_batch_are_said_and_leave_nothing(
+def test_limits_of_a_batch_are_reported_and_leave_nothing(
     catalog: Catalog,
     store: FolderStore,
     settings: Settings,

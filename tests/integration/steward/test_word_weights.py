@@ -175,7 +175,7 @@ def test_weights_that_raise_nothing_are_not_kept(city: City) -> None:
     assert record.held_out is not None
 
 
-def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
+def test_too_few_pairs_are_no_error_and_are_reported_in_numbers(city: City) -> None:
     city.publish(rows_of_places(8, 3, reported=True), street(8))
     record = city.learn()
     assert (record.outcome, record.weights) == (Outcome.NOT_ENOUGH_PAIRS, ())
