@@ -16,7 +16,7 @@ from typing import Any
 from uuid import UUID
 
 import sqlalchemy as sa
-from sqlalchemy.orm import Mapped, Session, defer, mapped_column
+from sqlalchemy.orm import Mapped, Session, aliased, defer, mapped_column
 
 from shared.catalog.database.base import (
     Base,
@@ -27,6 +27,7 @@ from shared.catalog.database.base import (
     db_now,
     get_in_map,
     page_newest_first,
+    partial_index,
 )
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
@@ -79,7 +80,18 @@ class TrackFrame(Base):
     error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     belief: Mapped[bytes | None] = mapped_column(sa.LargeBinary)
 
-    __table_args__ = (sa.UniqueConstraint("track_id", "captured_at"),)
+    __table_args__ = (
+        sa.UniqueConstraint("track_id", "captured_at"),
+        partial_index(
+            "ix_track_frames_pending",
+            "track_id",
+            "captured_at",
+            only=sa.and_(state.is_(None), error.is_(None)),
+        ),
+        partial_index(
+            "ix_track_frames_belief", "track_id", "captured_at", only=belief.is_not(None)
+        ),
+    )
 
     @property
     def pending(self) -> bool:
@@ -214,21 +226,19 @@ def add_frame(
 
 def latest_states(session: Session, track_ids: list[UUID]) -> dict[UUID, TrackFrame]:
     """Return the last frame with a state of each track, by the track's id."""
+    frame = aliased(TrackFrame)
     last = (
-        sa.select(TrackFrame.track_id, sa.func.max(TrackFrame.captured_at).label("captured_at"))
-        .where(TrackFrame.track_id.in_(track_ids), TrackFrame.state.is_not(None))
-        .group_by(TrackFrame.track_id)
-        .subquery()
+        sa.select(frame.id)
+        .where(frame.track_id == Track.id, frame.state.is_not(None))
+        .order_by(frame.captured_at.desc())
+        .limit(1)
+        .correlate(Track)
+        .scalar_subquery()
     )
     frames = session.scalars(
         sa.select(TrackFrame)
-        .join(
-            last,
-            sa.and_(
-                TrackFrame.track_id == last.c.track_id,
-                TrackFrame.captured_at == last.c.captured_at,
-            ),
-        )
+        .join(Track, TrackFrame.id == last)
+        .where(Track.id.in_(track_ids))
         .options(
             defer(TrackFrame.belief, raiseload=True), defer(TrackFrame.evidence, raiseload=True)
         )

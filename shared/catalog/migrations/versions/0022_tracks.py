@@ -51,3 +51,14 @@ def upgrade() -> None:
         sa.UniqueConstraint("track_id", "captured_at", name="uq_track_frames_track_id_captured_at"),
     )
     op.create_index("ix_track_frames_job_id", "track_frames", ["job_id"])
+    for name, condition in (
+        ("ix_track_frames_pending", "state IS NULL AND error IS NULL"),
+        ("ix_track_frames_belief", "belief IS NOT NULL"),
+    ):
+        op.create_index(
+            name,
+            "track_frames",
+            ["track_id", "captured_at"],
+            postgresql_where=sa.text(condition),
+            sqlite_where=sa.text(condition),
+        )
