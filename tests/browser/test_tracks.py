@@ -21,6 +21,7 @@ def test_a_track_is_listed_drawn_and_deleted(visitor: Visitor, town: Town) -> No
     expect(page.locator("path.point:not(.behind)")).to_have_count(3)
     page.get_by_role("button", name="Delete…").click()
     page.get_by_role("button", name="Delete", exact=True).click()
+    expect(page.get_by_role("heading", name="Tracks", exact=True)).to_be_visible()
     expect(page.locator(f"a[href='#/tracks/{track_id}']")).to_have_count(0)
     assert track_id not in {track["track_id"] for track in town.get("/tracks")["tracks"]}
     visitor.untroubled()
