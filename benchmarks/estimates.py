@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from benchmarks.report import Report
 from services.cli.environment import read_settings
-from services.cli.evaluation.describers import extractor_describer
 from services.cli.output import Table
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
@@ -36,7 +35,6 @@ from shared.evaluation.place_fit import PlaceSample, fit_place_model
 from shared.evaluation.place_levels import LevelScheme
 from shared.evaluation.place_probability import PlaceEstimate
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.ranking import describe_to_matrix
 from shared.place_paths import label_levels
 
 if TYPE_CHECKING:
@@ -106,6 +104,10 @@ def measure(progress: Progress, *, folders: Sequence[Path], splits: int) -> Repo
 
 def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
     """Describe an evaluation set as a new map would be."""
+    # Decoder processes import the program, and their memory limit leaves no room for torch.
+    from services.cli.evaluation.describers import extractor_describer
+    from shared.evaluation.ranking import describe_to_matrix
+
     settings = read_settings()
     dataset = open_evaluation_set(folder)
     photos = [*dataset.database, *dataset.queries]
@@ -143,14 +145,14 @@ class TrialMap:
     """
 
     def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
-        self.members = np.flatnonzero(in_map)
+        self.members = np.flatnonzero(in_map).tolist()
         self._photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.locations = [photos.locations[index] for index in self.members.tolist()]
+        self.locations = [photos.locations[index] for index in self.members]
         self.own_photos = OwnPhotoSampler(
             self.locations,
-            [photos.captured_at[index] for index in self.members.tolist()],
+            [photos.captured_at[index] for index in self.members],
             photos.scheme,
             photos.radius_m,
             lambda photo: _rank(scores[photo], without=photo),
