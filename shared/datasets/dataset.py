@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,8 @@ class DatasetPhoto:
     frame: int | None = None
     """number along its sequence or traverse"""
     sequence: str | None = None
+    captured_at: datetime | None = None
+    """UTC"""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from shared.datasets.dataset import DatasetPhoto, EvaluationSet, TrainingPlace, 
 from shared.datasets.ground_truth import find_positives, parse_rule
 from shared.datasets.layouts import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
 from shared.datasets.layouts.base import EvaluationLayout, ListedSet, TrainingLayout
+from shared.datasets.layouts.folder_pairs import RIDES, SEASONS
 from shared.errors import InvalidRequest, NotFound
 
 __all__ = [
@@ -33,7 +34,9 @@ __all__ = [
     "open_training_set",
 ]
 
-PART_FOLDERS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
+PART_FOLDERS = frozenset(
+    {"database", "queries", "train", "val", "test", "train_val", "images", RIDES, *SEASONS}
+)
 """Subfolders of datasets that are never datasets of their own"""
 LAYOUTS_HELP = "See docs/how-to/data-sets.md for all layouts."
 

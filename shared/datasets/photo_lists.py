@@ -38,6 +38,7 @@ def photo_from_filename(path: Path, name: str, place: str | None = None) -> Data
         longitude=location.longitude,
         heading=location.heading,
         place=place,
+        captured_at=location.captured_at,
     )
 
 

@@ -77,6 +77,8 @@ class FileNameLocation:
     """degrees clockwise from north, in [0, 360)"""
     note: str
     """free text; gsv_xs stores the place and the city here"""
+    captured_at: datetime | None = None
+    """UTC; only of full dates"""
 
 
 def parse_utm_file_name(name: str) -> FileNameLocation | None:
@@ -97,6 +99,7 @@ def parse_utm_file_name(name: str) -> FileNameLocation | None:
         longitude=_number(longitude) if latitude else None,
         heading=None if (heading := _number(parts[9])) is None else heading % 360,
         note=parts[14],
+        captured_at=_full_date(parts[13]),
     )
 
 

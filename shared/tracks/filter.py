@@ -56,11 +56,13 @@ SPACING_M = 5.0
 """Standard deviation between a frame and the photo of the map that is nearest to it"""
 MAX_REACH_M = 1000.0
 """A camera that may have moved farther is carried away as far as the filter knows"""
-MAX_PHOTOS = 1000
+MAX_PHOTOS = 500
 """of a belief; the least probable ones beyond go back to `elsewhere`"""
 ALWAYS_KEPT = 50
-MIN_GAIN = 1.5
+MIN_GAIN = 2.0
 """A photo of a belief is at least this much more probable than one elsewhere"""
+NEGLIGIBLE = 1e-3
+"""Probability that the least probable photos of a belief give back to `elsewhere`"""
 FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
@@ -303,9 +305,10 @@ def _fix_weights(targets: PhotoTable, fix: PositionFix, count: int) -> FloatArra
 def _kept(posterior: FloatArray, density: float) -> Indices:
     """Return the rows of the photos that keep a probability of their own."""
     order = np.argsort(-posterior, kind="stable")[:MAX_PHOTOS]
-    probable = posterior[order] > max(MIN_GAIN * density, 1e-9)
-    probable[:ALWAYS_KEPT] = True
-    return np.sort(order[probable])
+    tail = posterior.sum() - np.cumsum(posterior[order])
+    kept = (posterior[order] > MIN_GAIN * density) & (tail > NEGLIGIBLE)
+    kept[:ALWAYS_KEPT] = True
+    return np.sort(order[kept])
 
 
 def _backward(steps: Sequence[_Step], count: int) -> list[Belief]:

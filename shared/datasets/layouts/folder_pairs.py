@@ -1,5 +1,11 @@
 """Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
+Beside `database/`, `rides/` may have one folder for each sequence: the set `NAME_rides`. Two
+folders of seasons, such as `summer/` and `winter/`, are two rides along the same way, as in
+Nordland (Suenderhauf et al. 2013): the first is the database, and photos of about the same number
+show the same place. In `database/` and `queries/` with as many photos each, without positions and
+labels, photos are numbered as well, for the rule `frames 10`.
+
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
 one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
@@ -8,7 +14,7 @@ deep-visual-geo-localization-benchmark)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +25,10 @@ from shared.datasets.utm_coordinates import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
+RIDES = "rides"
+SEASONS = ("summer", "spring", "fall", "autumn", "winter")
+"""Names of folders of one season each; the database is the first one that exists"""
+SAME_INDEX_RULE = "frames 10"
 VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
@@ -31,11 +41,23 @@ class FolderPairs:
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         splits = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
-        return {prefix: ".", **splits} if _is_pair(base) else splits
+        rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
+        seasons = [season for season in SEASONS if (base / season).is_dir()]
+        pairs = {f"{prefix}_{season}": season for season in seasons[1:]}
+        return {**({prefix: "."} if _is_pair(base) else {}), **splits, **rides, **pairs}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        if key == RIDES:
+            photos = _read_photos(base / "database", base)
+            return ListedSet(photos, _read_rides(base), _default_rule(photos))
+        if key in SEASONS:
+            first = next(season for season in SEASONS if (base / season).is_dir())
+            photos = [_number(_read_photos(base / season, base)) for season in (first, key)]
+            return ListedSet(photos[0], photos[1], SAME_INDEX_RULE)
         folder = base / key
         database, queries = (_read_photos(folder / name, base) for name in ("database", "queries"))
+        if len(database) == len(queries) and not any(map(_is_located, database + queries)):
+            database, queries = _number(database), _number(queries)
         if protocol == VME_PROTOCOL:
             database, queries = (
                 tuple(replace(photo, zone=None) for photo in photos)
@@ -46,6 +68,29 @@ class FolderPairs:
 
 def _is_pair(folder: Path) -> bool:
     return (folder / "database").is_dir() and (folder / "queries").is_dir()
+
+
+def _is_located(photo: DatasetPhoto) -> bool:
+    return photo.easting is not None or photo.place is not None
+
+
+def _has_rides(folder: Path) -> bool:
+    return (folder / "database").is_dir() and (folder / RIDES).is_dir()
+
+
+def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
+    """Read the folders of rides: frames in the order of capture time, or else of name."""
+    frames: list[DatasetPhoto] = []
+    for folder in sorted(path for path in (base / RIDES).iterdir() if path.is_dir()):
+        photos = [replace(photo, place=None) for photo in _read_photos(folder, base)]
+        if all(photo.captured_at is not None for photo in photos):
+            photos.sort(key=lambda photo: str(photo.captured_at))
+        frames += [replace(photo, sequence=folder.name) for photo in _number(photos)]
+    return tuple(frames)
+
+
+def _number(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    return tuple(replace(photo, frame=number) for number, photo in enumerate(photos))
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:
