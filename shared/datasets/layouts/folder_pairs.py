@@ -52,8 +52,8 @@ class FolderPairs:
             return ListedSet(photos, _read_rides(base), _default_rule(photos))
         if key in SEASONS:
             first = next(season for season in SEASONS if (base / season).is_dir())
-            photos = [_number(_read_photos(base / season, base)) for season in (first, key)]
-            return ListedSet(photos[0], photos[1], SAME_INDEX_RULE)
+            before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
+            return ListedSet(before, after, SAME_INDEX_RULE)
         folder = base / key
         database, queries = (_read_photos(folder / name, base) for name in ("database", "queries"))
         if len(database) == len(queries) and not any(map(_is_located, database + queries)):
