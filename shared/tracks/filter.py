@@ -14,7 +14,8 @@ probability that the camera was carried away, e and c those of leaving and enter
 Update. The frame's evidence has posterior probabilities q of a single frame, and its prior is
 known, so their ratio is the likelihood up to a factor (Bayes' rule):
 
-    p(j)      ~ p'(j) * (q(j) / ((1 - s) / n)) ** w        outside ~ outside' * (q_out / s) ** w
+    p(j)      ~ p'(j) * (n * q(j) / (1 - q_out)) ** w
+    outside   ~ outside' * ((q_out / (1 - q_out)) / (s / (1 - s))) ** (w / 2)
 
 with s = OUT_OF_MAP_SHARE; photos that are no hits share what the hits leave. Two frames of the same
 view are not independent, so w is the share of the evidence that is new: the squared Hellinger
@@ -52,12 +53,18 @@ LEAVING = 0.002
 """Probability per frame that the camera leaves the map"""
 ENTERING = 0.02
 """Probability per frame that a camera outside enters the map, at any place"""
+OUTSIDE_WEIGHT = 0.5
+"""Weight of a frame's evidence for "outside the map". Another season makes all frames of a ride
+look foreign alike, so that their evidence is not independent."""
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
 """A camera that may have moved farther is carried away as far as the filter knows"""
-MAX_PHOTOS = 500
+MAX_PHOTOS = 300
 """of a belief; the least probable ones beyond go back to `elsewhere`"""
+MOVING_PHOTOS = 100
+"""of a belief, the most probable. What is near the others is not added, which bounds the time of a
+step while the place is not known"""
 ALWAYS_KEPT = 50
 MIN_GAIN = 2.0
 """A photo of a belief is at least this much more probable than one elsewhere"""
@@ -152,7 +159,9 @@ class TrackFilter:
         row_of = {photo: row for row, photo in enumerate(before.photos)}
         rows = np.array([row_of[photo] for photo in sources.ids], dtype=np.int64)
         reach_m = self._reach_m(seconds, evidence.odometry)
-        targets = self._targets(sources, evidence, min(reach_m, MAX_REACH_M))
+        moving = np.argsort(-before.probabilities[rows], kind="stable")[:MOVING_PHOTOS]
+        reach = min(reach_m, MAX_REACH_M)
+        targets = self._targets(sources, sources.take(moving), evidence, reach)
         kernel = self._kernel(sources, targets, seconds, evidence.odometry)
         seen = _excess(evidence, count)
         news = _news(before.seen, seen)
@@ -210,11 +219,13 @@ class TrackFilter:
             return odometry.distance_m + 3 * (odometry.distance_accuracy_m + SPACING_M)
         return self._motion.max_speed_mps * seconds + 3 * SPACING_M
 
-    def _targets(self, sources: PhotoTable, evidence: FrameEvidence, reach_m: float) -> PhotoTable:
+    def _targets(
+        self, sources: PhotoTable, moving: PhotoTable, evidence: FrameEvidence, reach_m: float
+    ) -> PhotoTable:
         reach_seconds = reach_m / self._motion.typical_speed_mps
         tables = [self._graph.photos([hit.photo for hit in evidence.hits])]
-        if len(sources):
-            tables.append(self._graph.around(sources, reach_m, reach_seconds))
+        if len(moving):
+            tables.append(self._graph.around(moving, reach_m, reach_seconds))
         if evidence.fix is not None:
             tables.append(_near_fix(self._graph, evidence.fix))
         return sources.union(*tables)
@@ -247,7 +258,8 @@ class TrackFilter:
         kernel *= moving[:, None]
         diagonal = np.arange(len(sources))  # the sources are the first targets
         kernel[diagonal, diagonal] += 1 - moving
-        return kernel
+        moves: FloatArray = kernel
+        return moves
 
 
 def _start(time: datetime) -> Belief:
@@ -292,14 +304,14 @@ def _likelihoods(
     targets: PhotoTable, evidence: FrameEvidence, count: int, news: float
 ) -> tuple[FloatArray, float, float]:
     """Return the likelihoods of the targets, of any other photo, and of "outside the map"."""
-    prior = (1 - OUT_OF_MAP_SHARE) / count
-    probability = {hit.photo: hit.probability for hit in evidence.hits}
-    rest = max(0.0, 1 - evidence.not_in_map - sum(probability.values()))
-    other = rest / max(count - len(probability), 1)
+    inside = max(1 - evidence.not_in_map, 1e-9)
+    probability = {hit.photo: hit.probability / inside for hit in evidence.hits}
+    other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
     values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
-    weights = np.maximum(values / prior, 1e-9) ** news
-    elsewhere = max(other / prior, 1e-9) ** news
-    outside = max(evidence.not_in_map / OUT_OF_MAP_SHARE, 1e-9) ** news
+    weights = np.maximum(values * count, 1e-9) ** news
+    elsewhere = max(other * count, 1e-9) ** news
+    odds = max(evidence.not_in_map, 1e-9) / inside * (1 - OUT_OF_MAP_SHARE) / OUT_OF_MAP_SHARE
+    outside = odds ** (OUTSIDE_WEIGHT * news)
     if evidence.fix is not None:
         near = _fix_weights(targets, evidence.fix, count)
         weights, elsewhere = weights * near, elsewhere * FIX_OUTLIERS
