@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from rich.table import Table
+from services.cli.output import Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class Report:
         return {"title": self.title, "missed": self.missed, "figures": figures, **self.details}
 
     def table(self) -> Table:
-        table = Table("what", "measured", "target", "", "load", title=self.title)
+        table = Table("what", "measured", "target", "result", "load", title=self.title)
         for figure in self.figures:
             table.add_row(
                 figure.what,

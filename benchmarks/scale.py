@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from services.cli.output import Table
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.search_api.client import MAX_CONCURRENT_CALLS

@@ -34,6 +34,8 @@ class Photo(Answer):
     image_id: UUID
     image_path: str
     original_filename: str
+    relative_path: str | None = None
+    """Path in the folder or archive that it was uploaded from; None if unknown."""
     upload_time: datetime
     file_size: int
     width: int
@@ -349,6 +351,7 @@ class Stats(Answer):
     feature_dimension: int | None
     max_images_per_chunk: int
     extractor: str
+    device: str | None
     vocabulary: str | None
     total_searches: int
     recent_uploads_24h: int
@@ -392,6 +395,8 @@ class Key(Answer):
     name: str
     prefix: str
     scopes: list[str]
+    maps: list[str] | None = None
+    """Names of the only maps that it may use; None: all maps."""
     requests_per_minute: int | None
     upload_bytes_per_day: int | None
     max_photos: int | None

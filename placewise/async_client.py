@@ -71,7 +71,7 @@ class AsyncClient(AsyncTransport):
             photo: The file.
             filename: Name to store; None for the file's own name.
             fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
-                `place`, `tags`, `metadata`, `role`.
+                `place`, `tags`, `metadata`, `role`, `relative_path`.
 
         Raises:
             Conflict: `photo_differs` if the map contains the same image with other metadata.
@@ -457,7 +457,7 @@ class AsyncClient(AsyncTransport):
         Args:
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
-            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+            limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}

@@ -68,7 +68,7 @@ class Client(Transport):
             photo: The file.
             filename: Name to store; None for the file's own name.
             fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
-                `place`, `tags`, `metadata`, `role`.
+                `place`, `tags`, `metadata`, `role`, `relative_path`.
 
         Raises:
             Conflict: `photo_differs` if the map contains the same image with other metadata.
@@ -452,7 +452,7 @@ class Client(Transport):
         Args:
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
-            limits: The optional fields of `POST /keys`: `days`, `requests_per_minute`,
+            limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}

@@ -70,7 +70,7 @@ class ConnectionLimits:
     @classmethod
     def of(cls, settings: Settings) -> Self:
         """Create the limits from the settings, capped by the file limit of the process."""
-        files = raise_file_limit()
+        files = _raise_file_limit()
         total = min(settings.max_connections, files - min(RESERVED_FILES, files // 2))
         if total < settings.max_connections:
             log.warning(
@@ -350,7 +350,7 @@ def address_group(address: str) -> str:
     return str(parsed)
 
 
-def raise_file_limit() -> int:
+def _raise_file_limit() -> int:
     """Raise the soft limit of open files to the hard limit, at most MAX_OPEN_FILES.
 
     Returns:

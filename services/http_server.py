@@ -9,13 +9,18 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.http_connections import Connections, LimitedProtocol
 from shared.errors import Misconfigured
 
+PEER_ADDRESS = "placewise.peer"
+"""Key of the ASGI scope: address of the connection, whatever the headers say."""
 BACKLOG = 2048  # connections that wait to be accepted
 # Connections accepted per wakeup. They are counted before more are accepted, so that a burst of
 # connections can't use up all file descriptors.
@@ -63,12 +68,15 @@ def http_server(
             SHUTDOWN_GRACE_SECONDS to finish.
     """
     proxies = [str(network) for network in connections.limits.trusted_proxies]
+    # uvicorn types ASGI messages one by one, Starlette does not.
+    forwarded: Any = ProxyHeadersMiddleware(app, trusted_hosts=proxies)  # type: ignore[arg-type]
     server = NotifyingServer(
         uvicorn.Config(
-            app,
+            # Instead of uvicorn's own, which would replace the address before it can be recorded.
+            _record_peer(forwarded),
+            proxy_headers=False,
             loop="asyncio",
             http=partial(LimitedProtocol, connections),  # type: ignore[arg-type]
-            forwarded_allow_ips=proxies,
             backlog=ACCEPTED_AT_ONCE,
             log_config=None,
             access_log=False,  # `request_log` logs requests
@@ -79,6 +87,17 @@ def http_server(
     server.on_stop = on_stop
     server.connections = connections
     return server
+
+
+def _record_peer(app: ASGIApp) -> ASGIApp:
+    """Record the address of the connection in the scope, before `X-Forwarded-For` replaces it."""
+
+    async def recording(scope: Scope, receive: Receive, send: Send) -> None:
+        if client := scope.get("client"):
+            scope[PEER_ADDRESS] = client[0]
+        await app(scope, receive, send)
+
+    return recording
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import uvicorn
@@ -25,11 +25,12 @@ from services.gateway.authentication import (
     LocalhostAuthenticator,
 )
 from services.gateway.dependencies import GatewayContext
+from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -37,12 +38,16 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
+from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import delete_dead_search_workers
-from shared.catalog.schema import migrate, sqlite_file
-from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.catalog.processes import (
+    delete_dead_search_workers,
+    delete_processes,
+    process_heartbeat,
+)
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
@@ -51,7 +56,9 @@ from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
+from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
+from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +96,22 @@ class Standalone:
             self.server.run(sockets=[self.listener])
         if self.error is not None:
             raise self.error
+
+
+def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None]) -> None:
+    """Run all services until the process is stopped by a signal.
+
+    Args:
+        settings: The settings.
+        on_ready: Called once the server listens.
+
+    Raises:
+        PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
+    """
+    configure_logging(settings, "embedded")
+    with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
+        on_ready(running)
+        running.serve()
 
 
 @contextlib.contextmanager
@@ -130,6 +153,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             get_or_create_default_map(session, settings.new_map_extractor)
             # The lock proves that no other worker is alive: rows are left from a killed process.
             delete_dead_search_workers(session, all_workers=True)
+            delete_processes(session, "extractor")
         release_expired_leases(catalog, settings.max_attempts, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
@@ -172,7 +196,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             except PlacewiseError as error:
                 running.stop(error)
                 return
-            with contextlib.closing(extractor):
+            with (
+                contextlib.closing(extractor),
+                process_heartbeat(catalog, "extractor", extractor.state),
+            ):
                 extractor.run(stop, wakeups)
 
         stop = threading.Event()
@@ -211,7 +238,8 @@ def _create_authenticator(
 ) -> tuple[Authenticator, str | None, str | None]:
     """Return the authenticator, the first admin key if it is created now, and the local key."""
     # Both the configured name and the address it resolves to, which can change.
-    if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
+    needs_key = settings.admin_key is not None or settings.sign_in_networks
+    if not needs_key and is_loopback(settings.host) and is_loopback(host):
         return LocalhostAuthenticator(settings.allowed_origins), None, None
     local_key, first_admin_key = generate_local_key(), None
     admins = [hash_api_key(local_key)]
@@ -223,4 +251,5 @@ def _create_authenticator(
                 _, first_admin_key = create_api_key(
                     session, "made at the first start", [Scope.ADMIN]
                 )
-    return ApiKeyAuthenticator(catalog, *admins), first_admin_key, local_key
+    keys = with_proxy_sign_in(ApiKeyAuthenticator(catalog, *admins), settings)
+    return keys, first_admin_key, local_key

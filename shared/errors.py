@@ -2,8 +2,10 @@
 
 PlacewiseError
 ├── InvalidRequest 400          no_file, empty_file, malformed_body, bad_manifest, ...
-├── Unauthorized 401            key_missing, key_unknown, key_revoked, key_expired
-├── Forbidden 403               scope_missing, foreign_page, forwarded_request
+├── Unauthorized 401            key_missing, key_unknown, key_revoked, key_expired,
+│                                proxy_user_invalid
+├── Forbidden 403               scope_missing, map_not_allowed, foreign_page,
+│                                forwarded_request
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
 ├── RequestTimeout 408          request_too_slow
 ├── Conflict 409                not_searchable, photo_differs, model_change_running, ...

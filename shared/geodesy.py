@@ -1,6 +1,6 @@
 """Distances and bounding boxes on the sphere, in Python and NumPy.
 
-`shared.catalog.base` has the same formulas in SQL.
+`shared.catalog.database.base` has the same formulas in SQL.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 from sqlalchemy.engine import make_url
 
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.support.servers import (

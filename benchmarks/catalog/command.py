@@ -15,7 +15,6 @@ from uuid import UUID
 import psycopg
 from PIL import Image
 from psycopg.sql import SQL, Identifier
-from rich.table import Table
 from sqlalchemy import select
 from sqlalchemy.engine import URL, make_url
 from starlette.testclient import TestClient
@@ -24,6 +23,7 @@ from benchmarks.catalog.explain import Explainer
 from benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog, fill_catalog
 from benchmarks.report import Report
 from services.cli.environment import read_settings
+from services.cli.output import Table
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
@@ -31,11 +31,11 @@ from services.search.catalog_sync import read_generation_versions
 from services.steward.evaluation_search import read_geotagged_photos
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.jobs import STEWARD_JOBS
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
 from shared.catalog.processes import upsert_search_worker
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.errors import Misconfigured, PlacewiseError

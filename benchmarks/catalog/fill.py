@@ -11,10 +11,10 @@ from uuid import UUID
 
 from sqlalchemy import text
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import create_map
 from shared.catalog.models import get_or_create_model
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 
 MAPS = 10

@@ -20,10 +20,10 @@ from benchmarks.chaos.traffic import Traffic
 from benchmarks.fleet import Fleet, start_servers
 from benchmarks.report import Report
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import UNFINISHED_STATES, JobKind, JobState
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.jobs import Job
 from shared.storage import ObjectStore
@@ -124,7 +124,6 @@ def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:
 RECOVERY_TIMEOUT_SECONDS = 180.0  # jobs that are unfinished after it count as stuck
 LEASE_SECONDS = 2.0
 POLL_SECONDS = 0.1
-QUERIES_PER_FAULT = 10  # queries after each fault, in addition to those during it
 MAX_FAULT_DELAY_SECONDS = 0.5  # the fault starts this long after the uploads at the latest
 
 
@@ -172,13 +171,17 @@ def run_chaos(
     fault_seconds: float,
     seed: int,
     faults: Sequence[Fault] | None = None,
+    queries_per_fault: int = 10,
+    query_interval_seconds: float = 0.1,
     executed: bool = True,
     on_outcome: Callable[[FaultOutcome], object] = lambda outcome: None,
 ) -> ChaosRun:
     """Upload `photos` in equal parts, one per fault; the seed determines the order of the faults.
 
-    Faults that have a duration last `fault_seconds`. The run ends at the first fault that leaves a
-    violation; the services' logs are then part of the result. `executed`: see `Fleet`.
+    Faults that have a duration last `fault_seconds`. Queries are sent every
+    `query_interval_seconds`, and `queries_per_fault` more after each fault. The run ends at the
+    first fault that leaves a violation; the services' logs are then part of the result. `executed`:
+    see `Fleet`.
     """
     moments = random.Random(seed)
     chosen = list(faults or all_faults())
@@ -205,10 +208,12 @@ def run_chaos(
         for name, seconds in CLOCK_OFFSETS_SECONDS.items():
             fleet[name].environment.update(clock_off_by(seconds))
         fleet.start()
-        with Traffic(fleet.gateway_urls, seed) as traffic:
+        with Traffic(fleet.gateway_urls, seed, query_interval_seconds) as traffic:
             for number, fault in enumerate(chosen):
                 upload = _upload_by_thirds(traffic, photos, number, len(chosen))
-                outcome = _run_fault(fleet, traffic, fault, fault_seconds, moments, upload)
+                outcome = _run_fault(
+                    fleet, traffic, fault, fault_seconds, moments, upload, queries_per_fault
+                )
                 run.outcomes.append(outcome)
                 on_outcome(outcome)
                 if not outcome.good:
@@ -236,8 +241,9 @@ def _run_fault(
     seconds: float,
     moments: random.Random,
     upload: Callable[[int], None],
+    queries: int,
 ) -> FaultOutcome:
-    """Upload photos before, during and after the fault, then check the invariants."""
+    """Upload photos before, during and after the fault, then check the invariants and query."""
     before = traffic.answers.copy()
     crashed = len(fleet.crashed)
     upload(1)
@@ -257,7 +263,7 @@ def _run_fault(
         # The jobs of queries whose gateway was killed still complete, although nobody waits.
         _wait_until(deadline, lambda: not count_unfinished_jobs(fleet.catalog))
         counts = check_invariants(fleet.catalog, fleet.store, traffic.acknowledged)
-    for known in moments.sample(traffic.known, min(QUERIES_PER_FAULT, len(traffic.known))):
+    for known in moments.sample(traffic.known, min(queries, len(traffic.known))):
         traffic.query(known)
     change = traffic.answers - before
     return FaultOutcome(

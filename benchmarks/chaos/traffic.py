@@ -30,8 +30,8 @@ class Traffic:
     A failed call is retried at the next gateway.
     """
 
-    def __init__(self, urls: Sequence[str], seed: int) -> None:
-        self._urls = urls
+    def __init__(self, urls: Sequence[str], seed: int, query_interval_seconds: float) -> None:
+        self._query_interval_seconds = query_interval_seconds
         self._random = random.Random(seed)
         headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
         self._clients = [
@@ -113,7 +113,7 @@ class Traffic:
                 self._stop.wait(RETRY_SECONDS)
 
     def _query_loop(self) -> None:
-        while not self._stop.wait(RETRY_SECONDS):
+        while not self._stop.wait(self._query_interval_seconds):
             with self._lock:
                 number = self._random.choice(self.known) if self.known else None
             if number is not None:

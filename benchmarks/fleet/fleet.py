@@ -16,8 +16,8 @@ from sqlalchemy.engine import make_url
 
 from benchmarks.fleet.fault_injection import FaultProxy
 from benchmarks.fleet.service import ServiceProcess
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.storage import ObjectStore
 from shared.storage.s3 import S3Store
 from tests.support.processes import PLACEWISE

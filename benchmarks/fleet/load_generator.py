@@ -24,8 +24,8 @@ import numpy as np
 from PIL import Image
 from sqlalchemy import func, select
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES
-from shared.catalog.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from shared.storage import ObjectStore
 from tests.support.server import SERVICES_KEY

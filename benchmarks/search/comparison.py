@@ -16,7 +16,6 @@ from statistics import median
 import faiss
 import numpy as np
 from rich.progress import Progress
-from rich.table import Table
 
 from benchmarks.report import LatencySummary, Report
 from benchmarks.search.memory_traffic import MemoryBandwidth, private_bytes
@@ -34,6 +33,7 @@ from benchmarks.search.methods import (
     same_ranking,
 )
 from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
+from services.cli.output import Table
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.codes.sign_codes import SignCodes, encode_signs

@@ -29,13 +29,13 @@ from sqlalchemy import insert
 from services.search.catalog_sync import MIN_CODED_BYTES
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.installation import open_installation_store
 from shared.catalog.maps import Map, create_map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, mark_photo_deleted
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
 from shared.codes.rotation import get_rotation
 from shared.config.settings import Settings
 from shared.ids import new_id

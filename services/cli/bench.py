@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
+from services.cli.output import JsonOption, print_json, print_table, progress_bar, report_errors
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Run benchmarks on this machine.", no_args_is_help=True)
@@ -167,6 +167,19 @@ def train(
         device=device,
         seed=seed,
     )
+
+
+@app.command("estimates")
+def estimates(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(help="Evaluation sets with coordinates or places.", exists=True),
+    ],
+    splits: Annotated[int, typer.Option(min=0, help="Random splits of each set.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how often place estimates answer, how often they are right, and their calibration."""
+    _run_benchmark("estimates", as_json, folders=folders, splits=splits)
 
 
 @app.command("query-latency")
@@ -330,7 +343,7 @@ def scale(
         print_json(sizing.as_json())
     elif page is None:
         for table in sizing.terminal_tables():
-            console.print(table)
+            print_table(table)
 
 
 def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
@@ -344,7 +357,7 @@ def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
         print_json(report.as_json())
     else:
         for table in (*report.tables, report.table()):
-            console.print(table)
+            print_table(table)
     if report.missed:
         raise typer.Exit(1)
 

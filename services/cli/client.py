@@ -12,6 +12,7 @@ from rich.progress import Progress
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
 from services.cli.environment import read_settings
+from services.cli.output import err_console
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
 
@@ -39,6 +40,12 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
+    err_console.print(
+        f"No server runs on {settings.placewise_home}: starting one for this command. "
+        "--server URL or PLACEWISE_HOME selects another.",
+        soft_wrap=True,
+        markup=False,
+    )
     from services.standalone import run_standalone  # clients of a running server don't need it
 
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
@@ -67,6 +74,12 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         finally:
             running.server.should_exit = True
             serving.join()
+
+
+def describe_target(client: Client, server: str | None, map_name: str | None) -> str:
+    """Name the map and the server that `connect` has selected for these options."""
+    folder = "" if server else f", which serves {read_settings().placewise_home}"
+    return f"map {map_name or 'default'} of {client.url}{folder}"
 
 
 POLL_SECONDS = 1.0  # short, so that the progress bar moves

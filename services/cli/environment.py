@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from typing import get_args
 
-from pydantic import ValidationError
-from rich.table import Table
+from pydantic import SecretStr, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
 
-from services.cli.output import JsonOption, console, print_json, report_errors
+from services.cli.output import JsonOption, Table, console, print_json, print_table, report_errors
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -21,15 +23,38 @@ def read_settings() -> Settings:
     try:
         return Settings()
     except ValidationError as error:
-        errors = [
-            ": ".join(
-                # `loc` is empty for an error of several settings: its message names them.
-                [str(part).upper() for part in item["loc"]]
-                + [item["msg"].removeprefix("Value error, ")]
-            )
-            for item in error.errors(include_input=False)  # a value may hold a password
-        ]
+        errors = [_describe_setting_error(item) for item in error.errors()]
         raise Misconfigured("bad_setting", "; ".join(errors)) from None
+
+
+EXPECTED = {
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_parsing": "a number",
+    "bool_parsing": "true or false",
+}
+
+
+def _describe_setting_error(error: ErrorDetails) -> str:
+    """Name the setting, its value and what is expected."""
+    message = error["msg"].removeprefix("Value error, ")
+    if not error["loc"]:  # an error of several settings: its message names them
+        return message
+    if error["type"] in EXPECTED:
+        message = f"expected {EXPECTED[error['type']]}"
+    elif message.startswith("Input should be "):
+        a_value = "a value " if error["type"].startswith(("greater", "less")) else ""
+        message = f"expected {a_value}{message.removeprefix('Input should be ')}"
+    name = str(error["loc"][0])
+    field = Settings.model_fields[name]
+    # A value that holds a secret, or one that is not a single text, is not repeated.
+    shown = isinstance(error["input"], str | int | float) and not _is_secret(field)
+    value = f"={error['input']}" if shown else ""
+    return f"{name.upper()}{value}: {message} ({field.description})"
+
+
+def _is_secret(field: FieldInfo) -> bool:
+    return SecretStr in (field.annotation, *get_args(field.annotation))
 
 
 def config(as_json: JsonOption = False) -> None:
@@ -44,7 +69,7 @@ def config(as_json: JsonOption = False) -> None:
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
-    console.print(table)
+    print_table(table)
     console.print(f"New maps use the extractor {settings.new_map_extractor}.", soft_wrap=True)
 
 
@@ -62,5 +87,5 @@ def require_packages(*names: str) -> None:
         raise Misconfigured(
             "trainer_missing",
             f"This command requires {', '.join(missing)}. "
-            "Install it: pip install 'placewise[trainer]'.",
+            "Run `make setup`, or in the repository: uv pip install '.[trainer]'.",
         )

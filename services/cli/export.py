@@ -115,6 +115,7 @@ def _parse_generation_id(generation_id: str) -> UUID:
 
 class PairNames(StrEnum):
     FILENAME = "filename"
+    PATH = "path"
     ID = "id"
 
 
@@ -132,8 +133,8 @@ def export_pairs(
             space, which hloc's format can't represent.
     """
     photos = list(client.photos())
-    if names == PairNames.FILENAME:
-        _check_unique_names(photos)
+    if names != PairNames.ID:
+        _check_unique_names(photos, names)
     queries = [photo for photo in photos if photo.role == "query"] or photos
     if not queries:
         raise Conflict("no_photos", "The map has no photos yet. Upload photos: placewise index.")
@@ -155,22 +156,26 @@ def export_pairs(
 
 
 def _photo_name(photo: Photo, names: PairNames) -> str:
-    return photo.original_filename if names == PairNames.FILENAME else str(photo.image_id)
+    if names == PairNames.ID:
+        return str(photo.image_id)
+    path = photo.relative_path if names == PairNames.PATH else None
+    return path or photo.original_filename
 
 
-def _check_unique_names(photos: list[Photo]) -> None:
-    counts = Counter(photo.original_filename for photo in photos)
+def _check_unique_names(photos: list[Photo], names: PairNames) -> None:
+    counts = Counter(_photo_name(photo, names) for photo in photos)
     bad = [name for name, count in counts.items() if count > 1 or name.split() != [name]]
     if bad:
         raise InvalidRequest(
             "ambiguous_names",
-            f"{len(bad)} file names are shared by several photos or contain white space, for "
-            f"example {bad[0]!r}. Identify photos by ID instead: --names id.",
+            f"{len(bad)} names are shared by several photos or contain white space, for example "
+            f"{bad[0]!r}. Identify photos by their path or ID instead: --names path, --names id.",
         )
 
 
 PHOTO_PROPERTIES = {
     "original_filename",
+    "relative_path",
     "upload_time",
     "captured_at",
     "heading",
@@ -302,7 +307,7 @@ def pairs(
         int, typer.Option("--top-k", min=1, max=100, help="Maximum number of matches per query.")
     ] = 20,
     names: Annotated[
-        PairNames, typer.Option(help="Identify photos by their original file name or by ID.")
+        PairNames, typer.Option(help="Identify photos by file name, path in their folder, or ID.")
     ] = PairNames.FILENAME,
     map_name: MapOption = None,
     server: ServerOption = None,

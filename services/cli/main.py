@@ -6,10 +6,14 @@ takes seconds and is not installed in every image.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import logging
 import sys
 from collections.abc import Collection
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -49,14 +53,7 @@ COMMANDS = {
 
 def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     """Build the application with the named commands, importing only their modules."""
-    app = typer.Typer(
-        name="placewise",
-        help="Self-hosted visual place recognition: find where a photo was taken.",
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        add_completion=False,
-    )
-    app.callback()(_root_callback)
+    app = _new_app()
     for name in names:
         module, attribute = COMMANDS[name]
         command = getattr(importlib.import_module(f"services.cli.{module}"), attribute)
@@ -67,16 +64,62 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     return app
 
 
+def build_overview() -> typer.Typer:
+    """Build the application for its own help: its commands do nothing.
+
+    The help texts are read from the source, because importing all commands takes over a second.
+    """
+    app = _new_app()
+    for name, (module, attribute) in COMMANDS.items():
+        path = Path(__file__).parent / f"{module.replace('.', '/')}.py"
+        for node in ast.parse(path.read_bytes()).body:
+            if isinstance(node, ast.FunctionDef) and node.name == attribute:
+                app.command(name, help=ast.get_docstring(node))(_root_callback)
+            elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == attribute:
+                assert isinstance(node.value, ast.Call)  # app = typer.Typer(help=...)
+                options = {option.arg: option.value for option in node.value.keywords}
+                app.add_typer(typer.Typer(), name=name, help=ast.literal_eval(options["help"]))
+    return app
+
+
 def run() -> None:
     """Parse the command line and run the command."""
     logging.basicConfig(
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
     names = sys.argv[1:2]
-    # Anything but a known command (--help, a typo) needs every command: for the help text and
-    # for the suggestion of a similar name.
-    build_app(names if names and names[0] in COMMANDS else COMMANDS.keys())()
+    if sys.argv[1:] in ([], ["--help"], ["--version"]):
+        app = build_overview()
+    else:
+        # The suggestion of a similar name, for a typo, needs every command.
+        app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
+    app()
 
 
-def _root_callback() -> None:
-    """Keep the application a command group even if it has only one command."""
+def _new_app() -> typer.Typer:
+    app = typer.Typer(
+        name="placewise",
+        help="Self-hosted visual place recognition: find where a photo was taken.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+    )
+    app.callback()(_root_callback)
+    return app
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"placewise {version('placewise')}")
+        raise typer.Exit
+
+
+def _root_callback(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version and exit.", is_eager=True, callback=_print_version
+        ),
+    ] = False,
+) -> None:
+    """Self-hosted visual place recognition: find where a photo was taken."""

@@ -6,7 +6,6 @@ import sys
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from placewise.answers import Map
 from services.cli.client import connect, wait_for_job
@@ -15,9 +14,10 @@ from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
-    console,
+    Table,
     print_json,
     print_result,
+    print_table,
     progress_bar,
     report_errors,
 )
@@ -42,7 +42,7 @@ def list_maps(
             print_json(maps)
             return
         counts = ("photos", "searchable", "queries")
-        table = Table("map", *counts, "extractor", "vocabulary", "dimension")
+        table = Table("map", *counts, "extractor", "vocabulary", "dimension", "labels")
         for map_ in maps:
             table.add_row(
                 map_.name,
@@ -52,8 +52,9 @@ def list_maps(
                 map_.extractor,
                 map_.vocabulary or "",
                 _format_dimension(map_),
+                "paths" if map_.place_labels_are_paths else "names",
             )
-        console.print(table)
+        print_table(table)
 
 
 def _format_dimension(map_: Map) -> str:
@@ -70,6 +71,13 @@ def create(
         str | None, typer.Option(help="Extractor of the map. Default: the setting EXTRACTOR.")
     ] = None,
     preprocessing: PreprocessingOption = None,
+    place_labels_are_paths: Annotated[
+        bool,
+        typer.Option(
+            "--place-labels-are-paths",
+            help="`/` separates the levels of place labels, as in `tower/floor 7/elevator`.",
+        ),
+    ] = False,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -79,7 +87,9 @@ def create(
         if preprocessing is not None:
             extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
-            created = client.create_map(name, extractor)
+            created = client.create_map(
+                name, extractor, place_labels_are_paths=place_labels_are_paths
+            )
         print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 
 

@@ -10,14 +10,20 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
+import rich.table
 import typer
-from rich.console import Console
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.style import StyleType
+from rich.text import Text
 
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
@@ -69,6 +75,97 @@ def print_result(result: Any, as_json: bool, message: str) -> None:
         console.print(message, soft_wrap=True, markup=False)
 
 
+MIN_NAME_WIDTH = 12  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class _Name:
+    """A name, path or ID in a table: one line, shortened in the middle if the column is narrow."""
+
+    text: Text
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement(MIN_NAME_WIDTH, self.text.cell_len)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        excess = self.text.cell_len - options.max_width
+        if excess <= 0:
+            yield self.text
+            return
+        shown = max(0, options.max_width - 1)
+        end = shown // 2
+        name = self.text.plain
+        yield Text(f"{name[: shown - end]}…{name[len(name) - end :]}", style=self.text.style)
+
+
+class Table(rich.table.Table):
+    """A table for `print_table`. In a narrow terminal, text wraps and long names are shortened.
+
+    A cell of one word is a name. A column without a header is left out of tab-separated output.
+    """
+
+    def __init__(
+        self,
+        *headers: rich.table.Column | str,
+        title: str | None = None,
+        caption: str | None = None,
+    ) -> None:
+        super().__init__(
+            *headers,
+            title=title,
+            caption=caption,
+            box=SIMPLE_HEAD,
+            show_edge=False,
+            padding=(0, 1, 0, 0),
+        )
+
+    def add_row(
+        self,
+        *renderables: RenderableType | None,
+        style: StyleType | None = None,
+        end_section: bool = False,
+    ) -> None:
+        """Add a row; strings may contain markup."""
+        cells = (_shorten_name(each) for each in renderables)
+        super().add_row(*cells, style=style, end_section=end_section)
+
+
+def print_table(table: Table) -> None:
+    """Print a table; unless stdout is a terminal, as tab-separated values without shortening."""
+    columns = [
+        (column, [_plain_text(cell) for cell in (column.header, *column.cells)])
+        for column in table.columns
+    ]
+    if console.is_terminal:
+        for column, cells in columns:
+            column.overflow = "fold"
+            # Wide columns give way, narrow ones keep their width.
+            column.no_wrap = column.no_wrap or max(map(len, cells)) <= MIN_NAME_WIDTH
+        console.print(table)
+        return
+    if table.title:
+        typer.echo(_plain_text(table.title))
+    for row in zip(*(cells for column, cells in columns if column.header), strict=True):
+        typer.echo("\t".join(row))
+    if table.caption:
+        typer.echo(_plain_text(table.caption))
+
+
+def _shorten_name(cell: RenderableType | None) -> RenderableType | None:
+    if isinstance(cell, str):
+        text = Text.from_markup(cell)
+        if text.cell_len > MIN_NAME_WIDTH and not any(map(str.isspace, text.plain)):
+            return _Name(text)
+    return cell
+
+
+def _plain_text(cell: RenderableType) -> str:
+    if isinstance(cell, _Name):
+        return cell.text.plain
+    text = Text.from_markup(cell) if isinstance(cell, str) else cell
+    return " ".join(text.plain.split()) if isinstance(text, Text) else ""
+
+
 @contextlib.contextmanager
 def report_errors(as_json: bool) -> Iterator[None]:
     """Report a PlacewiseError or database outage in one line and exit with code 1."""
@@ -89,9 +186,9 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     """The Unavailable error of a database failure; None for any other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.database_errors import to_unavailable  # few commands use a database
+    from shared.catalog.database.errors import explain_outage  # few commands use a database
 
-    return to_unavailable(error)
+    return explain_outage(error)
 
 
 def _print_error(error: PlacewiseError, as_json: bool) -> None:

@@ -8,17 +8,19 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 from rich.progress_bar import ProgressBar
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import Estimate, EstimateLevel, Explanation
-from services.cli.client import connect
+from services.cli.client import connect, describe_target
 from services.cli.output import (
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
+    Table,
     console,
     print_json,
+    print_table,
     report_errors,
 )
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -103,6 +105,7 @@ def query(
                 word_weights=None if word_weights else False,
                 certainty=certainty,
             )
+            target = describe_target(client, server, map_name)
         if as_json:
             print_json(answer)
             return
@@ -133,16 +136,18 @@ def query(
                 escape(match.place or ""),
                 *([_format_explanation(match.explanation)] if explain else []),
             )
-        console.print(table)
+        print_table(table)
         if levels:
             console.print(_summarize_levels(answer.estimate), soft_wrap=True, markup=False)
-            console.print(_levels_table(answer.estimate))
+            print_table(_levels_table(answer.estimate))
         else:
             console.print(_format_estimate(answer.estimate), soft_wrap=True, markup=False)
         console.print(
             f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
-            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}",
+            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
+            f"Searched {target}",
             soft_wrap=True,
+            markup=False,
         )
 
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import torch
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.models import ModelRegistration, get_model_for_loading, register_model
-from shared.catalog.session import Catalog
 from shared.config.private_files import make_private_folder
 from shared.config.settings import Settings
 from shared.descriptors.backbones.trained import TrainedBackbone

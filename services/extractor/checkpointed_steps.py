@@ -20,10 +20,10 @@ from services.extractor.model_registry import (
     ensure_model_row,
     generation_spec_columns,
 )
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import count_live_photos
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary, add_whitening
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.pca_whitening import PcaWhiteningFile

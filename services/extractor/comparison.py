@@ -27,8 +27,8 @@ from services.extractor.generation_resolver import ResolvedGeneration, resolve_g
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import read_stored_rows
 from services.extractor.publish import PublishResult
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, get_live_photos, get_photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.descriptors.explanation import SimilarityShares, draw_overlay, explain_similarities
 from shared.descriptors.extractor import Extractor, not_finite_error
@@ -105,18 +105,22 @@ class CandidateFeatures:
     def _compute(
         self, target: ResolvedGeneration, photos: Sequence[Photo]
     ) -> Iterator[tuple[UUID, LocalFeatures]]:
-        photo_ids, data = [], []
-        for photo in photos:
-            try:
-                data.append(self._store.get(photo.object_key))
+        photo_ids = []
+
+        def read_photos() -> Iterator[bytes]:
+            for photo in photos:
+                try:
+                    data = self._store.get(photo.object_key)
+                except NotFound:
+                    log.warning("the photo %s is not compared: its object is missing", photo.id)
+                    continue
                 photo_ids.append(photo.id)
-            except NotFound:
-                log.warning("the photo %s is not compared: its object is missing", photo.id)
+                yield data
+
         extractor = target.extractor
         decoded = []
-        for photo_id, outcome in zip(
-            photo_ids, self._decoders.decode(data, extractor.preprocessing), strict=True
-        ):
+        outcomes = self._decoders.decode(read_photos(), extractor.preprocessing)
+        for photo_id, outcome in zip(photo_ids, outcomes, strict=True):
             if isinstance(outcome, PlacewiseError):
                 _log_skipped(photo_id, outcome)
             else:

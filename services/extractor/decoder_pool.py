@@ -11,7 +11,7 @@ import logging
 import multiprocessing
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
@@ -45,9 +45,13 @@ class DecoderPool:
         self._pool = self._start_pool()
 
     def decode(
-        self, photos: Sequence[bytes], preprocessing: Preprocessing
+        self, photos: Iterable[bytes], preprocessing: Preprocessing
     ) -> list[DecodedPhoto | PlacewiseError]:
-        """Decode photos; each result is a decoded photo, or the error that explains the failure."""
+        """Decode photos; each result is a decoded photo, or the error that explains the failure.
+
+        At most SCHEDULED_PER_PROCESS photos per process are taken from `photos` before the first
+        of them is decoded: a generator that reads files holds as many in memory.
+        """
         with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
                 log.error("the decoder pool crashed, starting a new one")

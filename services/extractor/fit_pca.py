@@ -29,9 +29,9 @@ from services.extractor.checkpointed_steps import (
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
 from services.extractor.prepare import read_stored_rows
 from shared.catalog.chunks import Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, get_pca_source_generation
 from shared.descriptors.pca_fit import (
     PcaBlock,

@@ -24,11 +24,11 @@ from services.extractor.model_registry import (
     ensure_model_row,
     generation_spec_columns,
 )
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import QUERY_JOBS, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, lock_map
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import (
     StoredWhitening,
     Vocabulary,

@@ -10,6 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -49,43 +50,36 @@ class ExtractorMetrics:
     """Prometheus metrics of one worker."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self._batch_jobs = Histogram(
-            f"{METRIC_PREFIX}_batch_jobs",
-            "Jobs per claimed batch.",
-            ["kind"],
-            buckets=BATCH_SIZE_BUCKETS,
-            registry=registry,
+        counter = partial(Counter, namespace=METRIC_PREFIX, registry=registry)
+        gauge = partial(Gauge, namespace=METRIC_PREFIX, registry=registry)
+        histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=registry)
+        self._batch_jobs = histogram(
+            "batch_jobs", "Jobs per claimed batch.", ["kind"], buckets=BATCH_SIZE_BUCKETS
         )
-        self._jobs = Counter(
-            f"{METRIC_PREFIX}_jobs",
+        self._jobs = counter(
+            "jobs",
             "Claimed jobs by outcome. lost: the lease was taken over, or the job was cancelled; "
             "paused, waiting, given_back: requeued; refused: failed, or paused until an operator "
             "acts; crashed: retried alone.",
             ["kind", "outcome"],
-            registry=registry,
         )
-        self._stage_seconds = Histogram(
-            f"{METRIC_PREFIX}_stage_seconds",
+        self._stage_seconds = histogram(
+            "stage_seconds",
             "Duration of a batch's stages in seconds.",
             ["stage"],
             buckets=STAGE_BUCKETS_SECONDS,
-            registry=registry,
         )
-        self._load_seconds = Histogram(
-            f"{METRIC_PREFIX}_model_load_seconds",
+        self._load_seconds = histogram(
+            "model_load_seconds",
             "Duration of loading an extractor in seconds.",
             buckets=LOAD_BUCKETS_SECONDS,
-            registry=registry,
         )
-        self._drain_seconds = Histogram(
-            f"{METRIC_PREFIX}_drain_seconds",
+        self._drain_seconds = histogram(
+            "drain_seconds",
             "Duration in seconds of drains that claimed jobs.",
             buckets=STAGE_BUCKETS_SECONDS,
-            registry=registry,
         )
-        self._draining = Gauge(
-            f"{METRIC_PREFIX}_draining", "1 while the worker processes jobs.", registry=registry
-        )
+        self._draining = gauge("draining", "1 while the worker processes jobs.")
         registry.register(_DeviceMemoryCollector())
 
     def observe_claim(self, kind: JobKind, jobs: int) -> None:

@@ -13,7 +13,9 @@ A vocabulary fit (`VocabularyFitJob`) has three stages, with these objects under
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from uuid import UUID
 
 from sqlalchemy import select
@@ -30,8 +32,8 @@ from services.extractor.checkpointed_steps import (
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.fit_pca import PcaFitJob
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole, get_live_photos
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, VocabularyOrigin, get_vocabulary
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor
@@ -45,6 +47,7 @@ from shared.descriptors.vocabulary_file import (
 )
 from shared.descriptors.vocabulary_fit import VocabularyFit
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import Job, JobKind
 from shared.storage import ObjectStore
 from shared.storage.keys import job_work_key
@@ -110,7 +113,13 @@ class VocabularyFitJob:
             self._catalog,
             job,
             stage="sample",
-            params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
+            params={
+                **job.params,
+                "clusters": clusters,
+                "sampled": 0,
+                "described": 0,
+                "provisional": len(photo_ids) < MIN_PHOTOS_TO_FIT,
+            },
             progress_total=len(plan) + FIT_PROGRESS_UNITS + len(photo_ids),
         )
 
@@ -144,18 +153,14 @@ class VocabularyFitJob:
             progress_done=sampled,
         )
 
-    def _read_photos(self, photo_ids: list[UUID]) -> list[bytes]:
-        """Return the bytes of the photos that have not been deleted since the plan."""
+    def _read_photos(self, photo_ids: list[UUID]) -> Iterator[bytes]:
+        """Yield the bytes of the photos that have not been deleted since the plan."""
         with self._catalog.read() as session:
             live = get_live_photos(session, photo_ids)
-        photos = []
         for photo_id in photo_ids:
             if photo_id in live:
-                try:
-                    photos.append(self._store.get(live[photo_id].object_key))
-                except NotFound:
-                    continue
-        return photos
+                with contextlib.suppress(NotFound):
+                    yield self._store.get(live[photo_id].object_key)
 
     def _cluster(self, job: Job, extractor: Extractor) -> None:
         """Run steps of the fit; when it is finished, create the vocabulary and its generation."""
@@ -181,6 +186,8 @@ class VocabularyFitJob:
             photos=params["described"],
             seed=params["seed"],
         )
+        # A fit that the previous release has planned does not have the parameter.
+        provenance["provisional"] = params.get("provisional", False)
         start_generation_with_new_vocabulary(
             self._catalog,
             self._store,

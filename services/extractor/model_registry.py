@@ -24,7 +24,7 @@ from shared.descriptors.extractor import Extractor, choose_device, spec_fingerpr
 from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
-from shared.errors import Unavailable
+from shared.errors import PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.storage import ObjectStore
 
@@ -80,6 +80,8 @@ class ModelRegistry:
         self._pass_limits: defaultdict[tuple[object, ...], BatchSizeLimit] = defaultdict(
             BatchSizeLimit
         )
+        self._load_errors: dict[str, str] = {}
+        self._update_state()
         self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)
         self._projections: LRUCache[UUID, PcaProjection] = LRUCache(MAX_WHITENINGS)
 
@@ -96,8 +98,24 @@ class ModelRegistry:
             precision = choose_precision(self._settings.precision, config, self._device)
         with self._lock:
             if config.name not in self._extractors:
-                self._extractors[config.name] = self._load(config, precision)
+                try:
+                    self._extractors[config.name] = self._load(config, precision)
+                except PlacewiseError as error:
+                    self._load_errors[name] = error.code
+                    raise
+                else:
+                    self._load_errors.pop(name, None)
+                finally:
+                    self._update_state()
             return self._extractors[config.name].with_precision(precision)
+
+    def _update_state(self) -> None:
+        # Replaced as a whole: heartbeats read it without the lock, which a load holds for minutes.
+        self.state: dict[str, Any] = {
+            "device": self._device.type,
+            "models": sorted(self._extractors),
+            "errors": dict(self._load_errors),
+        }
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
         """Return the generation's extractor in the precision that the generation was created with.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
@@ -20,9 +20,9 @@ from sqlalchemy import select
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.generation_resolver import ResolvedGeneration
 from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.photos import Photo, get_live_photos
-from shared.catalog.session import Catalog
 from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.errors import NotFound, PlacewiseError
@@ -167,22 +167,32 @@ def prepare_batch(
         batch.seconds["read"] = time.perf_counter() - started
         return batch
     keys = _photo_object_keys(catalog, jobs)
-    present: list[tuple[Job, bytes]] = []
-    for job in jobs:
-        key = keys.get(job.id)
-        try:
+    present: list[Job] = []
+
+    def read_photos() -> Iterator[bytes]:
+        # Read as they are decoded: a batch of the largest photos would take gigabytes.
+        for job in jobs:
+            read_started = time.perf_counter()
+            key = keys.get(job.id)
             if key is None:
                 batch.deleted.append(job)
-            else:
-                present.append((job, store.get(key)))
-        except NotFound as error:
-            # Deleted since the catalog was read, or lost: `publish` checks under the map's lock.
-            batch.failed.append((job, error))
-    batch.seconds["read"] = time.perf_counter() - started
+                continue
+            try:
+                data = store.get(key)
+            except NotFound as error:
+                # Deleted since the catalog was read, or lost: `publish` checks under the map's
+                # lock.
+                batch.failed.append((job, error))
+                continue
+            finally:
+                batch.seconds["read"] += time.perf_counter() - read_started
+            present.append(job)
+            yield data
 
+    batch.seconds["read"] = time.perf_counter() - started
     started = time.perf_counter()
-    outcomes = decoders.decode([data for _, data in present], target.extractor.preprocessing)
-    for (job, _), outcome in zip(present, outcomes, strict=True):
+    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing)
+    for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
             batch.failed.append((job, outcome))
         else:

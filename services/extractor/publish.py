@@ -17,10 +17,10 @@ from sqlalchemy.orm import Session
 
 from services.extractor.prepare import DescribeBatch, photo_id_of
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import get_live_photos
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import JobKind
 from shared.jobs.leases import lock_leased_jobs

@@ -11,7 +11,6 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Callable
 from typing import Any
 
 from celery import signals
@@ -19,7 +18,10 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.session import Catalog
+from services.service_process import Announce, service_process
+from shared.catalog.database.session import Catalog
+from shared.catalog.installation import open_installation_store
+from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
 from shared.jobs.wakeups import WakeupQueue
@@ -30,20 +32,20 @@ from shared.telemetry.metrics_server import serve_metrics
 log = logging.getLogger(__name__)
 
 
-def serve_extractor(
-    catalog: Catalog,
-    store: ObjectStore,
-    settings: Settings,
-    on_ready: Callable[[], object] = lambda: None,
-) -> None:
+def serve_extractor(settings: Settings, announce: Announce) -> None:
     """Run the extractor until SIGTERM; claimed jobs are then released to the queue.
 
-    Args:
-        catalog: The catalog.
-        store: The object store.
-        settings: The settings.
-        on_ready: Called when the model is loaded and the worker consumes wakeups.
+    Raises:
+        Misconfigured: `redis_missing`.
     """
+    with service_process(settings, "extractor") as catalog:
+        store = open_installation_store(catalog, settings, exclusive=False)
+        _run_celery_worker(catalog, store, settings, announce)
+
+
+def _run_celery_worker(
+    catalog: Catalog, store: ObjectStore, settings: Settings, announce: Announce
+) -> None:
     app = create_celery_app(settings)
     wakeups = CeleryWakeups(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
@@ -68,7 +70,7 @@ def serve_extractor(
         stop.set()
 
     def on_worker_ready(**_: object) -> None:
-        on_ready()
+        announce("Placewise extractor is running")
 
     def on_heartbeat(**_: object) -> None:
         heartbeat.beat()
@@ -83,7 +85,10 @@ def serve_extractor(
     # Keeps Celery from installing its own handlers and formats; `--loglevel` has no effect.
     signals.setup_logging.connect(keep_logging_setup, weak=False)
     try:
-        with serve_metrics(settings, registry):
+        with (
+            process_heartbeat(catalog, "extractor", worker.state),
+            serve_metrics(settings, registry),
+        ):
             worker.warm_up()
             for queue in WakeupQueue:
                 wakeups.send(queue)  # for jobs queued before this worker started

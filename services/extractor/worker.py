@@ -25,6 +25,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from typing import Any
 
 from prometheus_client import CollectorRegistry
 
@@ -41,8 +42,8 @@ from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
@@ -114,6 +115,10 @@ class ExtractorWorker:
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
         self._publish_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="publish")
         self._pending_publish: Future[DrainStats] | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return the device, and the models with their errors, as the process registers them."""
+        return self._models.state
 
     def warm_up(self) -> None:
         """Load the extractor of new maps, so that the first photo does not wait for it."""

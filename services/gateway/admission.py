@@ -27,7 +27,7 @@ from fastapi import Depends, Request
 from services.gateway.authentication import Caller, get_caller
 from services.gateway.dependencies import GatewayDep, get_map_name
 from services.http_connections import address_group
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
@@ -151,9 +151,8 @@ class AdmissionControl:
         """
         self.disk.check()
         depth, settings = self.queue_depth(), self._settings
-        admitted = sum(count for name, count in self._admitted.items() if name is not None)
         for suffix, queued, limit in (
-            ("", depth.jobs + admitted, settings.max_queued_jobs),
+            ("", depth.jobs + self._admitted_jobs(), settings.max_queued_jobs),
             (
                 f" of the map {map_name!r}",
                 depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
@@ -163,6 +162,20 @@ class AdmissionControl:
             if queued >= limit:
                 raise _queue_full_error(f"jobs{suffix}", queued, limit, depth.finished_per_second)
         self._admitted[map_name] += 1
+
+    def check_queue(self) -> None:
+        """Check that the queue has room for jobs of some map.
+
+        Raises:
+            TooManyRequests: `queue_full`.
+        """
+        depth, limit = self.queue_depth(), self._settings.max_queued_jobs
+        queued = depth.jobs + self._admitted_jobs()
+        if queued >= limit:
+            raise _queue_full_error("jobs", queued, limit, depth.finished_per_second)
+
+    def _admitted_jobs(self) -> int:
+        return sum(count for name, count in self._admitted.items() if name is not None)
 
     def admit_query(self) -> None:
         """Admit a query photo.

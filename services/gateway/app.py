@@ -8,7 +8,7 @@ from fastapi.middleware.cors import CORSMiddleware
 from services.gateway import metrics
 from services.gateway.admission import AdmissionControl
 from services.gateway.authentication import READ, AuthenticationMiddleware, check_declared_scopes
-from services.gateway.dependencies import API_PREFIX, GatewayContext
+from services.gateway.dependencies import ALL_MAPS, API_PREFIX, GatewayContext
 from services.gateway.idempotency import IdempotentReplay, replay_response
 from services.gateway.metrics import GatewayMetrics
 from services.gateway.middleware import (
@@ -116,6 +116,8 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         check_declared_scopes(module.router)
         app.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)
     app.include_router(health.probe_router)
-    app.include_router(metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ])
+    app.include_router(
+        metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ, ALL_MAPS]
+    )
     app.include_router(create_web_page_router(gateway.settings))
     return app

@@ -29,14 +29,16 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from services.http_server import PEER_ADDRESS
 from shared.catalog.api_keys import (
     LAST_USED_RESOLUTION_SECONDS,
     KeyLimits,
     authenticate_api_key,
     record_key_use,
 )
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.session import Catalog
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.session import Catalog
+from shared.catalog.maps import DEFAULT_MAP
 from shared.errors import Forbidden, PlacewiseError, Unauthorized
 from shared.http.problem_details import problem_response
 from shared.security.api_keys import ALL_SCOPES, expand_scopes, hash_api_key, is_loopback
@@ -64,13 +66,37 @@ class Caller:
     key_id: UUID | None = None
     """None for keys that are not in the catalog: ADMIN_KEY and the local key of the CLI."""
     limits: KeyLimits = field(default=KeyLimits())
+    maps: frozenset[str] | None = None
+    """Names of the only maps that the caller may use; None: all maps."""
+
+    def check_map(self, name: str) -> None:
+        """Raise Forbidden (`map_not_allowed`) for a map that the caller may not use."""
+        if self.maps is not None and name not in self.maps:
+            raise Forbidden(
+                "map_not_allowed",
+                f"This key may only use the maps {', '.join(sorted(self.maps))}; the request is "
+                f"about the map {name!r}. Select one with ?map=NAME (commands: --map NAME).",
+            )
+
+    def check_all_maps(self) -> None:
+        """Raise Forbidden (`map_not_allowed`) if the caller may only use some maps."""
+        if self.maps is not None:
+            raise Forbidden(
+                "map_not_allowed",
+                f"This key may only use the maps {', '.join(sorted(self.maps))}; the request is "
+                "about all maps.",
+            )
 
 
 class Authenticator(Protocol):
     """Authenticates requests before they are routed."""
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         """Return the caller of a request.
+
+        Args:
+            headers: The request's headers.
+            peer: Address of the connection, whatever the headers say; None if unknown.
 
         Raises:
             Unauthorized: `key_missing`, `key_unknown`, `key_revoked` or `key_expired`.
@@ -96,7 +122,7 @@ class LocalhostAuthenticator:
         """`trusted_origins` (CORS_ORIGINS) are origins of web pages that are accepted."""
         self._trusted = trusted_origins
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         for name in FORWARDED:
             if name in headers:
                 raise Forbidden(
@@ -113,18 +139,23 @@ class LocalhostAuthenticator:
                 "Without a key only requests to localhost are accepted; this one is to "
                 f"{host[:100]!r} (Host header). Set ADMIN_KEY to accept other host names.",
             )
-        origin = headers.get("origin", f"http://{host}")
-        if origin.partition("://")[2] != host and origin not in self._trusted:
-            raise Forbidden(
-                "foreign_page",
-                "Without a key web pages of other origins are refused; this one is of "
-                f"{origin[:100]!r} (Origin header). Add the origin to CORS_ORIGINS, or set "
-                "ADMIN_KEY.",
-            )
+        check_same_origin(headers, self._trusted)
         return Caller("this machine", ALL_SCOPES)
 
     async def record_use(self, caller: Caller) -> None:
         pass
+
+
+def check_same_origin(headers: Headers, trusted_origins: Container[str]) -> None:
+    """Raise Forbidden (`foreign_page`) if a web page of another origin sends the request."""
+    host = headers.get("host", "")
+    origin = headers.get("origin", f"http://{host}")
+    if origin.partition("://")[2] != host and origin not in trusted_origins:
+        raise Forbidden(
+            "foreign_page",
+            "Without a key web pages of other origins are refused; this one is of "
+            f"{origin[:100]!r} (Origin header). Add the origin to CORS_ORIGINS, or send a key.",
+        )
 
 
 def _host_name(host: str) -> str:
@@ -150,7 +181,7 @@ class ApiKeyAuthenticator:
             MAX_REMEMBERED_USES, LAST_USED_RESOLUTION_SECONDS
         )
 
-    async def authenticate(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         key_sha256 = hash_api_key(parse_bearer(headers.get("authorization")))
         # In constant time, against timing attacks.
         if any(hmac.compare_digest(key_sha256, admin) for admin in self._admins):
@@ -175,6 +206,7 @@ class ApiKeyAuthenticator:
             scopes=expand_scopes([KeyScope(scope) for scope in key.scopes]),
             key_id=key.id,
             limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
+            maps=None if key.maps is None else frozenset(key.maps),
         )
 
     async def record_use(self, caller: Caller) -> None:
@@ -211,6 +243,8 @@ def parse_bearer(authorization: str | None) -> str:
 PUBLIC_PATHS = frozenset({"/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"})
 PUBLIC_PATH_PREFIX = "/console/"  # assets of the web page, where the user enters the key
 
+MAPS_PATH = "/api/v1/maps"
+
 # For the OpenAPI schema only: `AuthenticationMiddleware` checks the key, before routing.
 BEARER_SCHEME = HTTPBearer(
     auto_error=False,
@@ -236,7 +270,9 @@ class AuthenticationMiddleware:
             return
         request = Request(scope)
         try:
-            caller = await self._authenticator.authenticate(request.headers)
+            caller = await self._authenticator.authenticate(
+                request.headers, scope.get(PEER_ADDRESS)
+            )
         except PlacewiseError as error:
             log.debug("%s %s: %s", request.method, request.url.path, error.code)
             await problem_response(error, request)(scope, receive, send)
@@ -263,15 +299,21 @@ def _require_scope(
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    missing = set(scopes.scopes) - get_caller(request).scopes
+    caller = get_caller(request)
+    missing = set(scopes.scopes) - caller.scopes
     if missing:
         raise Forbidden(
             "scope_missing",
             f"This request needs a key with the scope {', '.join(sorted(missing))}; yours has "
-            f"{', '.join(sorted(get_caller(request).scopes))}. An admin can create one with "
+            f"{', '.join(sorted(caller.scopes))}. An admin can create one with "
             "placewise keys create.",
             needed=sorted(missing),
         )
+    # Each request selects its map by the query parameter, except those of /maps, which check it
+    # themselves, and those about all maps (`ALL_MAPS`), which refuse such keys.
+    if not request.scope["path"].startswith(MAPS_PATH):
+        for name in request.query_params.getlist("map") or [DEFAULT_MAP]:
+            caller.check_map(name)
 
 
 READ = Security(_require_scope, scopes=[KeyScope.READ.value])

@@ -21,11 +21,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.authentication import Authenticator
+from services.gateway.authentication import Authenticator, get_caller
+from services.gateway.similarity.neighbours import NeighbourCache
 from services.http_connections import ConnectionLimits, Connections
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import DEFAULT_MAP
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import NotFound, PlacewiseError, invalid_field_error
 from shared.jobs import Job, Wakeups
@@ -227,6 +228,7 @@ class GatewayContext:
     started_monotonic: float = field(default_factory=time.monotonic)
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
+    neighbours: NeighbourCache = field(default_factory=NeighbourCache)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "job_notifier", JobNotifier(self.catalog))
@@ -307,10 +309,16 @@ def _accept_no_parameters(_params: Annotated[MapParams, Query(include_in_schema=
     pass
 
 
+def _require_all_maps(request: Request) -> None:
+    get_caller(request).check_all_maps()
+
+
 MapQuery = Annotated[MapParams, Query()]
 PageQuery = Annotated[MapPageParams, Query()]
 NO_PARAMETERS = Depends(_accept_no_parameters)
 """Dependency of endpoints that use no query parameters."""
+ALL_MAPS = Depends(_require_all_maps)
+"""Dependency of endpoints about no map or all maps: keys for some maps are refused."""
 GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
 FileId = Annotated[UUID, _uuid_or_not_found("photo")]
 UploadId = Annotated[UUID, _uuid_or_not_found("upload")]

@@ -225,7 +225,7 @@ def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
         raise
 
 
-async def idempotent_form_request(
+async def _idempotent_form_request(
     request: Request, response: Response, gateway: GatewayDep, key: IdempotencyKeyHeader = None
 ) -> AsyncIterator[IdempotentRequest]:
     """Dependency for streamed bodies: the route calls `claim_form` or `claim_key` itself."""
@@ -239,8 +239,8 @@ async def idempotent_form_request(
         await run_in_threadpool(idempotent.release_key)
 
 
-async def idempotent_request(
-    request: Request, idempotent: Annotated[IdempotentRequest, Depends(idempotent_form_request)]
+async def _idempotent_request(
+    request: Request, idempotent: Annotated[IdempotentRequest, Depends(_idempotent_form_request)]
 ) -> IdempotentRequest:
     """Dependency for requests with a JSON body or none; claims the key."""
     body = await request.body()
@@ -254,5 +254,5 @@ def _key_scope(request: Request) -> str:
     return hashlib.sha256(json.dumps(scope).encode()).hexdigest()
 
 
-IdempotentDep = Annotated[IdempotentRequest, Depends(idempotent_request)]
-IdempotentFormDep = Annotated[IdempotentRequest, Depends(idempotent_form_request)]
+IdempotentDep = Annotated[IdempotentRequest, Depends(_idempotent_request)]
+IdempotentFormDep = Annotated[IdempotentRequest, Depends(_idempotent_form_request)]

@@ -22,7 +22,7 @@ from services.gateway.admission import AdmissionControl, UploadKind
 from services.gateway.dependencies import GatewayContext
 from services.http_connections import Connections
 from services.request_log import RequestRecord
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.maps import Map
 from shared.jobs.queue_depth import PolledValue

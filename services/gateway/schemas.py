@@ -38,6 +38,9 @@ class PhotoResponse(ResponseModel):
     image_id: UUID
     image_path: str = Field(description="URL path of the image on this server")
     original_filename: str
+    relative_path: str | None = Field(
+        description="path in the folder or archive that it was uploaded from; null if unknown"
+    )
     upload_time: datetime
     file_size: int
     width: int
@@ -61,6 +64,7 @@ class PhotoResponse(ResponseModel):
             "image_id": photo.id,
             "image_path": image_url,
             "original_filename": photo.filename,
+            "relative_path": photo.relative_path,
             "upload_time": photo.uploaded_at,
             "file_size": photo.size_bytes,
             "width": photo.width,
@@ -196,8 +200,8 @@ class SimilarityResponse(ResponseModel):
     similar_images: list[SimilarPhotoResponse]
     estimate: EstimateResponse
     vocabulary: str = Field(
-        description="`own`: fitted on this map's photos; `foreign`: fitted on other photos; "
-        "`none`: the extractor uses none"
+        description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
+        "them; `foreign`: fitted on other photos; `none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "

@@ -3,9 +3,9 @@
 All assets come from this server: Leaflet, Swagger UI and ReDoc are files of installed packages. The
 only other origin that a page may load from is that of MAP_TILES.
 
-Assets are read and compressed once, and revalidated by an ETag of their content. Starlette's
-StaticFiles derives the ETag from the file's modification time, which differs between replicas, and
-does not serve precompressed files.
+Assets are read once, compressed on first use, and revalidated by an ETag of their content.
+Starlette's StaticFiles derives the ETag from the file's modification time, which differs between
+replicas, and does not serve precompressed files.
 """
 
 from __future__ import annotations
@@ -42,22 +42,25 @@ COMPRESSIBLE_SUFFIXES = frozenset({".css", ".html", ".js", ".json", ".svg"})
 CACHE_CONTROL = "no-cache"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StaticAsset:
-    """A static file, with its gzip-compressed body."""
+    """A static file."""
 
-    media_type: str
+    suffix: str
+    """Suffix of the file, in MEDIA_TYPES."""
     body: bytes
-    gzipped_body: bytes | None
-    """The gzip-compressed body; None for formats that are compressed already."""
-    digest: str
-    """First 32 hexadecimal digits of the SHA-256 of the body."""
 
-    @classmethod
-    def from_bytes(cls, suffix: str, body: bytes) -> StaticAsset:
-        """Create an asset; raises KeyError for a suffix that is not in MEDIA_TYPES."""
-        zipped = gzip.compress(body, 9, mtime=0) if suffix in COMPRESSIBLE_SUFFIXES else None
-        return cls(MEDIA_TYPES[suffix], body, zipped, hashlib.sha256(body).hexdigest()[:32])
+    @functools.cached_property
+    def gzipped_body(self) -> bytes | None:
+        """The gzip-compressed body; None for formats that are compressed already."""
+        # On first use: compressing all assets would take 0.3 s of each start.
+        is_compressible = self.suffix in COMPRESSIBLE_SUFFIXES
+        return gzip.compress(self.body, 9, mtime=0) if is_compressible else None
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """First 32 hexadecimal digits of the SHA-256 of the body."""
+        return hashlib.sha256(self.body).hexdigest()[:32]
 
     def to_response(self, request: Request, headers: dict[str, str]) -> Response:
         """Build the response: 200, or 304 if the browser has the same content."""
@@ -73,7 +76,9 @@ class StaticAsset:
             return Response(status_code=304, headers=all_headers)
         if zipped:
             all_headers["Content-Encoding"] = "gzip"
-        return Response(zipped or self.body, media_type=self.media_type, headers=all_headers)
+        return Response(
+            zipped or self.body, media_type=MEDIA_TYPES[self.suffix], headers=all_headers
+        )
 
 
 def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
@@ -82,7 +87,7 @@ def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
         if path.suffix in MEDIA_TYPES:
             yield (
                 path.relative_to(folder).as_posix(),
-                StaticAsset.from_bytes(path.suffix, path.read_bytes()),
+                StaticAsset(path.suffix, path.read_bytes()),
             )
 
 
@@ -111,9 +116,7 @@ def create_web_page_router(settings: Settings) -> APIRouter:
     """Create the routes of the web page, the API documentation and the assets."""
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
-    assets["settings.json"] = StaticAsset.from_bytes(
-        ".json", json.dumps(_page_settings(settings)).encode()
-    )
+    assets["settings.json"] = StaticAsset(".json", json.dumps(_page_settings(settings)).encode())
 
     page_headers = _page_headers(settings)
     policy = page_headers["Content-Security-Policy"]
@@ -188,7 +191,7 @@ def _load_page_assets() -> dict[str, StaticAsset]:
     for url_folder, package, package_folder, names in VENDORED_PACKAGES:
         source = Path(str(files(package))) / package_folder
         for name in names:
-            assets[f"{url_folder}/{name}"] = StaticAsset.from_bytes(
+            assets[f"{url_folder}/{name}"] = StaticAsset(
                 Path(name).suffix, (source / name).read_bytes()
             )
     return assets

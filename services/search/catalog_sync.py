@@ -29,10 +29,10 @@ from services.search.photo_columns import PhotoColumns
 from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.chunks import list_live_chunks, list_live_filter_values
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFilterValues, list_photos_changed_since
-from shared.catalog.session import Catalog
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import NotFound, Unavailable
 from shared.search_api.protocol import IndexPart, ReplicationLag

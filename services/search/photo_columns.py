@@ -84,7 +84,7 @@ class PhotoColumns:
 
     def with_changes(self, changes: Mapping[UUID, PhotoFilterValues]) -> PhotoColumns:
         """Return the columns with changes applied; itself if none of the photos is in the chunk."""
-        rows = find_rows(self, changes)
+        rows = _find_rows(self, changes)
         if not len(rows):
             return self
         copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
@@ -97,7 +97,7 @@ class PhotoColumns:
         self.findable[row] = photo.findable
         self.latitude[row] = np.nan if photo.latitude is None else photo.latitude
         self.longitude[row] = np.nan if photo.longitude is None else photo.longitude
-        self.captured_at[row] = to_datetime64(photo.captured_at)
+        self.captured_at[row] = _to_datetime64(photo.captured_at)
         self.place[row] = photo.place
         self.tags[row] = frozenset(photo.tags)
 
@@ -187,7 +187,7 @@ class _JoinedRowIndex(Mapping[str, NDArray[np.int64]]):
 AnyPhotoColumns = PhotoColumns | JoinedColumns
 
 
-def find_rows(photos: AnyPhotoColumns, ids: Collection[UUID]) -> NDArray[np.int64]:
+def _find_rows(photos: AnyPhotoColumns, ids: Collection[UUID]) -> NDArray[np.int64]:
     """Return the rows of these photos in ascending order."""
     low_bits = np.fromiter((id_.int & LOW_64_BITS for id_ in ids), np.uint64, len(ids))
     matches = np.flatnonzero(np.isin(photos.id_low_bits, low_bits))
@@ -204,7 +204,7 @@ def _group_rows(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]
     return {text: np.array(rows, np.int64) for text, rows in rows_by_text.items()}
 
 
-def to_datetime64(when: datetime | None) -> np.datetime64:
+def _to_datetime64(when: datetime | None) -> np.datetime64:
     """Convert an aware datetime to NumPy's UTC microseconds; None becomes NaT."""
     if when is None:
         return UNKNOWN_TIME
@@ -226,7 +226,7 @@ def build_row_mask(
     """
     mask = photos.findable.copy()
     if photo_filter.ids is not None:
-        mask &= _mask_of_rows(find_rows(photos, photo_filter.ids), len(mask))
+        mask &= _mask_of_rows(_find_rows(photos, photo_filter.ids), len(mask))
     if photo_filter.place is not None:
         mask &= _mask_of_rows(photos.rows_by_place.get(photo_filter.place, NO_ROWS), len(mask))
     if photo_filter.place_under is not None:
@@ -238,11 +238,11 @@ def build_row_mask(
     for tag in photo_filter.tags:
         mask &= _mask_of_rows(photos.rows_by_tag.get(tag, NO_ROWS), len(mask))
     if exclude:
-        mask[find_rows(photos, exclude)] = False
+        mask[_find_rows(photos, exclude)] = False
     if photo_filter.captured_after is not None:
-        mask &= photos.captured_at >= to_datetime64(photo_filter.captured_after)
+        mask &= photos.captured_at >= _to_datetime64(photo_filter.captured_after)
     if photo_filter.captured_before is not None:
-        mask &= photos.captured_at <= to_datetime64(photo_filter.captured_before)
+        mask &= photos.captured_at <= _to_datetime64(photo_filter.captured_before)
     if photo_filter.box is not None:
         mask &= _in_box(photos, photo_filter.box)
     if photo_filter.near is not None:

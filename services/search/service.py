@@ -7,16 +7,14 @@ catalog with the versions that it has loaded.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from uuid import UUID
 
-import uvicorn
 from fastapi import FastAPI, Response
 from prometheus_client import CollectorRegistry
 from pydantic import BaseModel
@@ -27,16 +25,16 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.request_log import RequestLogMiddleware
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
-from shared.catalog.database_errors import OutageLog
+from services.service_process import Announce, service_process, start_service_thread
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
+from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import delete_search_worker, upsert_search_worker
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.http.problem_details import PROBLEM_RESPONSES, install_exception_handlers
 from shared.ids import new_id
 from shared.search_api.protocol import ReplicationLag, SearchRequest, SearchResponse, SearchStatus
-from shared.storage import ObjectStore
 from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE, serve_metrics
 
 log = logging.getLogger(__name__)
@@ -179,64 +177,49 @@ class WorkerHeartbeat:
         self._sent_versions, self._sent_at = versions, time.monotonic()
 
 
-@dataclass(slots=True)
-class SearchService:
-    """A running search service; `serve` answers HTTP requests until the process is stopped."""
-
-    url: str
-    worker: SearchWorker
-    server: uvicorn.Server
-    listener: socket.socket
-    failed: threading.Event
-
-    def stop(self) -> None:
-        """Stop the service because one of its threads has died."""
-        self.failed.set()
-        self.server.should_exit = True
-
-    def serve(self) -> None:
-        """Serve HTTP requests; Misconfigured (`part_died`) if a thread of the service has died."""
-        with stop_on_signals(self.server):
-            self.server.run(sockets=[self.listener])
-        if self.failed.is_set():
-            raise Misconfigured(
-                "part_died",
-                "A thread of the search service stopped unexpectedly. See the log above.",
-            )
-
-
-@contextlib.contextmanager
-def run_search_service(
-    settings: Settings, catalog: Catalog, store: ObjectStore
-) -> Iterator[SearchService]:
-    """Start a search service: listen on HOST and PORT, sync the shard SEARCH_SHARD, and register.
+def serve_search(settings: Settings, announce: Announce) -> None:
+    """Serve searches in the shard SEARCH_SHARD on HOST and PORT until SIGTERM.
 
     Raises:
-        Misconfigured: `address_in_use`.
+        Misconfigured: `address_in_use`; `part_died` if a thread has crashed.
     """
-    with listen(settings.host, settings.port) as listener:
-        host, port = listener.getsockname()[:2]
-        registry = CollectorRegistry()
-        worker = SearchWorker(catalog, store, settings, settings.shard)
-        url = reachable_url(host, port)
-        heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
-        # Its clients are a few gateways, with one connection for each concurrent query.
-        limits = replace(ConnectionLimits.of(settings), per_address=0)
-        server = http_server(create_search_app(worker, registry), Connections(limits))
-        service = SearchService(url, worker, server, listener, threading.Event())
-        stop = threading.Event()
-        threads = [
-            start_service_thread(name, target, stop, service.stop)
-            for name, target in (
-                ("search sync", worker.run),
-                ("search sync of building generations", worker.run_building),
-                ("search heartbeat", heartbeat.run),
-            )
-        ]
-        try:
-            with serve_metrics(settings, registry):
-                yield service
-        finally:
-            stop.set()
-            for thread in threads:
-                thread.join()
+    stop, failed = threading.Event(), threading.Event()
+    with service_process(settings, "search") as catalog:
+        store = open_installation_store(catalog, settings, exclusive=False)
+        with listen(settings.host, settings.port) as listener:
+            host, port = listener.getsockname()[:2]
+            registry = CollectorRegistry()
+            worker = SearchWorker(catalog, store, settings, settings.shard)
+            url = reachable_url(host, port)
+            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
+            # Its clients are a few gateways, with one connection for each concurrent query.
+            limits = replace(ConnectionLimits.of(settings), per_address=0)
+            server = http_server(create_search_app(worker, registry), Connections(limits))
+
+            def on_crash() -> None:
+                failed.set()
+                server.should_exit = True
+
+            threads = [
+                start_service_thread(name, run, stop, on_crash)
+                for name, run in (
+                    ("search sync", worker.run),
+                    ("search sync of building generations", worker.run_building),
+                    ("search heartbeat", heartbeat.run),
+                )
+            ]
+            try:
+                with serve_metrics(settings, registry), stop_on_signals(server):
+                    announce(
+                        f"Placewise search serves shard {settings.shard} on {url}\n"
+                        f"  health:   {url}/readyz   {url}/metrics"
+                    )
+                    server.run(sockets=[listener])
+            finally:
+                stop.set()
+                for thread in threads:
+                    thread.join()
+    if failed.is_set():
+        raise Misconfigured(
+            "part_died", "A thread of the search service stopped unexpectedly. See the log above."
+        )

@@ -31,9 +31,9 @@ from services.search.photo_columns import build_row_mask
 from services.search.query_batcher import QueryBatcher
 from services.search.residency import GpuResidency, MemoryBudget, open_search_device
 from services.search.snapshot import Snapshot
-from shared.catalog.database_errors import OutageLog
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable

@@ -17,9 +17,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Descriptor, find_descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole, is_geotagged
-from shared.catalog.session import Catalog
 from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
 from shared.evaluation.place_evidence import PhotoLocation

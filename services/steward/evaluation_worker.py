@@ -19,8 +19,8 @@ from services.steward.map_evaluation import MapEvaluation
 from services.steward.metrics import StewardMetrics
 from services.steward.word_weights import WordWeightsFit
 from shared.catalog.chunks import count_searchable
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation, active_generation
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
 from shared.config.settings import Settings
 from shared.errors import Conflict

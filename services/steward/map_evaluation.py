@@ -29,10 +29,10 @@ from services.steward.evaluation_search import (
     RankPhoto,
     read_geotagged_photos,
 )
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
-from shared.catalog.session import Catalog
 from shared.evaluation.calibration import (
     Calibration,
     auroc,
@@ -54,8 +54,8 @@ from shared.evaluation.place_evidence import (
     is_same_place,
 )
 from shared.evaluation.place_figures import PlaceEvaluation, evaluate_places
+from shared.evaluation.place_fit import PlaceSample
 from shared.evaluation.place_levels import LevelScheme, candidate_levels
-from shared.evaluation.place_probability import PlaceSample
 from shared.evaluation.place_samples import (
     SAME_SESSION_PERIOD,
     IndexRanking,
@@ -361,7 +361,10 @@ class MapEvaluation:
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     accepted=calibration.accepts(evidence) if evidence else None,
                     truth=query.spot,
-                    ranking=_to_ranked(ranking),
+                    ranking=[
+                        RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
+                        for hit, spot in ranking
+                    ],
                     best_photo_id=ranking[0][0].photo_id if ranking else None,
                 )
             )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
@@ -25,71 +26,44 @@ class StewardMetrics:
     """The metrics of one steward process; those of several stewards can be summed."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self._task_runs = Counter(
-            f"{METRIC_PREFIX}_duties",
+        counter = partial(Counter, namespace=METRIC_PREFIX, registry=registry)
+        gauge = partial(Gauge, namespace=METRIC_PREFIX, registry=registry)
+        histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=registry)
+        self._task_runs = counter(
+            "duties",
             "Runs of each periodic task by outcome: done, failed, or catalog_away.",
             ["duty", "outcome"],
-            registry=registry,
         )
-        self._task_seconds = Histogram(
-            f"{METRIC_PREFIX}_duty_seconds",
+        self._task_seconds = histogram(
+            "duty_seconds",
             "Duration of a run of a periodic task, in seconds.",
             ["duty"],
             buckets=TASK_BUCKETS_SECONDS,
-            registry=registry,
         )
-        self.leases_expired = Counter(
-            f"{METRIC_PREFIX}_leases_expired",
-            "Jobs whose lease expired because their worker died.",
-            registry=registry,
+        self.leases_expired = counter(
+            "leases_expired", "Jobs whose lease expired because their worker died."
         )
-        self.hints_resent = Counter(
-            f"{METRIC_PREFIX}_hints_resent",
-            "Wakeups sent again for waiting jobs.",
-            registry=registry,
-        )
-        self.slots_merged = Counter(
-            f"{METRIC_PREFIX}_slots_merged",
-            "Slots whose chunks were merged into one.",
-            registry=registry,
-        )
-        self.journal_lines = Counter(
-            f"{METRIC_PREFIX}_journal_lines",
-            "Catalog rows written to the journal.",
-            registry=registry,
-        )
-        self.catalog_lag_segments = Gauge(
-            f"{METRIC_PREFIX}_catalog_lag_segments",
+        self.hints_resent = counter("hints_resent", "Wakeups sent again for waiting jobs.")
+        self.slots_merged = counter("slots_merged", "Slots whose chunks were merged into one.")
+        self.journal_lines = counter("journal_lines", "Catalog rows written to the journal.")
+        self.catalog_lag_segments = gauge(
+            "catalog_lag_segments",
             "Journal segments in the object store that the catalog does not know: 0, unless an "
             "older catalog was restored.",
-            registry=registry,
         )
-        self.objects_deleted = Counter(
-            f"{METRIC_PREFIX}_objects_deleted",
-            "Deleted objects that nothing referred to any more.",
-            ["duty"],
-            registry=registry,
+        self.objects_deleted = counter(
+            "objects_deleted", "Deleted objects that nothing referred to any more.", ["duty"]
         )
-        self.objects_trashed = Counter(
-            f"{METRIC_PREFIX}_objects_trashed",
-            "Orphaned objects moved to the trash.",
-            registry=registry,
-        )
-        self.collection_held = Gauge(
-            f"{METRIC_PREFIX}_collection_held",
+        self.objects_trashed = counter("objects_trashed", "Orphaned objects moved to the trash.")
+        self.collection_held = gauge(
+            "collection_held",
             "1 while orphan collection waits for `placewise storage collect --confirm`, else 0.",
-            registry=registry,
         )
-        self.trash_bytes = Gauge(
-            f"{METRIC_PREFIX}_trash_bytes",
-            "Bytes in the trash after the last collection.",
-            registry=registry,
-        )
-        self._jobs = Counter(
-            f"{METRIC_PREFIX}_jobs",
+        self.trash_bytes = gauge("trash_bytes", "Bytes in the trash after the last collection.")
+        self._jobs = counter(
+            "jobs",
             "Slices of the steward's own jobs by outcome: done, stopped, paused, failed, crashed.",
             ["kind", "outcome"],
-            registry=registry,
         )
         self._last_success: dict[str, float] = {}
         registry.register(_TaskLagCollector(self._last_success))

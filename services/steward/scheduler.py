@@ -36,9 +36,9 @@ from services.steward.tasks.model_changes import (
     remove_dead_search_workers,
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
-from shared.catalog.database_errors import OutageLog
-from shared.catalog.schema import sqlite_file
-from shared.catalog.session import Catalog
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.schema import sqlite_file
+from shared.catalog.database.session import Catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups

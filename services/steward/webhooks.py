@@ -30,9 +30,9 @@ import httpcore2
 from sqlalchemy import ColumnElement, select, update
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.base import db_now, db_now_plus
-from shared.catalog.database_errors import OutageLog
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.catalog.webhooks import SECRET_PREFIX, Delivery, DeliveryState, Webhook
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from services.steward.evaluation_search import MAX_READ_ATTEMPTS, GeotaggedPhoto, map_damaged_error
 from services.steward.map_evaluation import MapEvaluation, RecallCounter
 from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
-from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.evaluation.place_evidence import is_same_place
 from shared.storage import ObjectStore

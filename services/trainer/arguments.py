@@ -45,6 +45,12 @@ def parse_names(value: Any) -> Any:
     return parse_literal(value)
 
 
+def parse_integers(value: Any) -> Any:
+    """Parse a list of integers: a literal, one integer, or integers separated by commas."""
+    parsed = parse_literal(value)
+    return (parsed,) if isinstance(parsed, int) and not isinstance(parsed, bool) else parsed
+
+
 def parse_image_size(value: Any) -> Any:
     """Parse `(320, 320)`, `[320, 320]`, `320 320`, `320x320` or `320` as (height, width)."""
     parsed = parse_literal(value)
@@ -64,7 +70,7 @@ MIN_IMAGE_PIXELS = 32
 """Minimum side in pixels; below it a ResNet's last feature map is smaller than one position."""
 
 NameList = Annotated[tuple[str, ...], BeforeValidator(parse_names)]
-IntList = Annotated[tuple[int, ...], BeforeValidator(parse_literal)]
+IntList = Annotated[tuple[int, ...], BeforeValidator(parse_integers)]
 HeightWidth = Annotated[tuple[int, int], BeforeValidator(parse_image_size)]
 
 
@@ -124,6 +130,9 @@ class TrainingArguments(BaseModel):
     layers_to_crop: IntList = _argument(
         MODEL, (), "JSON list of layers to remove: 4 removes layer4, 3 also removes layer3."
     )
+    backbone_norm: bool = _argument(
+        MODEL, True, "Apply the final norm of DINOv2 and Swin. False for BoQ's published DINOv2."
+    )
     agg_arch: str = _argument(MODEL, "AVG", "Name of the aggregator.")
     agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
         MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."
@@ -177,6 +186,9 @@ class TrainingArguments(BaseModel):
     faiss_gpu: bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
     check_val_every_n_epoch: int = _argument(
         EVALUATION, 1, "Validate every n epochs, and after the last.", ge=1
+    )
+    save_val_predictions: bool = _argument(
+        EVALUATION, False, "Save the predictions of each validation. Those of tests always are."
     )
     num_sanity_val_steps: int = _argument(
         EVALUATION, 0, "Number of validation batches run before training. -1: all.", ge=-1
@@ -355,6 +367,14 @@ def resolve_keys(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     return resolved
 
 
+# Added to pydantic's messages, by the type of its error.
+EXPECTED_VALUES = {
+    "bool_parsing": ". Expected True or False",
+    "tuple_type": """. Expected a JSON list, such as [4] or ["a", "b"]""",
+    "dict_type": """. Expected a JSON dict, such as {"p": 3}""",
+}
+
+
 def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     """Merge and validate arguments; later layers override earlier ones.
 
@@ -368,8 +388,8 @@ def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
         return TrainingArguments(**merged)
     except ValidationError as error:
         messages = [
-            f"--{detail['loc'][0]}: {detail['msg'].removeprefix('Value error, ')} "
-            f"(got {detail['input']!r})"
+            f"--{detail['loc'][0]}: {detail['msg'].removeprefix('Value error, ')}"
+            f"{EXPECTED_VALUES.get(detail['type'], '')} (got {detail['input']!r})"
             for detail in error.errors()
         ]
         raise InvalidRequest("bad_argument", "; ".join(dict.fromkeys(messages))) from error

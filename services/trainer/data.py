@@ -186,7 +186,7 @@ class PlaceDataset(Dataset[Batch]):
                 image = decode_resized(path, self._image_size)
             except Unprocessable as error:
                 if self._fail_on_undecodable:
-                    raise undecodable_photo_error(str(path), error.detail) from error
+                    raise _undecodable_photo_error(str(path), error.detail) from error
                 undecodable.append((str(path), error.detail))
                 continue
             if self._augment:
@@ -200,7 +200,7 @@ class PlaceDataset(Dataset[Batch]):
         )
 
 
-def undecodable_photo_error(path: str, reason: str) -> Unprocessable:
+def _undecodable_photo_error(path: str, reason: str) -> Unprocessable:
     """Return the error for a photo that cannot be decoded."""
     return Unprocessable(
         "undecodable_photo",
@@ -209,7 +209,7 @@ def undecodable_photo_error(path: str, reason: str) -> Unprocessable:
     )
 
 
-def collate_batches(places: list[Batch]) -> Batch:
+def _collate_batches(places: list[Batch]) -> Batch:
     """Concatenate the photos of several places."""
     return Batch(
         torch.cat([place.photos for place in places]),
@@ -233,7 +233,7 @@ def load_batches(
             dataset,
             batch_sampler=sampler.batches(epoch, start),
             num_workers=num_workers,
-            collate_fn=collate_batches,
+            collate_fn=_collate_batches,
             pin_memory=pin_memory,
             worker_init_fn=_init_worker if num_workers else None,
             generator=torch.Generator(),  # else it would draw from the training's global generator

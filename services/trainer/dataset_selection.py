@@ -25,6 +25,8 @@ class EvaluationSets:
     """empty in the phase test"""
     test: tuple[EvaluationSet, ...]
     """empty in the phase train"""
+    roots: dict[str, Path]
+    """name of each available set -> the folder of the arguments that it is in"""
     names: dict[str, tuple[str, ...]]
     """resolved values of val_set_names and test_set_names"""
 
@@ -87,6 +89,7 @@ def select_evaluation_sets(arguments: TrainingArguments) -> EvaluationSets:
         validation=open_sets("val_set_names") if phase != "test" else (),
         test=open_sets("test_set_names") if phase != "train" else (),
         names=names,
+        roots=available,
     )
 
 

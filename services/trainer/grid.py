@@ -241,7 +241,9 @@ def run_grid(
     stop: StopRequest,
     after_each: Callable[[list[RunOutcome]], None],
 ) -> list[RunOutcome]:
-    """Execute all unfinished runs sequentially. A failed run does not stop the others.
+    """Execute all unfinished runs sequentially.
+
+    A failed run does not stop the others, unless none of them can start for the same reason.
 
     Args:
         plan: the runs.
@@ -267,7 +269,40 @@ def run_grid(
         display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
         outcomes[index] = _execute_run(planned, out / planned.name, display, stop)
         after_each(outcomes)
+        remaining = [each for each in outcomes[index + 1 :] if each.state is not RunState.FINISHED]
+        if remaining and all(_fails_likewise(each.run, outcomes[index]) for each in remaining):
+            display.warn(f"Stopped: the other {len(remaining)} runs can't start either.")
+            break
     return outcomes
+
+
+def _fails_likewise(planned: PlannedRun, outcome: RunOutcome) -> bool:
+    """Return whether the run can't start, for the reason that another run failed for."""
+    if outcome.error is None:
+        return False
+    obstacles = run.find_obstacles(build_arguments(planned.arguments))
+    return bool(obstacles) and run.combine_obstacles(obstacles).detail == outcome.error["detail"]
+
+
+# Settings that decide neither the data nor the network.
+_HARMLESS_ARGUMENTS = {"loss_name", "miner_name", "miner_margin", "lr", "max_epochs", "seed"}
+
+
+def find_grid_obstacles(plan: GridPlan) -> dict[str, list[str]]:
+    """Return what keeps runs from starting on this machine: code and detail -> names of the runs.
+
+    Runs that differ only in their training settings are checked once.
+    """
+    checked: dict[str, list[PlacewiseError]] = {}
+    blocked: dict[str, list[str]] = {}
+    for planned in plan.runs:
+        arguments = build_arguments(planned.arguments)
+        key = arguments.model_dump_json(exclude=_HARMLESS_ARGUMENTS)
+        if key not in checked:
+            checked[key] = run.find_obstacles(arguments)
+        for error in checked[key]:
+            blocked.setdefault(f"{error.code}: {error.detail}", []).append(planned.name)
+    return blocked
 
 
 def _execute_run(

@@ -58,7 +58,7 @@ def _row(outcome: RunOutcome, comparable: set[str]) -> Row:
         if metric in outcome.run.published and set_name in comparable:
             row[f"{metric} published"] = f"{outcome.run.published[metric]:.2f}"
     row["dimension"] = str(report["best"]["dimension"])
-    row["epochs"] = str(len(report["epochs"]))
+    row["epochs"] = str(report["epochs"][-1]["number"] + 1 if report["epochs"] else 0)
     row["photos/s"] = f"{report['images_per_second'] or 0:.1f}"
     row["checkpoint"] = Path(report["best"]["path"]).name
     return row

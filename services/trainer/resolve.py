@@ -6,12 +6,15 @@ read; creates the loggers and the checkpoint settings.
 
 from __future__ import annotations
 
+import csv
 import importlib.util
+import json
+import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
 import torch
 from lightning.pytorch.loggers import (
     CSVLogger,
@@ -28,7 +31,7 @@ from services.trainer.run_control import Display
 from services.trainer.run_folder import CHECKPOINTS_FOLDER
 from shared.datasets.dataset import TrainingSet
 from shared.errors import InvalidRequest, Misconfigured
-from shared.evaluation.exact_knn import exact_knn
+from shared.evaluation.exact_knn import has_faiss_gpu
 from shared.evaluation.ranking import DEFAULT_KS
 
 PRECISION_ALIASES = {
@@ -52,6 +55,8 @@ class Device:
     precision: Any
     """Lightning's `precision` argument, such as `16-mixed`"""
     torch_device: torch.device
+    faiss_gpu: bool
+    """whether evaluations search on the GPU"""
 
 
 def resolve_device(arguments: TrainingArguments) -> Device:
@@ -73,15 +78,16 @@ def resolve_device(arguments: TrainingArguments) -> Device:
         raise InvalidRequest(
             "precision_unfit", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
         )
+    faiss_gpu = arguments.faiss_gpu and has_faiss_gpu()
     if accelerator != "gpu":
-        return Device(accelerator, 1, precision, torch.device(accelerator))
+        return Device(accelerator, 1, precision, torch.device(accelerator), faiss_gpu)
     if index >= torch.cuda.device_count():
         raise Misconfigured(
             "no_gpu",
             f"--devices [{index}] does not exist: this machine has {torch.cuda.device_count()} "
             "GPUs, numbered from 0.",
         )
-    return Device("gpu", [index], precision, torch.device("cuda", index))
+    return Device("gpu", [index], precision, torch.device("cuda", index), faiss_gpu)
 
 
 def _resolve_accelerator(requested: str) -> str:
@@ -94,8 +100,7 @@ def _resolve_accelerator(requested: str) -> str:
             raise Misconfigured(
                 "no_gpu",
                 "PyTorch finds no CUDA GPU (--accelerator gpu is the default). Train on the CPU "
-                "with --accelerator cpu --faiss_gpu False, or install the driver and a CUDA build "
-                "of PyTorch.",
+                "with --accelerator cpu, or install the driver and a CUDA build of PyTorch.",
             )
         return "gpu"
     if requested == "mps" and not torch.backends.mps.is_available():
@@ -115,15 +120,23 @@ def _device_index(devices: int | str | tuple[int, ...]) -> int:
     )
 
 
-def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
-    """Create Lightning loggers by name.
+def make_loggers(
+    names: tuple[str, ...], folder: Path, arguments: dict[str, Any], completed_steps: int = 0
+) -> list[Logger]:
+    """Create Lightning loggers by name; that of a resumed run continues its CSV file.
 
     Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`).
+
+    Args:
+        names: the loggers.
+        folder: the run's folder.
+        arguments: logged as hyperparameters.
+        completed_steps: steps of the checkpoint that the run resumes; later rows are dropped.
     """
     loggers: list[Logger] = []
     for name in names:
         if name == "csv":
-            loggers.append(CSVLogger(folder, name="csv"))
+            loggers.append(_continue_csv(folder, completed_steps))
         elif name == "tensorboard":
             loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
         elif name == "wandb":
@@ -133,6 +146,26 @@ def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]
     for logger in loggers:
         logger.log_hyperparams(arguments)
     return loggers
+
+
+def _continue_csv(folder: Path, completed_steps: int) -> CSVLogger:
+    """Create a CSV logger that begins with the rows that earlier parts of the run have logged."""
+    logger = CSVLogger(folder, name="csv")
+    earlier = sorted((folder / "csv").glob("version_*/metrics.csv"), key=os.path.getmtime)
+    rows: dict[str, dict[str, str]] = {}  # each once, also if a copy was interrupted
+    for file in earlier:
+        with file.open(newline="") as opened:
+            for row in csv.DictReader(opened):
+                if int(row["step"]) <= completed_steps:
+                    logged = {name: value for name, value in row.items() if value != ""}
+                    rows[json.dumps(logged, sort_keys=True)] = logged
+    for logged in rows.values():
+        # Values are written as they were read, so that an interrupted copy is recognised.
+        logger.log_metrics(cast("dict[str, Any]", logged), int(logged["step"]))
+    logger.save()
+    for file in earlier:
+        shutil.rmtree(file.parent)
+    return logger
 
 
 def check_loggers(names: tuple[str, ...]) -> None:
@@ -153,19 +186,38 @@ def check_loggers(names: tuple[str, ...]) -> None:
 Json = dict[str, Any]
 
 
-def check_environment(arguments: TrainingArguments) -> Device:
-    """Check device, loggers and faiss, and return the device.
+def check_environment(arguments: TrainingArguments, display: Display) -> Device:
+    """Check device and loggers, and return the device; warn if faiss can't use the GPU.
 
     Raises:
-        Misconfigured: `no_gpu`, `faiss_gpu_missing`, `logger_missing`.
+        Misconfigured: `no_gpu`, `logger_missing`.
         InvalidRequest: as `resolve_device`.
     """
     device = resolve_device(arguments)
     check_loggers(arguments.logger)
-    if arguments.faiss_gpu:
-        row = np.ones((1, 1), np.float32)
-        exact_knn(row, row, 1, faiss_gpu=True)
+    if arguments.faiss_gpu and not device.faiss_gpu:
+        display.warn(
+            "Evaluations search on the CPU, with the same results: faiss can't use a GPU here "
+            "(--faiss_gpu False omits this warning)."
+        )
     return device
+
+
+def list_changed_meanings(arguments: TrainingArguments) -> list[str]:
+    """Return a line for each argument whose value had another effect in the GSV-Cities code."""
+    notes = []
+    if arguments.optimizer == "adam" and arguments.weight_decay > 0:
+        notes.append(
+            "--optimizer adam is Adam. The GSV-Cities script ran AdamW by this name: for the same "
+            "training use --optimizer adamw."
+        )
+    if arguments.experiment_phase != "train" and arguments.test_image_size == "same":
+        height, width = arguments.image_size
+        notes.append(
+            f"Test photos are resized to {height} x {width} pixels. The GSV-Cities script tested "
+            "them at their own size: for the same figures use --test_image_size native."
+        )
+    return notes
 
 
 def resolve_arguments(

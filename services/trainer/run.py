@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,15 @@ from services.trainer.dataset_selection import (
 )
 from services.trainer.model_factory import make_model
 from services.trainer.resolve import (
-    Device,
     check_environment,
+    check_loggers,
+    list_changed_meanings,
     make_checkpoints,
     make_loggers,
     resolve_arguments,
+    resolve_device,
 )
-from services.trainer.run_control import Display, RunStopped, StopRequest
+from services.trainer.run_control import Display, NullDisplay, RunStopped, StopRequest
 from services.trainer.run_folder import (
     CONFIG_FILE,
     METRICS_FILE,
@@ -34,11 +38,59 @@ from services.trainer.run_folder import (
 )
 from services.trainer.summary import build_summary, print_data_sets
 from services.trainer.training_loop import TrainingLoop, TrainingRun
-from services.trainer.validation import Validator
-from shared.descriptors.vpr_models.checkpoint import load_checkpoint
-from shared.errors import Conflict, InvalidRequest
+from services.trainer.validation import Validator, write_predictions
+from shared.descriptors.vpr_models.checkpoint import Checkpoint, load_checkpoint
+from shared.errors import Conflict, InvalidRequest, Misconfigured, PlacewiseError
+from shared.evaluation.ranking import RecallEvaluation
 
 Json = dict[str, Any]
+
+
+def find_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
+    """Return every reason for which a run can't start on this machine, each once.
+
+    Checks the device, the loggers, the data sets and the network; missing pretrained weights are
+    downloaded if possible.
+    """
+    checks: list[Callable[[], object]] = [
+        lambda: resolve_device(arguments),
+        lambda: check_loggers(arguments.logger),
+        lambda: select_evaluation_sets(arguments),
+    ]
+    if arguments.experiment_phase == "test":
+        checks.append(lambda: _load_tested(arguments))
+    else:
+        checks.append(lambda: select_training_set(arguments))
+        checks.append(lambda: make_model(arguments, NullDisplay(), resuming=False))
+    obstacles: dict[str, PlacewiseError] = {}
+    for check in checks:
+        try:
+            check()
+        except PlacewiseError as error:
+            obstacles.setdefault(error.detail, error)
+    return list(obstacles.values())
+
+
+def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:
+    """Return the only obstacle, or an error `several_obstacles` that lists all."""
+    if len(obstacles) == 1:
+        return obstacles[0]
+    lines = [f"- {error.code}: {error.detail}" for error in obstacles]
+    return Misconfigured("several_obstacles", "\n".join(["The run can't start:", *lines]))
+
+
+@contextlib.contextmanager
+def _listing_all_obstacles(arguments: TrainingArguments) -> Iterator[None]:
+    """Replace the first error of the start by one that lists all obstacles."""
+    try:
+        yield
+    except PlacewiseError as error:
+        obstacles = find_obstacles(arguments)
+        if all(each.detail != error.detail for each in obstacles):
+            obstacles.insert(0, error)
+        if len(obstacles) == 1:
+            raise
+        raise combine_obstacles(obstacles) from error
 
 
 def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
@@ -56,15 +108,18 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
         RunStopped: a stop was requested; the message says how to resume. Also raises every error
             of arguments and data.
     """
-    device = check_environment(arguments)
     if arguments.experiment_phase == "test":
-        return _run_test_phase(arguments, device, display, stop)
-    training_set, sets = select_training_set(arguments), select_evaluation_sets(arguments)
-    arguments = resolve_arguments(arguments, training_set, sets)
-    if arguments.show_data_stats:
-        print_data_sets(training_set, sets, display)
-    seed_everything(arguments.seed)
-    model = make_model(arguments, display, resuming=False)
+        return _run_test_phase(arguments, display, stop)
+    with _listing_all_obstacles(arguments):
+        device = check_environment(arguments, display)
+        training_set, sets = select_training_set(arguments), select_evaluation_sets(arguments)
+        arguments = resolve_arguments(arguments, training_set, sets)
+        if arguments.show_data_stats:
+            print_data_sets(training_set, sets, display)
+        for note in list_changed_meanings(arguments):
+            display.info(note)
+        seed_everything(arguments.seed)
+        model = make_model(arguments, display, resuming=False)
     folder = Path() if arguments.fast_dev_run else create_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
     checkpoints = make_checkpoints(arguments, folder, sets, display)
@@ -96,7 +151,7 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
     """
     folder, checkpoint = find_run(path)
     arguments = load_resumed_arguments(folder, changes)
-    device = check_environment(arguments)
+    device = check_environment(arguments, display)
     training_set, history = select_training_set(arguments), TrainingHistory.load(folder)
     if history.training_set["fingerprint"] != training_set.fingerprint:
         raise Conflict(
@@ -127,7 +182,7 @@ def _train(
 ) -> Json:
     arguments, device, folder = prepared.arguments, prepared.device, prepared.folder
     checkpoints = prepared.checkpoints
-    validator = Validator(arguments, device.torch_device, display.progress, stop)
+    validator = Validator(arguments, device, display.progress, stop)
     loop = TrainingLoop(prepared, validator, display, stop)
     try:
         if resume_from is None:
@@ -141,13 +196,16 @@ def _train(
             validator.sanity_check(prepared.model, sets.validation, 1)
             display.info("One batch of training and validation succeeded; no files were written.")
             return {"fast_dev_run": True}
-        loop.fit(make_loggers(arguments.logger, folder, to_plain_dict(arguments)))
+        loop.fit(
+            make_loggers(arguments.logger, folder, to_plain_dict(arguments), loop.completed_steps)
+        )
         prepared.history.save(folder)
-        test_recalls = {}
+        tests: dict[str, RecallEvaluation] = {}
         if arguments.experiment_phase == "all":
             best_path = checkpoints.best_path or checkpoints.last_path
             best = load_checkpoint(best_path).model.to(device.torch_device)
-            test_recalls = validator.measure(best, sets.test, for_tests=True)
+            tests = validator.measure(best, sets.test, for_tests=True)
+            write_predictions(folder, tests)
     except RunStopped:
         if not checkpoints.last_path.is_file():
             raise RunStopped(
@@ -157,30 +215,37 @@ def _train(
             f"Stopped. {checkpoints.last_path} holds the full training state; resume with\n"
             f"  placewise train --resume {shlex.quote(str(folder))}"
         ) from None
-    report = build_summary(arguments, folder, prepared.history, checkpoints, sets, test_recalls)
+    report = build_summary(arguments, folder, prepared.history, checkpoints, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report
 
 
-def _run_test_phase(
-    arguments: TrainingArguments, device: Device, display: Display, stop: StopRequest
-) -> Json:
+def _load_tested(arguments: TrainingArguments) -> Checkpoint:
     if arguments.model_path is None:
         raise InvalidRequest(
             "model_path_missing",
             "--experiment_phase test requires --model_path, the checkpoint to test.",
         )
-    checkpoint = load_checkpoint(arguments.model_path)
-    if "image_size" not in arguments.model_fields_set:
-        arguments = arguments.model_copy(update={"image_size": checkpoint.config.image_size})
-    sets = select_evaluation_sets(arguments)
+    return load_checkpoint(arguments.model_path)
+
+
+def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
+    with _listing_all_obstacles(arguments):
+        device = check_environment(arguments, display)
+        checkpoint = _load_tested(arguments)
+        if "image_size" not in arguments.model_fields_set:
+            arguments = arguments.model_copy(update={"image_size": checkpoint.config.image_size})
+        sets = select_evaluation_sets(arguments)
     if arguments.show_data_stats:
         print_data_sets(None, sets, display)
-    validator = Validator(arguments, device.torch_device, display.progress, stop)
+    for note in list_changed_meanings(arguments):
+        display.info(note)
+    validator = Validator(arguments, device, display.progress, stop)
     model = checkpoint.model.to(device.torch_device)
-    test_recalls = validator.measure(model, sets.test, for_tests=True)
+    tests = validator.measure(model, sets.test, for_tests=True)
     folder = create_run_folder(arguments)
+    write_predictions(folder, tests)
     save_yaml(arguments, folder / CONFIG_FILE)
-    report = build_summary(arguments, folder, None, None, sets, test_recalls)
+    report = build_summary(arguments, folder, None, None, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report

@@ -4,6 +4,8 @@ config.yaml           every argument, resolved
 history.json          metrics of the epochs so far; `--resume` needs it
 metrics.json          summary, written at the end
 checkpoints/          the best checkpoints, and last.ckpt
+predictions_SET.npy   (queries, 20) database indices of each test set, best first
+predictions/epochNN/  the same of each validation, with `save_val_predictions`
 csv/  tensorboard/    output of the loggers
 """
 
@@ -23,14 +25,18 @@ from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 CHECKPOINTS_FOLDER = "checkpoints"
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.json"
+PREDICTIONS_FOLDER = "predictions"
 
-# Arguments that --resume must not change: they determine the training itself.
-IMMUTABLE_ARGUMENTS = (
-    "batch_size", "img_per_place", "min_img_per_place", "shuffle_all",
-    "random_sample_from_each_place", "image_size", "reload_dataloaders_every_n_epochs", "cities",
-    "backbone_arch", "layers_to_freeze", "layers_to_crop", "agg_arch", "agg_config", "optimizer",
-    "loss_name", "miner_name", "seed",
-)  # fmt: skip
+# Arguments that --resume may change: the length of the run, the machine, evaluation and output. All
+# others determine the training itself, and `metrics.json` states them for the whole run.
+RESUMABLE_ARGUMENTS = {
+    "max_epochs", "max_steps",
+    "accelerator", "devices", "precision", "num_workers", "faiss_gpu", "weights", "on_bad_image",
+    "data_root", "eval_roots", "val_set_names", "test_set_names", "test_image_size",
+    "check_val_every_n_epoch", "num_sanity_val_steps", "save_val_predictions", "experiment_phase",
+    "default_root_dir", "run_name", "logger", "log_every_n_steps", "show_data_stats",
+    "fast_dev_run", "save_top_k", "save_weights_only", "filename", "auto_insert_metric_name",
+}  # fmt: skip
 
 
 def create_run_folder(arguments: TrainingArguments) -> Path:
@@ -95,12 +101,14 @@ def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArg
     """Load a run's arguments and apply changes.
 
     Raises:
-        Conflict: `run_differs`, for a change of one of `IMMUTABLE_ARGUMENTS`.
+        Conflict: `run_differs`, for a change of an argument not in `RESUMABLE_ARGUMENTS`.
     """
     stored = load_yaml(folder / CONFIG_FILE)
     before, after = build_arguments(stored), build_arguments(stored, changes)
     differing = [
-        name for name in IMMUTABLE_ARGUMENTS if getattr(before, name) != getattr(after, name)
+        f"{name} ({getattr(before, name)} -> {getattr(after, name)})"
+        for name in TrainingArguments.model_fields
+        if name not in RESUMABLE_ARGUMENTS and getattr(before, name) != getattr(after, name)
     ]
     if differing:
         raise Conflict(

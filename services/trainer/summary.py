@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from services.trainer.run_control import Display
 from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
 from shared.datasets.dataset import TrainingSet
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
-from shared.evaluation.ranking import Recalls
+from shared.evaluation.ranking import RecallEvaluation
+from shared.evaluation.results import predictions_path
 
 Json = dict[str, Any]
 
@@ -47,7 +49,7 @@ def build_summary(
     history: TrainingHistory | None,
     checkpoints: TopKCheckpoints | None,
     sets: EvaluationSets,
-    test_recalls: dict[str, Recalls],
+    tests: Mapping[str, RecallEvaluation],
 ) -> Json:
     """Build the content of `metrics.json`; recalls are from 0 to 1.
 
@@ -60,7 +62,8 @@ def build_summary(
         "sets": {
             each.name: summarise_evaluation_set(each) for each in (*sets.validation, *sets.test)
         },
-        "test": {name: recalls.as_json() for name, recalls in test_recalls.items()},
+        "test": {name: evaluation.recalls.as_json() for name, evaluation in tests.items()},
+        "predictions": {name: str(predictions_path(folder, name)) for name in tests},
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__,
@@ -72,7 +75,7 @@ def build_summary(
         report |= _training_summary(arguments, history, checkpoints)
     else:
         report["best"] = _checkpoint_details(Path(str(arguments.model_path)), None)
-    report["next"] = _next_commands(arguments, report)
+    report["next"] = _next_commands(arguments, sets, report)
     return report
 
 
@@ -116,11 +119,17 @@ def _checkpoint_details(path: Path, score: float | None) -> Json:
     }
 
 
-def _next_commands(arguments: TrainingArguments, report: Json) -> list[str]:
-    """Return commands that evaluate the best checkpoint and register it as a model."""
+def _next_commands(arguments: TrainingArguments, sets: EvaluationSets, report: Json) -> list[str]:
+    """Return commands that show predictions, and evaluate and register the best checkpoint."""
     best = shlex.quote(report["best"]["path"])
     root = shlex.quote(str((arguments.eval_roots or (arguments.data_root,))[0]))
+    show_predictions = [
+        f"placewise evaluate --predictions {shlex.quote(predictions)} "
+        f"--data {shlex.quote(str(sets.roots[name]))} --set {name} --out report"
+        for name, predictions in list(report["predictions"].items())[:1]
+    ]
     return [
+        *show_predictions,
         f"placewise evaluate --data {root} --checkpoint {best}",
         f"placewise models add {best} --name NAME",
     ]

@@ -26,8 +26,8 @@ from services.trainer.losses import make_loss
 from services.trainer.miners import batch_accuracy, make_miner
 from services.trainer.resolve import Device, portable_arguments
 from services.trainer.run_control import Display, StopRequest
-from services.trainer.run_folder import EpochRecord, TrainingHistory
-from services.trainer.validation import Validator, flatten_recalls
+from services.trainer.run_folder import PREDICTIONS_FOLDER, EpochRecord, TrainingHistory
+from services.trainer.validation import Validator, flatten_recalls, write_predictions
 from shared.datasets.dataset import EvaluationSet, TrainingSet
 from shared.descriptors.vpr_models.checkpoint import STATE_DICT_PREFIX, checkpoint_state
 from shared.descriptors.vpr_models.model import VprModel
@@ -127,6 +127,11 @@ class TrainingLoop:
         self._step = 0  # number of completed steps
         self._last_loss = float("nan")
         self._last_saved_step = -1
+
+    @property
+    def completed_steps(self) -> int:
+        """Number of completed steps."""
+        return self._step
 
     def restore(self, checkpoint: Path) -> None:
         """Restore the full training state, and repeat a validation that was interrupted."""
@@ -250,9 +255,11 @@ class TrainingLoop:
     def _validate(self, loggers: Sequence[Logger]) -> None:
         """Validate, and save the checkpoint if it is one of the best."""
         history, checkpoints = self._run.history, self._run.checkpoints
-        metrics = flatten_recalls(
-            self._validator.measure(self._run.model, self._run.validation_sets)
-        )
+        evaluations = self._validator.measure(self._run.model, self._run.validation_sets)
+        if self._arguments.save_val_predictions:
+            folder = self._run.folder / PREDICTIONS_FOLDER / f"epoch{self._epoch:02d}"
+            write_predictions(folder, evaluations)
+        metrics = flatten_recalls(evaluations)
         self._log(loggers, metrics)
         history.epochs.append(EpochRecord(self._epoch, self._step, self._last_loss, metrics))
         is_best = checkpoints.save_if_best(self._save, metrics, self._epoch, self._step)

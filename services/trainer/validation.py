@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import torch
 
 from services.trainer.arguments import TrainingArguments
 from services.trainer.model_describer import ModelDescriber
+from services.trainer.resolve import Device
 from services.trainer.run_control import StopRequest
 from shared.datasets.dataset import EvaluationSet
-from shared.evaluation.ranking import Recalls, evaluate_recall
+from shared.evaluation.ranking import RecallEvaluation, evaluate_recall
+from shared.evaluation.results import predictions_path
 
 BATCH_PHOTOS = 32
 
@@ -27,7 +31,7 @@ class Validator:
     def __init__(
         self,
         arguments: TrainingArguments,
-        device: torch.device,
+        device: Device,
         on_progress: ProgressCallback,
         stop: StopRequest,
     ) -> None:
@@ -38,7 +42,7 @@ class Validator:
 
     def measure(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
-    ) -> dict[str, Recalls]:
+    ) -> dict[str, RecallEvaluation]:
         """Evaluate the network on each set.
 
         Args:
@@ -47,27 +51,26 @@ class Validator:
             for_tests: use `test_image_size` instead of `image_size`.
 
         Returns:
-            Recalls by set name.
+            Rankings and recalls by set name.
 
         Raises:
             RunStopped: a stop was requested; also raises what describing and searching raise.
         """
         size = self._test_size() if for_tests else self._arguments.image_size
         describe = ModelDescriber(
-            model, self._device, size, batch_photos=1 if size is None else BATCH_PHOTOS
+            model, self._device.torch_device, size, batch_photos=1 if size is None else BATCH_PHOTOS
         )
-        recalls = {}
+        evaluations = {}
         for each in sets:
 
             def on_progress(what: str, done: int, total: int, name: str = each.name) -> None:
                 self._stop.check()
                 self._on_progress(f"{name}: {what}", done, total)
 
-            result = evaluate_recall(
-                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=on_progress
+            evaluations[each.name] = evaluate_recall(
+                describe, each, faiss_gpu=self._device.faiss_gpu, on_progress=on_progress
             )
-            recalls[each.name] = result.recalls
-        return recalls
+        return evaluations
 
     def sanity_check(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int
@@ -95,13 +98,20 @@ class Validator:
         return None if size == "native" else size
 
 
-def flatten_recalls(recalls_by_set: dict[str, Recalls]) -> dict[str, float]:
+def write_predictions(folder: Path, evaluations: Mapping[str, RecallEvaluation]) -> None:
+    """Write `predictions_SET.npy` of each set: (queries, k) int64 database indices, best first."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, evaluation in evaluations.items():
+        np.save(predictions_path(folder, name), evaluation.ranked.indices)
+
+
+def flatten_recalls(evaluations: Mapping[str, RecallEvaluation]) -> dict[str, float]:
     """Return recalls as metrics `SET/R1`, `SET/R5` ..., from 0 to 1.
 
     A query without a positive counts as a miss.
     """
     return {
         f"{name}/R{k}": recall
-        for name, recalls in recalls_by_set.items()
-        for k, recall in recalls.recall_all.items()
+        for name, evaluation in evaluations.items()
+        for k, recall in evaluation.recalls.recall_all.items()
     }

@@ -19,9 +19,9 @@ from shared.backup.folder import (
     is_backed_up,
     list_backup_objects,
 )
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import Installation
-from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.errors import Misconfigured, NotFound, Unavailable
 from shared.integrity.referenced_objects import list_referenced_objects
 from shared.storage import ObjectStore

@@ -25,7 +25,7 @@ from sqlalchemy import Table, func, insert, select
 from sqlalchemy.orm import Session
 
 import shared.catalog.tables  # noqa: F401  (registers every table)
-from shared.catalog.base import Base, from_json, to_json
+from shared.catalog.database.base import Base, from_json, to_json
 from shared.catalog.installation import Installation
 from shared.catalog.photos import PresignedUpload
 from shared.catalog.processes import RegisteredProcess, RegisteredSearchWorker

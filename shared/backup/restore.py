@@ -22,11 +22,11 @@ from shared.backup.folder import (
     list_backup_objects,
     load_rows,
 )
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import get_or_create_installation
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job
 from shared.catalog.maps import DEFAULT_MAP, Map
 from shared.catalog.processes import RegisteredSearchWorker
-from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.errors import Conflict, Misconfigured, NotFound
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_job, release_job

@@ -13,9 +13,16 @@ from uuid import UUID
 from sqlalchemy import BigInteger, Integer, String, Text, Uuid, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, count_rows, db_now, db_now_plus
+from shared.catalog.database.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    count_rows,
+    db_now,
+    db_now_plus,
+)
 from shared.catalog.photos import Photo
-from shared.errors import NotFound, Unauthorized
+from shared.errors import NotFound, Unauthorized, invalid_field_error
 from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
@@ -32,6 +39,7 @@ class ApiKey(Base):
     prefix: Mapped[str] = mapped_column(String(20))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     scopes: Mapped[list[str]] = mapped_column(JsonValue)
+    maps: Mapped[list[str] | None] = mapped_column(JsonValue)  # names; None: all maps
     requests_per_minute: Mapped[int | None] = mapped_column(Integer)
     upload_bytes_per_day: Mapped[int | None] = mapped_column(BigInteger)
     max_photos: Mapped[int | None] = mapped_column(BigInteger)
@@ -57,14 +65,33 @@ def create_api_key(
     *,
     life_seconds: float | None = None,
     limits: KeyLimits = KeyLimits(),
+    maps: Collection[str] | None = None,
 ) -> tuple[ApiKey, str]:
-    """Create a key. Returns its row and the key itself, which is not stored and only shown once."""
+    """Create a key.
+
+    Args:
+        session: The session.
+        name: Its owner or purpose.
+        scopes: What it may do.
+        life_seconds: Time until it expires; None: never.
+        limits: Its rate limit and quotas.
+        maps: Names of the only maps that it may use; None: all maps.
+
+    Returns:
+        Its row, and the key itself, which is not stored and only shown once.
+
+    Raises:
+        Unprocessable: `invalid_field` for the scope `admin` with `maps`: admins manage all keys.
+    """
+    if maps is not None and Scope.ADMIN in scopes:
+        raise invalid_field_error("maps", "can't be combined with the scope admin")
     key = generate_api_key()
     row = ApiKey(
         name=name,
         prefix=api_key_prefix(key),
         sha256=hash_api_key(key),
         scopes=sorted(scopes),
+        maps=None if maps is None else sorted(set(maps)),
         expires_at=None if life_seconds is None else db_now_plus(life_seconds),
         requests_per_minute=limits.requests_per_minute,
         upload_bytes_per_day=limits.upload_bytes_per_day,

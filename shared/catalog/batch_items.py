@@ -24,7 +24,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, count_rows, for_update, partial_index
+from shared.catalog.database.base import Base, JsonValue, count_rows, for_update, partial_index
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority, WaitingFor
 from shared.catalog.maps import lock_map

@@ -13,7 +13,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, UtcDateTime, count_rows, db_now, partial_index
+from shared.catalog.database.base import Base, UtcDateTime, count_rows, db_now, partial_index
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id

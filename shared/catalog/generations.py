@@ -14,7 +14,7 @@ from uuid import UUID
 from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, String, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Journaled,
     JsonValue,

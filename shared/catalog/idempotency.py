@@ -22,7 +22,14 @@ from sqlalchemy import Index, Integer, String, Text, UniqueConstraint, Uuid, del
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
+from shared.catalog.database.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    affected_rows,
+    db_now,
+    db_now_plus,
+)
 from shared.errors import Conflict, Unprocessable
 from shared.ids import new_id
 

@@ -15,11 +15,11 @@ from uuid import UUID
 from sqlalchemy import BigInteger, CheckConstraint, Integer, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, get_or_insert
 from shared.catalog.chunks import Chunk
+from shared.catalog.database.base import Base, JsonValue, UtcDateTime, db_now, get_or_insert
+from shared.catalog.database.session import Catalog
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
 from shared.ids import new_id

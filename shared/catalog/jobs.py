@@ -32,12 +32,13 @@ from uuid import UUID
 from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid, and_, or_, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Condition,
     JsonValue,
     UtcDateTime,
     db_now,
+    db_now_plus,
     get_in_map,
     page_newest_first,
     partial_index,
@@ -200,6 +201,12 @@ def claimable_condition(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
         Job.waiting_for.is_(None),
         or_(Job.run_after.is_(None), Job.run_after <= db_now()),
     )
+
+
+def is_job_overdue(session: Session, seconds: float) -> bool:
+    """Return whether a job that an extractor may claim was created more than `seconds` ago."""
+    overdue = select(Job.id).where(claimable_condition(), Job.created_at < db_now_plus(-seconds))
+    return session.scalar(overdue.limit(1)) is not None
 
 
 def select_locked_job_ids(token: UUID) -> Select[UUID]:

@@ -20,7 +20,8 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
+from shared.catalog.database.base import (
     Base,
     Journaled,
     JsonValue,
@@ -32,9 +33,8 @@ from shared.catalog.base import (
     get_or_insert,
     page_newest_first,
 )
-from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
-from shared.catalog.generations import active_generation
-from shared.catalog.jobs import Job
+from shared.catalog.generations import Generation, GenerationState, active_generation
+from shared.catalog.jobs import Job, WaitingFor
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
@@ -83,6 +83,26 @@ def create_map(
 def list_maps(session: Session) -> list[Map]:
     """List the live maps by name."""
     return list(session.scalars(sa.select(Map).where(Map.deleted_at.is_(None)).order_by(Map.name)))
+
+
+def list_extractors_in_use(session: Session) -> set[str]:
+    """Return the names of the extractors of all maps and of their active generations."""
+    of_generations = sa.select(Generation.extractor).join(Map, Map.id == Generation.map_id)
+    return {
+        *session.scalars(sa.select(Map.extractor).where(Map.deleted_at.is_(None))),
+        *session.scalars(
+            of_generations.where(
+                Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None)
+            )
+        ),
+    }
+
+
+def list_maps_without_vocabulary(session: Session) -> list[str]:
+    """Return the names of the maps that have jobs waiting for a vocabulary."""
+    waiting = sa.exists().where(Job.map_id == Map.id, Job.waiting_for == WaitingFor.VOCABULARY)
+    names = sa.select(Map.name).where(Map.deleted_at.is_(None), waiting).order_by(Map.name)
+    return list(session.scalars(names))
 
 
 def mark_map_deleted(session: Session, map_: Map) -> None:

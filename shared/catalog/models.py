@@ -14,7 +14,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Journaled,
     JsonValue,

@@ -14,7 +14,7 @@ from uuid import UUID
 from sqlalchemy import Select, Uuid, func, literal, or_, select, tuple_
 from sqlalchemy.orm import Session, aliased
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Condition,
     UtcDateTime,
     count_rows,

@@ -16,7 +16,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     Condition,
     CoordinateColumn,
@@ -51,6 +51,7 @@ class Photo(Journaled, Base):
     sha256: Mapped[str] = mapped_column(sa.String(64))
     object_key: Mapped[str] = mapped_column(sa.Text)
     filename: Mapped[str] = mapped_column(sa.Text)
+    relative_path: Mapped[str | None] = mapped_column(sa.Text)  # in its folder or archive
     media_type: Mapped[str] = mapped_column(sa.String(50))
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     width: Mapped[int] = mapped_column(sa.Integer)

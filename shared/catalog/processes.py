@@ -1,7 +1,7 @@
 """Registry and heartbeats of running processes and of search workers.
 
-The registry of gateways, extractors and stewards is informational, for `placewise doctor` and
-operators; leases decide which worker owns a job.
+The registry of gateways, extractors and stewards is informational, for `GET /health`, `placewise
+doctor` and operators; leases decide which worker owns a job.
 
 Search workers have a registry of their own with their shard and the versions that they have
 loaded, updated about every second or two. A generation is activated only once every live worker has
@@ -15,21 +15,28 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import Integer, String, Text, Uuid, delete, select, update
+from sqlalchemy import Integer, String, Text, Uuid, and_, delete, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
 from shared.catalog.chunks import Chunk
-from shared.catalog.database_errors import OutageLog
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import (
+    Base,
+    JsonValue,
+    UtcDateTime,
+    affected_rows,
+    db_now,
+    db_now_plus,
+)
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.config.shards import Shard
 from shared.ids import new_id
 
@@ -41,7 +48,7 @@ PROCESS_RETENTION_SECONDS = 86_400.0
 
 
 class RegisteredProcess(Base):
-    """A running process; `role` is the name of its command."""
+    """A running process; `role` is the name of its command, `state` what it reports of itself."""
 
     __tablename__ = "live_processes"
 
@@ -51,6 +58,7 @@ class RegisteredProcess(Base):
     release: Mapped[str] = mapped_column(String(30))
     started_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    state: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +69,21 @@ class ProcessStatus:
     name: str
     release: str
     seconds_since_heartbeat: float
+    state: dict[str, Any]
+
+    @property
+    def is_live(self) -> bool:
+        return self.seconds_since_heartbeat < PROCESS_TIMEOUT_SECONDS
 
 
 @contextlib.contextmanager
-def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
+def process_heartbeat(
+    catalog: Catalog, role: str, read_state: Callable[[], dict[str, Any] | None] = lambda: None
+) -> Iterator[None]:
     """Register this process while the block runs.
 
-    A thread writes a heartbeat every PROCESS_HEARTBEAT_SECONDS; heartbeats are skipped while the
-    catalog is unreachable.
+    A thread writes a heartbeat with the state every PROCESS_HEARTBEAT_SECONDS; heartbeats are
+    skipped while the catalog is unreachable.
     """
     process_id, stop = new_id(), threading.Event()
     name = f"{socket.gethostname()}-{os.getpid()}"
@@ -78,7 +93,7 @@ def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
         while True:
             try:
                 with catalog.write() as session:
-                    _upsert_process(session, process_id, role, name)
+                    _upsert_process(session, process_id, role, name, read_state())
                 outage.record_success()
             except SQLAlchemyError as error:
                 outage.record_error(error)
@@ -99,22 +114,38 @@ def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
             log.info("this process could not be unregistered: %s", error)
 
 
-def _upsert_process(session: Session, process_id: UUID, role: str, name: str) -> None:
+def _upsert_process(
+    session: Session, process_id: UUID, role: str, name: str, state: dict[str, Any] | None
+) -> None:
     updated = session.execute(
         update(RegisteredProcess)
         .where(RegisteredProcess.id == process_id)
-        .values(seen_at=db_now())
+        .values(seen_at=db_now(), state=state)
         .returning(RegisteredProcess.id)
     )
     if updated.first() is None:
+        # Dead processes of the same role are replaced by this one.
         session.execute(
             delete(RegisteredProcess).where(
-                RegisteredProcess.seen_at < db_now_plus(-PROCESS_RETENTION_SECONDS)
+                or_(
+                    RegisteredProcess.seen_at < db_now_plus(-PROCESS_RETENTION_SECONDS),
+                    and_(
+                        RegisteredProcess.role == role,
+                        RegisteredProcess.seen_at < db_now_plus(-PROCESS_TIMEOUT_SECONDS),
+                    ),
+                )
             )
         )
         session.add(
-            RegisteredProcess(id=process_id, role=role, name=name, release=version("placewise"))
+            RegisteredProcess(
+                id=process_id, role=role, name=name, release=version("placewise"), state=state
+            )
         )
+
+
+def delete_processes(session: Session, role: str) -> None:
+    """Unregister all processes of a role, where none can be running."""
+    session.execute(delete(RegisteredProcess).where(RegisteredProcess.role == role))
 
 
 def list_processes(session: Session) -> list[ProcessStatus]:
@@ -127,7 +158,11 @@ def list_processes(session: Session) -> list[ProcessStatus]:
     )
     return [
         ProcessStatus(
-            process.role, process.name, process.release, (now - process.seen_at).total_seconds()
+            process.role,
+            process.name,
+            process.release,
+            (now - process.seen_at).total_seconds(),
+            process.state or {},
         )
         for process, now in rows
     ]

@@ -24,8 +24,8 @@ from shared.catalog import (  # noqa: F401
     vocabularies,
     webhooks,
 )
-from shared.catalog.base import Base
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.database.base import Base
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
 
 

@@ -10,7 +10,7 @@ from uuid import UUID
 from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
+from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
 from shared.catalog.generations import Generation, active_generation
 from shared.errors import Conflict
 from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES
@@ -43,8 +43,13 @@ class Vocabulary(Journaled, Base):
 
     @property
     def standing(self) -> str:
-        """`own` if fitted on this map's photos, else `foreign`; part of API responses."""
-        return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
+        """`own` if fitted on this map's photos, else `foreign`; part of API responses.
+
+        `provisional` if the map had fewer than MIN_PHOTOS_TO_FIT photos when it was fitted.
+        """
+        if self.origin != VocabularyOrigin.FITTED:
+            return "foreign"
+        return "provisional" if self.provenance.get("provisional") else "own"
 
 
 def vocabulary_standing(session: Session, generation: Generation) -> str:

@@ -18,7 +18,7 @@ from uuid import UUID
 from sqlalchemy import Index, Integer, String, Text, Uuid, delete, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import (
+from shared.catalog.database.base import (
     Base,
     JsonValue,
     UtcDateTime,

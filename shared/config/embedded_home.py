@@ -45,7 +45,7 @@ def find_running_server(home: Path) -> RunningServer | None:
     return None
 
 
-def running_server_url(home: Path) -> str | None:
+def _running_server_url(home: Path) -> str | None:
     """Return the URL of the server that serves the folder now, or None."""
     running = find_running_server(home)
     return running.url if running else None
@@ -63,7 +63,7 @@ def lock_home(home: Path) -> Iterator[None]:
         lock = FileLock(_lock_file(home), timeout=0, mode=FILE_MODE)
         lock.acquire()
     except Timeout:
-        user = running_server_url(home) or "another process"
+        user = _running_server_url(home) or "another process"
         raise Misconfigured(
             "home_in_use",
             f"The folder {home} is already in use by {user}. Use that server, stop it, or set "

@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
+from shared.config.sizes import Size
 from shared.errors import Misconfigured
 from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
 from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
@@ -61,7 +62,7 @@ class ExtractorSettings(BaseSettings):
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's, downloaded "
         "from the Hugging Face hub",
     )
-    model_cache_bytes: int = Field(
+    model_cache_bytes: Size = Field(
         10_000_000_000,
         ge=0,
         description="size of an extractor's cache of models fetched from a bucket, under "
@@ -69,7 +70,7 @@ class ExtractorSettings(BaseSettings):
     )
     batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
     decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
-    decode_memory_bytes: int = Field(
+    decode_memory_bytes: Size = Field(
         2_000_000_000, ge=500_000_000, description="memory limit of one decoding process, bytes"
     )
     decode_timeout_seconds: float = Field(
@@ -78,7 +79,7 @@ class ExtractorSettings(BaseSettings):
     batch_ahead_photos: int = Field(
         500, ge=1, description="queued photos at which batch uploads wait for the extractors"
     )
-    descriptor_cache_bytes: int = Field(
+    descriptor_cache_bytes: Size = Field(
         20_000_000_000,
         ge=0,
         description="size of the descriptor cache of `evaluate` and `compare`, in "
@@ -133,7 +134,7 @@ class ExtractorSettings(BaseSettings):
             config = get_extractor_config(
                 self.extractor, allow_test_extractors=self.allow_test_extractors
             )
-            check_extractor_is_shared(config)
+            _check_extractor_is_shared(config)
         except Misconfigured as error:
             raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
         selected = self.new_map_extractor
@@ -168,7 +169,7 @@ class ExtractorSettings(BaseSettings):
                 one machine.
         """
         config = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
-        check_extractor_is_shared(config)
+        _check_extractor_is_shared(config)
         if config.hub is not None and config.name not in self.allowed_hub_extractors:
             raise Misconfigured(
                 "torchhub_not_allowed",
@@ -188,7 +189,7 @@ class ExtractorSettings(BaseSettings):
         return tuple(dict.fromkeys(allowed))
 
 
-def check_extractor_is_shared(config: ExtractorConfig) -> None:
+def _check_extractor_is_shared(config: ExtractorConfig) -> None:
     """Raise Misconfigured (`model_not_added`) for a checkpoint that is a file of one machine."""
     if config.trained is not None and config.trained.file is not None:
         raise Misconfigured(

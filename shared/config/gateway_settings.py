@@ -10,6 +10,8 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from shared.config.lists import split_list
+from shared.config.sizes import Size
+from shared.security.api_keys import Scope
 
 MIN_ADMIN_KEY_CHARACTERS = 16
 
@@ -52,6 +54,23 @@ class GatewaySettings(BaseSettings):
         "10.0.0.5, 192.168.0.0/16. Their `X-Forwarded-For` is trusted, and their connections are "
         "not limited per address; unset: none",
     )
+    sign_in_proxies: str | None = Field(
+        None,
+        description="addresses or networks of proxies that sign users in, separated by commas. "
+        "Their headers name the user of a request without a key; unset: none",
+    )
+    sign_in_user_header: str = Field(
+        "X-Forwarded-User", description="header of SIGN_IN_PROXIES with the user's name"
+    )
+    sign_in_groups_header: str = Field(
+        "X-Forwarded-Groups",
+        description="header of SIGN_IN_PROXIES with the user's groups, separated by commas",
+    )
+    sign_in_scopes: str = Field(
+        "",
+        description="scopes of the groups of signed-in users, separated by commas; `*` is every "
+        "user: *:read, editors:write, vpr-admins:admin",
+    )
     request_head_seconds: float = Field(
         20.0, gt=0, description="timeout for receiving the head of a request"
     )
@@ -72,7 +91,7 @@ class GatewaySettings(BaseSettings):
     key_requests_per_minute: int | None = Field(
         None, ge=1, description="rate limit of one key, requests per minute; unset: no limit"
     )
-    key_upload_bytes_per_day: int | None = Field(
+    key_upload_bytes_per_day: Size | None = Field(
         None,
         ge=1,
         description="bytes of request bodies that one key may send in 24 hours, whether or not "
@@ -99,11 +118,11 @@ class GatewaySettings(BaseSettings):
     )
 
     # Upload limits.
-    max_file_size: int = Field(10_485_760, gt=0, description="maximum bytes of one photo")
+    max_file_size: Size = Field(100_000_000, gt=0, description="maximum bytes of one photo")
     max_image_pixels: int = Field(
-        50_000_000, gt=0, description="maximum width x height of one photo"
+        200_000_000, gt=0, description="maximum width x height of one photo"
     )
-    max_archive_size: int = Field(
+    max_archive_size: Size = Field(
         10_737_418_240,
         gt=0,
         description="maximum bytes of one batch: of its archive, packed and unpacked, or of all "
@@ -118,10 +137,10 @@ class GatewaySettings(BaseSettings):
         "imports/",
         description="key prefix of the objects that a batch may import from the object store",
     )
-    max_vocabulary_bytes: int = Field(
+    max_vocabulary_bytes: Size = Field(
         64_000_000, gt=0, description="maximum bytes of an imported vocabulary"
     )
-    max_model_bytes: int = Field(
+    max_model_bytes: Size = Field(
         2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
     )
     presign_seconds: int = Field(
@@ -152,7 +171,7 @@ class GatewaySettings(BaseSettings):
     max_concurrent_uploads_per_caller: int = Field(
         16, ge=1, description="concurrent uploads of one key, and of one address"
     )
-    min_free_bytes: int = Field(
+    min_free_bytes: Size = Field(
         500_000_000,
         ge=0,
         description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads are "
@@ -194,7 +213,7 @@ class GatewaySettings(BaseSettings):
                 )
         return value
 
-    @field_validator("trusted_proxies")
+    @field_validator("trusted_proxies", "sign_in_proxies")
     @classmethod
     def _check_networks(cls, value: str | None) -> str | None:
         for address in split_list(value):
@@ -204,6 +223,24 @@ class GatewaySettings(BaseSettings):
                 raise ValueError(
                     f"{error}; expected an address or network such as 10.0.0.5 or 10.0.0.0/8"
                 ) from None
+        return value
+
+    @field_validator("sign_in_user_header", "sign_in_groups_header")
+    @classmethod
+    def _check_header_name(cls, value: str) -> str:
+        if not re.fullmatch(r"[A-Za-z0-9-]+", value):
+            raise ValueError("expected the name of a header, such as X-Forwarded-User")
+        return value
+
+    @field_validator("sign_in_scopes")
+    @classmethod
+    def _check_group_scopes(cls, value: str) -> str:
+        for entry in split_list(value):
+            group, separator, scope = entry.rpartition(":")
+            if not (separator and group and scope in set(Scope)):
+                raise ValueError(
+                    f"{entry!r} is not GROUP:SCOPE with one of the scopes {', '.join(Scope)}"
+                )
         return value
 
     @field_validator("map_tiles")
@@ -233,6 +270,20 @@ class GatewaySettings(BaseSettings):
     def allowed_origins(self) -> tuple[str, ...]:
         """Origins other than the server's own whose pages may call the API."""
         return tuple(dict.fromkeys(split_list(self.cors_origins)))
+
+    @property
+    def sign_in_networks(self) -> list[str]:
+        """Addresses and networks of the proxies that sign users in."""
+        return split_list(self.sign_in_proxies)
+
+    @property
+    def sign_in_scopes_by_group(self) -> dict[str, frozenset[Scope]]:
+        """The scopes of each group of signed-in users; those of `*` belong to all of them."""
+        scopes: dict[str, frozenset[Scope]] = {}
+        for entry in split_list(self.sign_in_scopes):
+            group, _, scope = entry.rpartition(":")
+            scopes[group] = scopes.get(group, frozenset()) | {Scope(scope)}
+        return scopes
 
     @property
     def proxy_addresses(self) -> list[str]:

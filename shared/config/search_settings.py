@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings
 
 from shared.config.lists import split_list
 from shared.config.shards import Shard
+from shared.config.sizes import Size
 
 
 class SearchSettings(BaseSettings):
@@ -44,7 +45,7 @@ class SearchSettings(BaseSettings):
     search_wait_seconds: float = Field(
         5.0, gt=0, description="maximum wait for `min_version`, seconds"
     )
-    search_memory_budget: int | None = Field(
+    search_memory_budget: Size | None = Field(
         None,
         ge=0,
         description="bytes of codes and rows that search keeps in memory; unset: half of the "

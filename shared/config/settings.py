@@ -1,25 +1,23 @@
 """`Settings`: the configuration of every service, read from the environment and `.env`.
 
-The fields are declared in groups, one base class a group, in the modules beside this one. Each
-field is an environment variable of the same name in capitals. Names of durations end in
+The fields are declared in groups, one base class a group, here and in the modules beside this one.
+Each field is an environment variable of the same name in capitals. Names of durations end in
 `_seconds`, names of sizes in `_bytes`, except where AnyLoc's name is kept (`MAX_FILE_SIZE`, in
-bytes).
+bytes). Sizes may have a unit: `100MB`.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
-from pydantic import model_validator
-from pydantic_settings import SettingsConfigDict
+from pydantic import Field, SecretStr, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from shared.config.extractor_settings import ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
-from shared.config.job_settings import JobSettings
 from shared.config.search_settings import SearchSettings
-from shared.config.service_settings import ServiceSettings
 from shared.config.shards import Shard
 from shared.config.storage_settings import StorageSettings
 
@@ -34,6 +32,81 @@ def memory_limit_bytes() -> int:
     except OSError:
         return machine
     return min(machine, int(limit)) if limit.isdigit() else machine  # "max" means no limit
+
+
+class ServiceSettings(BaseSettings):
+    """Listening address, message broker and observability."""
+
+    host: str = Field("127.0.0.1", description="listening address")
+    port: int = Field(8000, ge=0, le=65535, description="listening port; 0 picks a free port")
+    debug: bool = Field(
+        False,
+        description="log every request and every rejected request; responses stay the same",
+    )
+    log_format: Literal["text", "json"] = Field(
+        "text", description="log format; json writes one JSON object per line"
+    )
+    metrics_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="port on HOST where a service answers GET /metrics for Prometheus, without a "
+        "key; unset: no such port (the gateway and search also serve /metrics beside their API)",
+    )
+    otel_exporter_otlp_endpoint: str | None = Field(
+        None,
+        description="OTLP/HTTP endpoint for traces: http://collector:4318; needs the extra otel; "
+        "unset: tracing is off",
+    )
+    redis_url: SecretStr | None = Field(
+        None,
+        description="URL of the Redis that carries job notifications between services; unset: all "
+        "services run in one process",
+    )
+    heartbeat_file: Path | None = Field(
+        None,
+        description="heartbeat file for health checks, touched regularly by a separate extractor "
+        "or steward process; unset: none",
+    )
+
+
+class JobSettings(BaseSettings):
+    """Leases and retries of jobs, retention of finished ones, automatic evaluation."""
+
+    lease_seconds: float = Field(
+        60.0,
+        gt=0,
+        description="time without a renewal after which a job's lease expires, seconds",
+    )
+    drain_seconds: float = Field(
+        10.0, gt=0, description="time that a worker spends on jobs for one notification, seconds"
+    )
+    visibility_seconds: int = Field(
+        900,
+        ge=60,
+        description="Redis visibility timeout: an unacknowledged notification is delivered again "
+        "after this time, seconds",
+    )
+    max_attempts: int = Field(
+        3, ge=1, description="crashes of a job that runs alone before it is failed"
+    )
+    query_ttl_seconds: float = Field(
+        3600.0, gt=0, description="retention of a query photo that is not stored, seconds"
+    )
+    job_retention_days: float = Field(
+        30.0,
+        gt=0,
+        description="retention of a finished job, days; photos that were not described keep theirs",
+    )
+    search_history_days: float = Field(
+        90.0, gt=0, description="retention of a search in the history, days"
+    )
+    auto_evaluate_photos: int = Field(
+        20,
+        ge=0,
+        description="geotagged photos from which a changed map is evaluated automatically; "
+        "0: never",
+    )
 
 
 # The fields of the last base come first: pydantic collects them against the order of resolution.

@@ -9,6 +9,14 @@ from typing import Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
+# How the URL of a database may begin -> dialect and driver of SQLAlchemy.
+DATABASE_SCHEMES = {
+    "postgres": "postgresql+psycopg",
+    "postgresql": "postgresql+psycopg",
+    "postgresql+psycopg": "postgresql+psycopg",
+    "sqlite": "sqlite",
+}
+
 
 class StorageSettings(BaseSettings):
     """Where the catalog and the objects are, and how they are maintained."""
@@ -21,7 +29,8 @@ class StorageSettings(BaseSettings):
     )
     database_url: SecretStr | None = Field(
         None,
-        description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
+        description="URL of the catalog: postgresql://USER:PASSWORD@HOST:PORT/DATABASE; unset: "
+        "SQLite under PLACEWISE_HOME",
     )
 
     # Connections to PostgreSQL; the embedded SQLite ignores these settings.
@@ -108,6 +117,20 @@ class StorageSettings(BaseSettings):
     @classmethod
     def _resolve_path(cls, value: Path | None) -> Path | None:
         return value and value.expanduser().resolve()
+
+    @field_validator("database_url")
+    @classmethod
+    def _check_database_url(cls, value: SecretStr | None) -> SecretStr | None:
+        if value is None:
+            return None
+        scheme, separator, rest = value.get_secret_value().partition("://")
+        if separator and scheme in DATABASE_SCHEMES:
+            return SecretStr(f"{DATABASE_SCHEMES[scheme]}://{rest}")
+        # Without a separator, all of the value may be a password.
+        named = f"the scheme {scheme!r} is not known" if separator else "it has no scheme"
+        raise ValueError(
+            f"{named}; expected postgresql://USER:PASSWORD@HOST:PORT/DATABASE or sqlite:///FILE"
+        )
 
     @field_validator("s3_endpoint")
     @classmethod

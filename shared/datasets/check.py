@@ -2,7 +2,7 @@
 
 `inspect_dataset` opens every set in a folder and collects problems, for `placewise datasets check`.
 
-`find_undecodable` decodes every photo completely, on all cores.
+`_find_undecodable` decodes every photo completely, on all cores.
 
 `find_suspect_labels` lists confident first matches that the ground truth counts as wrong although
 they are close: a match 30 m away, or at the right position with another heading, often shows the
@@ -44,7 +44,7 @@ MAX_DECODED_PIXELS = 100_000_000
 PHOTOS_PER_TASK = 1024
 
 
-def find_undecodable(
+def _find_undecodable(
     paths: Sequence[Path], on_progress: Callable[[int], None] = lambda count: None
 ) -> list[tuple[Path, str]]:
     """Return the photos that can't be decoded, with the reason.
@@ -162,7 +162,7 @@ def find_undecodable_photos(
     photos = report.photos()
     existing = [path for path in photos if path.is_file()]
     on_progress(len(photos) - len(existing))  # missing photos are reported already
-    broken = [f"{path}: {reason}" for path, reason in find_undecodable(existing, on_progress)]
+    broken = [f"{path}: {reason}" for path, reason in _find_undecodable(existing, on_progress)]
     return [_problem("undecodable_photo", broken, "photos can't be decoded")] if broken else []
 
 

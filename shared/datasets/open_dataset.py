@@ -35,7 +35,11 @@ __all__ = [
 ]
 
 PART_FOLDERS = frozenset(
-    {"database", "queries", "train", "val", "test", "train_val", "images", RIDES, *SEASONS}
+    {
+        *("database", "queries", "queries_v1", "queries_v2"),
+        *("train", "val", "test", "train_val", "images"),
+        *(RIDES, *SEASONS),
+    }
 )
 """Subfolders of datasets that are never datasets of their own"""
 LAYOUTS_HELP = "See docs/how-to/data-sets.md for all layouts."

@@ -78,7 +78,7 @@ class FileNameLocation:
     note: str
     """free text; gsv_xs stores the place and the city here"""
     captured_at: datetime | None = None
-    """UTC; only of full dates"""
+    """UTC; None unless the timestamp is a full date"""
 
 
 def parse_utm_file_name(name: str) -> FileNameLocation | None:

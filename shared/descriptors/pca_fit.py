@@ -160,7 +160,7 @@ MIN_VARIANCE = 1e-9
 Matrix = NDArray[np.float64]
 
 
-class PcaFitStage(StrEnum):
+class _PcaFitStage(StrEnum):
     """The stages of a fit, in their order."""
 
     PRODUCTS = "products"  # Gram matrix
@@ -192,7 +192,7 @@ class PcaFit:
         self._rows = rows
         self._kept = kept
         self._blocks = block_count(rows)
-        self.stage = PcaFitStage.PRODUCTS
+        self.stage = _PcaFitStage.PRODUCTS
         self._block = 0
         """Blocks of columns done in the current stage."""
         # The smaller one of XX' (rows) and X'X (columns).
@@ -206,15 +206,15 @@ class PcaFit:
 
     @property
     def done(self) -> bool:
-        return self.stage == PcaFitStage.DONE
+        return self.stage == _PcaFitStage.DONE
 
     @property
     def progress(self) -> tuple[int, int]:
         """Steps done, and the total."""
         steps_before = {
-            PcaFitStage.PRODUCTS: 0,
-            PcaFitStage.VARIANCES: 0,
-            PcaFitStage.DIRECTIONS: self._blocks + 1,
+            _PcaFitStage.PRODUCTS: 0,
+            _PcaFitStage.VARIANCES: 0,
+            _PcaFitStage.DIRECTIONS: self._blocks + 1,
         }
         total = 2 * self._blocks + 1
         return (total if self.done else steps_before[self.stage] + self._block), total
@@ -224,7 +224,7 @@ class PcaFit:
         """Number of blocks of the result returned so far."""
         if self.done:
             return self._blocks
-        return self._block if self.stage == PcaFitStage.DIRECTIONS else 0
+        return self._block if self.stage == _PcaFitStage.DIRECTIONS else 0
 
     def step(self) -> PcaBlock | None:
         """Process one block of columns, or compute the variances.
@@ -235,22 +235,22 @@ class PcaFit:
         Raises:
             Unprocessable: `pca_too_many_dimensions` if the rows vary in too few directions.
         """
-        if self.stage == PcaFitStage.VARIANCES:
+        if self.stage == _PcaFitStage.VARIANCES:
             self._find_variances()
             return None
         block, mean = _centred(self._rows.read(self._block))
         part = None
-        if self.stage == PcaFitStage.PRODUCTS:
+        if self.stage == _PcaFitStage.PRODUCTS:
             self._products += block.T @ block if self._by_columns else block @ block.T
         else:
             directions = self._basis.T if self._by_columns else self._basis.T @ block
             part = PcaBlock(mean.astype(np.float32), directions.astype(np.float32))
         self._block += 1
         if self._block == self._blocks:
-            if self.stage == PcaFitStage.DIRECTIONS:
-                self.stage = PcaFitStage.DONE
+            if self.stage == _PcaFitStage.DIRECTIONS:
+                self.stage = _PcaFitStage.DONE
             else:
-                self.stage = PcaFitStage.VARIANCES
+                self.stage = _PcaFitStage.VARIANCES
         return part
 
     def whitening(self, parts: Sequence[PcaBlock]) -> PcaWhitening:
@@ -274,7 +274,7 @@ class PcaFit:
         scale = 1 / np.sqrt(self._variances) if self._by_columns else np.sqrt(freedom) / squares
         self._basis = vectors * scale
         self._products = np.empty((0, 0))
-        self.stage, self._block = PcaFitStage.DIRECTIONS, 0
+        self.stage, self._block = _PcaFitStage.DIRECTIONS, 0
 
     # --- checkpointing -------------------------------------------------------------------------
 
@@ -295,7 +295,7 @@ class PcaFit:
     def resume(self, data: bytes) -> None:
         """Restore a state saved by a fit of the same rows."""
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
-            self.stage = PcaFitStage(str(saved["stage"]))
+            self.stage = _PcaFitStage(str(saved["stage"]))
             self._block = int(saved["block"])
             self._products, self._basis = saved["products"], saved["basis"]
             self._variances, self._total = saved["variances"], float(saved["total"])

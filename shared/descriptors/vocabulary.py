@@ -89,7 +89,7 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
 
 def encode_centres(centres: ClusterCentres) -> bytes:
     """Encode the centres as a `.npy` file."""
-    return encode_array(centres.array)
+    return _encode_array(centres.array)
 
 
 def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
@@ -107,7 +107,7 @@ def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
     return parse_centres(array, width=width)
 
 
-def encode_array(array: NDArray[Any]) -> bytes:
+def _encode_array(array: NDArray[Any]) -> bytes:
     """Encode the array as a `.npy` file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)

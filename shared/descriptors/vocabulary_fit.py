@@ -101,7 +101,7 @@ class FitEffort:
 DEFAULT_EFFORT = FitEffort()
 
 
-class VocabularyFitStage(StrEnum):
+class _VocabularyFitStage(StrEnum):
     """The stages of a fit, in their order."""
 
     SEED = "seed"
@@ -146,7 +146,7 @@ class VocabularyFit:
         self._seed = seed
         self._effort = effort
         self._batches = PointBatches(points, max(BATCH_PATCHES, BATCH_PER_CLUSTER * self.clusters))
-        self.stage = VocabularyFitStage.SEED
+        self.stage = _VocabularyFitStage.SEED
         self.passes = 0
         """Completed passes."""
         self.similarity: float | None = None
@@ -166,7 +166,7 @@ class VocabularyFit:
 
     @property
     def done(self) -> bool:
-        return self.stage == VocabularyFitStage.DONE
+        return self.stage == _VocabularyFitStage.DONE
 
     @property
     def progress(self) -> tuple[int, int]:
@@ -174,7 +174,7 @@ class VocabularyFit:
         batches = len(self._batches)
         passes = self._effort.mini_batch_passes + self._effort.settling_passes
         total = self.clusters + passes * batches
-        if self.stage == VocabularyFitStage.SEED:
+        if self.stage == _VocabularyFitStage.SEED:
             return (len(self._seeding.chosen) if self._seeding else 0), total
         if self.done:
             return total, total
@@ -182,7 +182,7 @@ class VocabularyFit:
 
     def step(self) -> None:
         """Choose one seed, or process one batch of points; takes milliseconds."""
-        if self.stage == VocabularyFitStage.SEED:
+        if self.stage == _VocabularyFitStage.SEED:
             self._choose_seed()
         else:
             self._update_centres()
@@ -216,7 +216,7 @@ class VocabularyFit:
     def _update_centres(self) -> None:
         points = self._batches.read(self._order[self._batch])
         self._pass.accumulate(points, self._centres)
-        if self.stage == VocabularyFitStage.MINI_BATCH:
+        if self.stage == _VocabularyFitStage.MINI_BATCH:
             self._centres = self._pass.means(self._centres)
         self._batch += 1
         if self._batch == len(self._batches):
@@ -226,27 +226,27 @@ class VocabularyFit:
         moved = self._pass.end(self._centres)
         movement = float(((moved - self._centres) ** 2).sum())
         self.similarity = self._pass.similarity / len(self._points)
-        settled = self.stage == VocabularyFitStage.SETTLE and movement <= TOLERANCE
+        settled = self.stage == _VocabularyFitStage.SETTLE and movement <= TOLERANCE
         self._centres = moved
         self.passes += 1
         self._begin_pass()
         if settled:
-            self.stage = VocabularyFitStage.DONE
+            self.stage = _VocabularyFitStage.DONE
 
     def _begin_pass(self) -> None:
         self._batch = 0
         self._pass = KMeansPass.begin(self._centres)
         mini_batch = self._effort.mini_batch_passes
         if self.passes < mini_batch:
-            self.stage = VocabularyFitStage.MINI_BATCH
+            self.stage = _VocabularyFitStage.MINI_BATCH
         elif self.passes < mini_batch + self._effort.settling_passes:
-            self.stage = VocabularyFitStage.SETTLE
+            self.stage = _VocabularyFitStage.SETTLE
         else:
-            self.stage = VocabularyFitStage.DONE
+            self.stage = _VocabularyFitStage.DONE
         self._set_order()
 
     def _set_order(self) -> None:
-        if self.stage == VocabularyFitStage.MINI_BATCH:
+        if self.stage == _VocabularyFitStage.MINI_BATCH:
             self._order = self._batches.shuffled([self._seed, self.passes])
         else:
             self._order = list(range(len(self._batches)))
@@ -280,7 +280,7 @@ class VocabularyFit:
             self.passes, self._batch = map(int, saved["numbers"])
             similarity = float(saved["similarity"])
             self.similarity = None if np.isnan(similarity) else similarity
-            self.stage = VocabularyFitStage(str(saved["stage"]))
+            self.stage = _VocabularyFitStage(str(saved["stage"]))
             self._centres = torch.from_numpy(saved["centres"])
             self._pass = KMeansPass(
                 counts=torch.from_numpy(saved["counts"]),

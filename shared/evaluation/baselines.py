@@ -30,7 +30,7 @@ def average_colour(photo: Image.Image) -> Rows:
     return _unit(np.append(mean - 0.5, 1.0).astype(np.float32))
 
 
-def colour_histogram(photo: Image.Image) -> Rows:
+def _colour_histogram(photo: Image.Image) -> Rows:
     """Return the square roots of the joint colour histogram, (COLOUR_BINS ** 3,) float32.
 
     The cosine of two such vectors is the Bhattacharyya coefficient.
@@ -52,7 +52,7 @@ def thumbnail(photo: Image.Image) -> Rows:
 
 BASELINE_DESCRIPTORS: dict[str, Callable[[Image.Image], Rows]] = {
     "average colour": average_colour,
-    "colour histogram": colour_histogram,
+    "colour histogram": _colour_histogram,
     "thumbnail 16x16": thumbnail,
 }
 

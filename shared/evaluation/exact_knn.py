@@ -93,13 +93,18 @@ def _search_cpu(queries: Rows, block: Rows, k: int) -> tuple[Scores, Indices]:
     return scores, indices
 
 
+def has_faiss_gpu() -> bool:
+    """Return whether faiss was built for GPUs and finds one."""
+    return hasattr(faiss, "StandardGpuResources") and faiss.get_num_gpus() > 0
+
+
 def _make_gpu_search() -> Callable[[Rows, Rows, int], tuple[Scores, Indices]]:
-    if not hasattr(faiss, "StandardGpuResources") or faiss.get_num_gpus() == 0:
+    if not has_faiss_gpu():
         raise Misconfigured(
             "faiss_gpu_missing",
             "faiss cannot use a GPU: either the package faiss-cpu is installed, or there is no "
-            "GPU. Search on the CPU (training: --faiss_gpu False; otherwise omit --faiss-gpu), or "
-            "install faiss with GPU support.",
+            "GPU. Omit --faiss-gpu: the search on the CPU is as exact. Or install faiss with GPU "
+            "support.",
         )
     resources = faiss.StandardGpuResources()
 

@@ -5,7 +5,7 @@ Two photos show the same place if they are close to each other or have the same 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +70,8 @@ class RankedPhoto:
 
     score: float
     location: PhotoLocation
+    photo: Hashable = None
+    """identifies the photo in other rankings of the same map; None if it is not known"""
 
 
 @dataclass(frozen=True, slots=True)

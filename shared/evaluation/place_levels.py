@@ -9,7 +9,8 @@ The features compare scores in units of the `spread` of a map's rankings, the me
 between the first score and the last of `EVIDENCE_DEPTH`, so that extractors are comparable. Some of
 them compare the query with the *neighbours* of the best photo, the photos of the map that are most
 similar to it: a query that is less similar to it than many of its neighbours are was probably taken
-elsewhere (local density, as in the local outlier factor of Breunig et al. 2000).
+elsewhere (local density, as in the local outlier factor of Breunig et al. 2000), and so was one
+that finds other photos than it does (shared neighbours, Jarvis and Patrick 1973).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from shared.evaluation.place_evidence import (
 from shared.place_paths import is_within_level, label_levels
 
 VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
+SHARED_DEPTHS = (5, 10, 20)  # first ranks whose photos are compared with the best photo's
 WIDE_TEMPERATURE = 0.3
 MIN_SHARE = 1e-3  # of the votes; bounds the log-odds of a level that has all votes or none
 MIN_SPREAD = 1e-6
@@ -122,6 +124,7 @@ def candidate_levels(
             for radius in sorted(scheme.radii_m)
         ]
     scores, neighbour_scores = _scores(ranking), _scores(neighbours)
+    shared = shared_neighbours(ranking, neighbours)
     return [
         replace(
             level,
@@ -130,11 +133,30 @@ def candidate_levels(
                 photos_inside(level, ranking),
                 neighbour_scores,
                 photos_inside(level, neighbours),
+                shared,
                 spread,
             ),
         )
         for level in levels
     ]
+
+
+def shared_neighbours(
+    ranking: Sequence[RankedPhoto], neighbours: Sequence[RankedPhoto]
+) -> list[float]:
+    """Return the share of the first photos that the best photo finds first, too.
+
+    Args:
+        ranking: The first photos of the map, best first.
+        neighbours: The ranking of the best photo itself, without it.
+
+    Returns:
+        For each of SHARED_DEPTHS k, the number of photos that are among the first k of `ranking`
+        and among the best photo and its first k - 1 neighbours, divided by k.
+    """
+    first = [r.photo for r in ranking]
+    best = [*first[:1], *(n.photo for n in neighbours)]
+    return [len({*first[:k]} & {*best[:k]} - {None}) / k for k in SHARED_DEPTHS]
 
 
 def _vote_for_places(
@@ -175,6 +197,7 @@ FEATURES = (
     "votes",
     "wide_votes",
     "margin",
+    "second_margin",
     "agreement_3",
     "agreement_10",
     "agreement",
@@ -185,6 +208,10 @@ FEATURES = (
     "ahead_of_neighbours_inside",
     "nearer_neighbours",
     "ahead_of_neighbours",
+    "neighbours_agreement_3",
+    "neighbours_agreement_10",
+    "neighbours_agreement",
+    *(f"shared_neighbours_{depth}" for depth in SHARED_DEPTHS),
 )
 """Names of a level's features, in the order of `level_features`."""
 
@@ -194,6 +221,7 @@ def level_features(
     inside: Mask,
     neighbour_scores: FloatArray,
     neighbours_inside: Mask,
+    shared: Sequence[float],
     spread: float,
 ) -> FloatArray:
     """Compute the features of a level.
@@ -203,16 +231,18 @@ def level_features(
         inside: (k,) which of its photos lie in the level.
         neighbour_scores: (n,) scores of the best photo's own ranking.
         neighbours_inside: (n,) which of these photos lie in the level.
+        shared: `shared_neighbours` of both rankings.
         spread: Unit of score differences.
 
     Returns:
-        (len(FEATURES),) float64: log-odds of the votes inside, at two temperatures; margin of the
-        best score inside over the best outside; share of the first 3, the first 10 and all photos
-        that lie inside; log of the summed margins of the first ten inside; log of the number of
-        leading photos inside; first score minus last. Then the first score minus the best of a
-        neighbour outside, and inside; log of the number of neighbours that are more similar to the
-        best photo than the query is; and the first score minus the mean of the first ten
-        neighbours. The last four are 0 without neighbours.
+        (len(FEATURES),) float64: log-odds of the votes inside, at two temperatures; margins of the
+        best and the second score inside over the best outside; share of the first 3, the first 10
+        and all photos that lie inside; log of the summed margins of the first ten inside; log of
+        the number of leading photos inside; first score minus last. Then the first score minus the
+        best of a neighbour outside, and inside; log of the number of neighbours that are more
+        similar to the best photo than the query is; the first score minus the mean of the first
+        ten neighbours; share of the first 3, the first 10 and all neighbours that lie inside; and
+        the shared neighbours. The features of neighbours are 0 without them.
     """
     last = scores[-1]
     best_outside = scores[~inside].max(initial=last)
@@ -222,6 +252,7 @@ def level_features(
         _log_odds(_votes(scores, VOTE_TEMPERATURE * spread), inside),
         _log_odds(_votes(scores, WIDE_TEMPERATURE * spread), inside),
         (scores[inside].max(initial=last) - best_outside) / spread,
+        (scores[inside][1:].max(initial=last) - best_outside) / spread,
         inside[:3].mean(),
         inside[:VOTING_PHOTOS].mean(),
         inside.mean(),
@@ -236,9 +267,13 @@ def level_features(
             (first - neighbour_scores[neighbours_inside].max(initial=last)) / spread,
             np.log1p((neighbour_scores > first).sum()),
             (first - neighbour_scores[:VOTING_PHOTOS].mean()) / spread,
+            neighbours_inside[:3].mean(),
+            neighbours_inside[:VOTING_PHOTOS].mean(),
+            neighbours_inside.mean(),
+            *shared,
         ]
     else:
-        features += [0.0] * 4
+        features += [0.0] * (len(FEATURES) - len(features))
     return np.array(features, dtype=np.float64)
 
 

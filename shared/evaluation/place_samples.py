@@ -21,13 +21,13 @@ from shared.evaluation.place_evidence import (
     PhotoLocation,
     RankedPhoto,
 )
+from shared.evaluation.place_fit import PlaceSample
 from shared.evaluation.place_levels import (
     CandidateLevel,
     LevelScheme,
     candidate_levels,
     ranking_spread,
 )
-from shared.evaluation.place_probability import PlaceSample
 from shared.geodesy import distances_m
 from shared.place_paths import label_levels
 
@@ -134,9 +134,10 @@ class OwnPhotoSampler:
 
     def _ranked(self, ranking: IndexRanking, visible: NDArray[np.bool_]) -> list[RankedPhoto]:
         shown = np.flatnonzero(visible[ranking[0]])[:EVIDENCE_DEPTH]
+        photos, scores = ranking[0][shown].tolist(), ranking[1][shown].tolist()
         return [
-            RankedPhoto(float(ranking[1][rank]), self._locations[ranking[0][rank]])
-            for rank in shown
+            RankedPhoto(score, self._locations[photo], photo)
+            for photo, score in zip(photos, scores, strict=True)
         ]
 
     def _visible(self, photo: int) -> NDArray[np.bool_]:

@@ -65,6 +65,11 @@ def read_predictions(path: Path) -> Indices:
     return ranked
 
 
+def predictions_path(folder: Path, set_name: str) -> Path:
+    """Return the path of a set's predictions, `predictions_SET.npy`."""
+    return folder / f"predictions_{re.sub(r'[^A-Za-z0-9._-]+', '_', set_name)}.npy"
+
+
 def check_predictions(
     path: Path, ranked: Indices, positives: Sequence[Indices], database_size: int | None
 ) -> None:
@@ -165,7 +170,7 @@ def compare_with_run(
             f"in this run it is {fingerprint[:12]}: the photos, the positives or the protocol "
             "differ. Evaluate both runs on the same set.",
         )
-    ranked = read_predictions(folder / f"predictions_{set_name}.npy")
+    ranked = read_predictions(predictions_path(folder, set_name))
     if len(ranked) != len(positives):
         raise InvalidRequest(
             "bad_run", f"{folder} has predictions for {len(ranked)} of {len(positives)} queries."
@@ -231,11 +236,8 @@ class EvaluationResult:
     """published results on the same set and protocol"""
     suspects: tuple[SuspectLabel, ...] = ()
     """confident first matches that count as wrong but are just outside the positive criterion"""
-
-    @property
-    def file_name(self) -> str:
-        """The set's name, safe for file names."""
-        return re.sub(r"[^A-Za-z0-9._-]+", "_", self.evaluation_set.name)
+    places: dict[str, Any] | None = None
+    """answers at the levels of places (`measure_places`)"""
 
     @property
     def scores(self) -> Scores | None:
@@ -263,6 +265,7 @@ class EvaluationResult:
             "against": self.against.as_json() if self.against else None,
             "published": [each.as_json() for each in self.published],
             "suspects": [asdict(suspect) for suspect in self.suspects],
+            "places": self.places,
         }
 
 
@@ -285,8 +288,9 @@ def write_run_files(out: Path, run: EvaluationRun, results: Sequence[EvaluationR
     """
     out.mkdir(parents=True, exist_ok=True)
     for result in results:
-        np.save(out / f"predictions_{result.file_name}.npy", result.ranked.indices)
-        _write_predictions_csv(out / f"predictions_{result.file_name}.csv", result)
+        predictions = predictions_path(out, result.evaluation_set.name)
+        np.save(predictions, result.ranked.indices)
+        _write_predictions_csv(predictions.with_suffix(".csv"), result)
     text = json.dumps(build_metrics(run, results), indent=2, ensure_ascii=False, allow_nan=False)
     partial = out / ".metrics.json.partial"
     partial.write_text(text + "\n", encoding="utf-8")

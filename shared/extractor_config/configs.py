@@ -40,6 +40,7 @@ ANYLOC_PREPROCESSING_NAMES = ("demo1024", "paper480x640", "round14")
 AREA_PREPROCESSING_NAME = "area288x384"
 PREPROCESSING_NAMES = ("square224", *ANYLOC_PREPROCESSING_NAMES, AREA_PREPROCESSING_NAME)
 MAX_CLUSTERS = 4096
+MIN_PHOTOS_TO_FIT = 50  # a vocabulary that was fitted on fewer photos of a map is provisional
 MAX_PCA_DIMENSION = 1024  # dimensions after PCA, whose time and memory grow quadratically
 TORCHHUB_BACKBONE = "torchhub"  # the backbone that is a torch.hub entry
 TRAINED_BACKBONE = "gsv"  # the backbone that is a model of `placewise train`

@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.ids import new_id
 from shared.telemetry.tracing import REQUEST_ID_HEADER

@@ -36,6 +36,8 @@ from shared.imaging.file_formats import (
 from shared.imaging.photo_header import ROTATED_ORIENTATIONS
 from shared.imaging.preprocessing import Pixels, Preprocessing
 
+# Larger JPEGs are decoded at half their size. The results of smaller ones stay as they always were.
+FULL_DECODE_PIXELS = 50_000_000
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
 EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright
@@ -63,7 +65,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     """Decode and preprocess a photo, and make its upright thumbnail.
 
     Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
-    eight bits.
+    eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
+    which bounds the memory; no preprocessing needs as many pixels.
 
     Args:
         data: The file's bytes.
@@ -79,9 +82,12 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
             warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
             with _open_image(data) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
+                if image.width * image.height > FULL_DECODE_PIXELS:
+                    # None keeps the mode; other formats than JPEG ignore the call.
+                    image.draft(None, (image.width // 2, image.height // 2))
                 image.load()
-                as_stored = to_rgb(image)
-                upright = apply_exif_orientation(image, as_stored)
+                as_stored = _to_rgb(image)
+                upright = _apply_exif_orientation(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             return DecodedPhoto(pixels=pixels, thumbnail=_thumbnail(upright))
     except UnidentifiedImageError as error:
@@ -97,7 +103,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     except MemoryError as error:
         raise Unprocessable(
             "undecodable_photo",
-            "Decoding the photo needs more memory than the limit for one photo.",
+            "Decoding the photo needs more memory than the limit for one photo "
+            "(DECODE_MEMORY_BYTES). Send a smaller photo, or a JPEG.",
         ) from error
 
 
@@ -110,14 +117,15 @@ def _open_image(data: bytes) -> Image.Image:
         raise Unprocessable(
             "no_heic_decoder",
             "This server's extractor has no decoder for HEIC. Install the extra `heic` there "
-            "(pip install 'placewise[heic]') and retry the job, or send the photo as JPEG.",
+            "(uv pip install '.[heic]' in the repository) and retry the job, or send the photo as "
+            "JPEG.",
         ) from error
     pillow_heif.options.DECODE_THREADS = 1  # the pool has as many children as there are cores
     pillow_heif.register_heif_opener(thumbnails=False)
     return Image.open(io.BytesIO(data), formats=("HEIF",))
 
 
-def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
+def _apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     """Transpose `rgb` by the EXIF orientation of `image`.
 
     Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
@@ -130,7 +138,7 @@ def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     return rgb if method is None else rgb.transpose(method)
 
 
-def to_rgb(image: Image.Image) -> Image.Image:
+def _to_rgb(image: Image.Image) -> Image.Image:
     """Convert to 8-bit RGB on black; ValueError for modes without a defined brightness range."""
     if image.mode.startswith("I;16"):
         # Pillow would clip 16-bit samples at 255 and make the photo white.
@@ -179,7 +187,7 @@ def decode_resized(
                 check_pixel_count(image.width, image.height, max_pixels)
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
-                upright = apply_exif_orientation(image, to_rgb(image))
+                upright = _apply_exif_orientation(image, _to_rgb(image))
             return upright.resize((width, height), Image.Resampling.BILINEAR)
     except UnidentifiedImageError as error:
         raise Unprocessable(

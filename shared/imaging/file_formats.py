@@ -30,10 +30,10 @@ def detect_archive_format(first_bytes: bytes) -> ArchiveFormat | None:
         return ArchiveFormat.ZIP
     if first_bytes.startswith(b"\x1f\x8b\x08"):
         return ArchiveFormat.GZIP
-    return ArchiveFormat.TAR if is_tar_header(first_bytes[:ARCHIVE_SIGNATURE_BYTES]) else None
+    return ArchiveFormat.TAR if _is_tar_header(first_bytes[:ARCHIVE_SIGNATURE_BYTES]) else None
 
 
-def is_tar_header(block: bytes) -> bool:
+def _is_tar_header(block: bytes) -> bool:
     """Whether a block of 512 bytes is a tar header, by its checksum; `ustar` is optional."""
     if len(block) != ARCHIVE_SIGNATURE_BYTES:
         return False
@@ -97,6 +97,8 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
         raise Unprocessable(
             "too_many_pixels",
-            f"The photo has {width} x {height} pixels; "
-            f"the limit is {max_pixels} pixels in total (MAX_IMAGE_PIXELS).",
+            f"The photo has {width} x {height} pixels, {width * height / 1e6:.4g} megapixels; the "
+            f"limit of this server is {max_pixels / 1e6:.4g} megapixels. Its administrator can "
+            "raise the limit: MAX_IMAGE_PIXELS in the environment of the server, or in the file "
+            ".env of the folder where it starts.",
         )

@@ -56,7 +56,7 @@ class _Box:
     content: bytes
 
 
-def read_heic_header(file: BinaryIO) -> HeicHeader:
+def _read_heic_header(file: BinaryIO) -> HeicHeader:
     """Read size and EXIF of the primary image.
 
     Raises ValueError if there is none, or if it is not HEVC (AVIF, for example).
@@ -261,7 +261,7 @@ def _header(image: Image.Image) -> PhotoHeader:
 
 def _heic_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
     """Read a HEIC header; the boxes have the size, and EXIF's orientation is ignored in HEIC."""
-    header = read_heic_header(file)
+    header = _read_heic_header(file)
     check_pixel_count(header.width, header.height, max_pixels)
     exif = Image.Exif()
     if header.exif:

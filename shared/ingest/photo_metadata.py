@@ -24,6 +24,8 @@ MAX_TAGS = 50
 MAX_METADATA_CHARACTERS = 100_000
 MAX_METADATA_DEPTH = 32  # serialising a response fails at 255 levels
 MAX_TEXT_CHARACTERS = 500  # characters of a tag or a place
+MAX_PATH_CHARACTERS = 1000
+DRIVE = re.compile("[A-Za-z]:")
 
 # An escaped NUL in JSON; after an escaped backslash the same characters are plain text.
 JSON_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
@@ -41,6 +43,7 @@ class PhotoFields:
     tags: list[str] | None = None
     metadata: dict[str, Any] | None = None
     role: PhotoRole | None = None
+    relative_path: str | None = None
 
 
 FORM_FIELDS = tuple(PhotoFields.__slots__)
@@ -71,6 +74,7 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
         tags=parse_tags(values["tags"].split(",")) if "tags" in values else None,
         metadata=_metadata(values["metadata"]) if "metadata" in values else None,
         role=_role(values["role"]) if "role" in values else None,
+        relative_path=parse_relative_path(values.get("relative_path", "")),
     )
     check_coordinate_pair(fields.latitude, fields.longitude)
     return fields
@@ -112,6 +116,17 @@ def parse_tags(tags: list[str]) -> list[str]:
     if len(unique) > MAX_TAGS:
         raise invalid_field_error("tags", f"at most {MAX_TAGS} tags are allowed")
     return unique
+
+
+def parse_relative_path(text: str) -> str | None:
+    """Normalise the path of a photo in its folder or archive: `Day 2/IMG_2078.jpg`.
+
+    It is a label and is never opened: drives, `.`, `..` and unprintable characters are dropped, and
+    of a longer path the last MAX_PATH_CHARACTERS remain. None if nothing remains.
+    """
+    parts = ("".join(c for c in part if c.isprintable()) for part in re.split(r"[/\\]", text))
+    kept = [part for part in parts if part not in ("", ".", "..") and not DRIVE.fullmatch(part)]
+    return "/".join(kept)[-MAX_PATH_CHARACTERS:] or None
 
 
 def _number(values: dict[str, str], field: str, minimum: float, maximum: float) -> float | None:

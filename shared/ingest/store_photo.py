@@ -18,9 +18,9 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from shared.catalog.api_keys import count_photos_of_key
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo, PhotoRole, find_photo_by_sha256
-from shared.catalog.session import Catalog
 from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields
@@ -104,6 +104,7 @@ def insert_photo(
         sha256=received.sha256,
         object_key=received.key,
         filename=received.filename,
+        relative_path=fields.relative_path,
         media_type=incoming.media_type,
         size_bytes=received.size_bytes,
         width=header.width,
@@ -145,6 +146,8 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
             file_id=str(photo.id),
             differing=differing,
         )
+    if photo.relative_path is None:  # stored before paths were kept, or uploaded without its folder
+        photo.relative_path = fields.relative_path
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
         requeue_job(job)

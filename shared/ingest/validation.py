@@ -10,6 +10,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 from uuid import UUID
 
+from shared.config.sizes import format_megabytes
 from shared.errors import PlacewiseError, TooLarge, UnsupportedMedia
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, PHOTO_SIGNATURE_BYTES, detect_media_type
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
@@ -128,7 +129,9 @@ def file_too_large_error(max_bytes: int) -> PlacewiseError:
     """Return the error for a file larger than MAX_FILE_SIZE."""
     return TooLarge(
         "file_too_large",
-        f"The file is larger than {max_bytes} bytes (MAX_FILE_SIZE).",
+        f"The photo is larger than {format_megabytes(max_bytes)}, the limit of this server. Its "
+        "administrator can raise the limit: MAX_FILE_SIZE in the environment of the server, or in "
+        "the file .env of the folder where it starts.",
         max_bytes=max_bytes,
     )
 

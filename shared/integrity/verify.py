@@ -20,13 +20,13 @@ from uuid import UUID
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, get_live_photos
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.errors import NotFound
 from shared.ids import new_id

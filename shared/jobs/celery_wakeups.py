@@ -138,11 +138,10 @@ class CeleryWakeups:
         self._redis.close()
 
     def _run(self) -> None:
-        while True:
+        while not self._stop.is_set():
             self._any_pending.wait()
-            if self._stop.is_set():
+            if self._stop.wait(DEBOUNCE_SECONDS):
                 return
-            self._stop.wait(DEBOUNCE_SECONDS)
             self._any_pending.clear()
             for queue in WakeupQueue:
                 if self._pending[queue].is_set():

@@ -8,7 +8,7 @@ from uuid import UUID
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import Condition, db_now, db_now_plus
+from shared.catalog.database.base import Condition, db_now, db_now_plus
 from shared.catalog.jobs import (
     EXTRACTOR_JOBS,
     SINGLE_CLAIM_JOBS,

@@ -17,10 +17,10 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import affected_rows, db_now_plus
-from shared.catalog.database_errors import OutageLog
+from shared.catalog.database.base import affected_rows, db_now_plus
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, select_locked_job_ids
-from shared.catalog.session import Catalog
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
 from shared.catalog.generations import (
     Generation,
     GenerationState,

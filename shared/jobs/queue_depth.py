@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind, Priority
 from shared.catalog.maps import Map
 

@@ -35,11 +35,11 @@ from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
 from shared.catalog.batch_items import has_batch_items
-from shared.catalog.database_errors import OutageLog
+from shared.catalog.database.base import db_now
+from shared.catalog.database.errors import OutageLog
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, JobKind, JobState
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs

@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session, object_session
 
-from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.catalog.batch_items import ITEMS_PER_STATEMENT, BatchItem, BatchSource, sync_item_states
+from shared.catalog.database.base import Condition, db_now, db_now_plus
 from shared.catalog.jobs import (
     CHECKPOINTED_JOBS,
     MODEL_CHANGE_JOBS,

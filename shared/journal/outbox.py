@@ -15,8 +15,8 @@ from functools import partial
 from sqlalchemy import bindparam, exists, literal, select, union_all, update
 from sqlalchemy.orm import Session
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.installation import REBUILDING, Installation, get_or_create_installation
-from shared.catalog.session import Catalog
 from shared.errors import NotFound, Unavailable
 from shared.journal.segments import (
     MIN_SEGMENTS_TO_MERGE,

@@ -24,7 +24,7 @@ from uuid import UUID
 
 from sqlalchemy import RowMapping, Table
 
-from shared.catalog.base import Journaled, from_json, to_json
+from shared.catalog.database.base import Journaled, from_json, to_json
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model

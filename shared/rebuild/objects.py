@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import (
     DEFAULT_MAP,
@@ -29,7 +30,6 @@ from shared.catalog.maps import (
     lock_map,
 )
 from shared.catalog.photos import Photo, get_live_photos
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
 from shared.ingest.store_photo import insert_photo, retry_on_conflict

@@ -18,8 +18,9 @@ from sqlalchemy.orm import Session
 
 from shared.backup.folder import backup_tables
 from shared.catalog.api_keys import ApiKey
-from shared.catalog.base import Condition
 from shared.catalog.chunks import Descriptor
+from shared.catalog.database.base import Condition
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.installation import (
     REBUILDING,
@@ -31,7 +32,6 @@ from shared.catalog.jobs import Job, JobKind, Priority
 from shared.catalog.maps import DEFAULT_MAP, CachedMapStatistics, Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Conflict, Unavailable
 from shared.ids import new_id

@@ -20,12 +20,12 @@ from uuid import UUID
 from sqlalchemy import insert, select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import DELETED_NAME_PREFIX, Map, increment_map_version
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import NotFound, Unavailable
 from shared.journal.outbox import unknown_lines

@@ -20,8 +20,9 @@ from uuid import UUID
 
 import httpx2
 
+from shared.config.settings import Settings
 from shared.config.shards import Shard
-from shared.errors import Unavailable
+from shared.errors import Misconfigured, Unavailable
 from shared.search_api.protocol import (
     CERTIFICATES,
     NONE,
@@ -160,6 +161,17 @@ class HttpSearchClient:
         self._refresh_thread = threading.Thread(
             target=self._refresh_workers, name="search-workers", daemon=True
         )
+
+    @classmethod
+    def from_settings(cls, settings: Settings) -> Self:
+        """Create the client of SEARCH_URLS; Misconfigured (`search_missing`) if it is not set."""
+        if not settings.search_worker_urls:
+            raise Misconfigured(
+                "search_missing",
+                "SEARCH_URLS is not set. List the URL of every search worker, for example "
+                "http://search-1:8000,http://search-2:8000.",
+            )
+        return cls(settings.search_worker_urls, settings.search_timeout_seconds)
 
     def __enter__(self) -> Self:
         self._workers.refresh()

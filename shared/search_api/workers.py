@@ -98,7 +98,7 @@ STATUS_TIMEOUT_SECONDS = 2.0  # a worker that answers more slowly gets no querie
 
 
 @dataclass(slots=True)
-class WorkerState:
+class _WorkerState:
     """Last known state of one worker; `status` is its last answer, however old."""
 
     url: str
@@ -127,7 +127,7 @@ class WorkerDirectory:
     def __init__(self, urls: Sequence[str], http: httpx2.Client) -> None:
         self._http = http
         self._lock = threading.Lock()
-        self._workers = [WorkerState(url) for url in urls]
+        self._workers = [_WorkerState(url) for url in urls]
         self._status_executor = ThreadPoolExecutor(
             max(1, len(urls)), thread_name_prefix="search-status"
         )
@@ -141,7 +141,7 @@ class WorkerDirectory:
         for _ in self._status_executor.map(self._refresh, self._workers):
             pass
 
-    def _refresh(self, worker: WorkerState) -> None:
+    def _refresh(self, worker: _WorkerState) -> None:
         status, silent, reason = None, False, ""
         try:
             status = fetch_status(self._http, worker.url, STATUS_TIMEOUT_SECONDS)
@@ -197,7 +197,7 @@ class WorkerDirectory:
                     statuses[worker.shard] = worker.status
             return statuses, [shard for shard in _shards_of(best) if shard not in statuses]
 
-    def _best_workers(self, generation_id: UUID | None) -> list[WorkerState]:
+    def _best_workers(self, generation_id: UUID | None) -> list[_WorkerState]:
         """The workers of the best number of shards."""
         shard_counts = {worker.shard.of for worker in self._workers if worker.shard}
         groups = {
@@ -215,18 +215,18 @@ class WorkerDirectory:
         return groups[max(groups, key=rank)] if groups else []
 
 
-def _shard_coverage(workers: Iterable[WorkerState], count: int) -> float:
+def _shard_coverage(workers: Iterable[_WorkerState], count: int) -> float:
     """Share of the shards that the workers hold."""
     return len({worker.shard for worker in workers}) / count
 
 
-def _shards_of(workers: Sequence[WorkerState]) -> list[Shard]:
+def _shards_of(workers: Sequence[_WorkerState]) -> list[Shard]:
     """All shards of the workers' common number, including those that no worker serves."""
     count = next((worker.shard.of for worker in workers if worker.shard), 0)
     return [Shard(index, count) for index in range(count)]
 
 
-def _total_version(worker: WorkerState) -> tuple[int, bool]:
+def _total_version(worker: _WorkerState) -> tuple[int, bool]:
     if worker.status is None:
         return 0, False
     return sum(worker.status.versions.values()), not worker.status.missing

@@ -18,7 +18,7 @@ PARTIAL_SUFFIX = ".partial"
 STALE_PARTIAL_SECONDS = 3600.0  # age of partial files whose process must have been killed
 
 
-def copy_and_hash(source: BinaryIO, write: Callable[[bytes], object]) -> tuple[int, str]:
+def _copy_and_hash(source: BinaryIO, write: Callable[[bytes], object]) -> tuple[int, str]:
     """Pass the file's bytes to `write`; return their number and SHA-256."""
     digest, size = hashlib.sha256(), 0
     while block := source.read(COPY_BYTES):
@@ -39,7 +39,7 @@ def copy_object(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int
     with source.open(key) as file:
         writer = target.writer(key)
         try:
-            copied = copy_and_hash(file, writer.write)
+            copied = _copy_and_hash(file, writer.write)
             writer.commit()
         finally:
             writer.abort()
@@ -58,7 +58,7 @@ def download_object(store: ObjectStore, key: str, target: Path) -> str:
     Raises NotFound if the object is missing.
     """
     with store.open(key) as source, create_private_file(target) as file:
-        _, sha256 = copy_and_hash(source, file.write)
+        _, sha256 = _copy_and_hash(source, file.write)
         file.flush()
         os.fsync(file.fileno())
     return sha256

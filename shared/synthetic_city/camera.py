@@ -192,7 +192,7 @@ class TextureCache:
         offsets, widths, heights = [], [], []
         for level in range(MIP_LEVELS):
             if level:
-                picture = downsample(picture, ignore_transparent=rim)
+                picture = _downsample(picture, ignore_transparent=rim)
             stored = np.pad(picture, ((1, 1), (1, 1), (0, 0))) if rim else picture
             packed = np.ascontiguousarray(stored.transpose(1, 0, 2)).view(np.uint32).ravel()
             self.pixels[self._used : self._used + len(packed)] = packed
@@ -203,7 +203,7 @@ class TextureCache:
         return MipmappedTexture(np.array(offsets), np.array(widths), np.array(heights))
 
 
-def downsample(picture: NDArray[np.uint8], *, ignore_transparent: bool) -> NDArray[np.uint8]:
+def _downsample(picture: NDArray[np.uint8], *, ignore_transparent: bool) -> NDArray[np.uint8]:
     """Halve (h, w, 4) to (ceil(h / 2), ceil(w / 2), 4): mean colours, and one of four codes.
 
     `ignore_transparent` excludes transparent pixels from the mean, for outlines against the sky.

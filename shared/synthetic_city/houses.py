@@ -120,12 +120,12 @@ def arrange_house(rng: np.random.Generator, width: float, shopping: float, floor
     )
 
 
-def bay_centre_column(house: House, bay: int) -> int:
+def _bay_centre_column(house: House, bay: int) -> int:
     """Return the texture column of the centre of a bay."""
     return round((bay + 0.5) * house.width / house.bays * PIXELS_PER_METRE)
 
 
-def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: int) -> None:
+def _draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: int) -> None:
     """Draw the roof and chimneys above row `eaves`."""
     draw = ImageDraw.Draw(picture)
     width = picture.width
@@ -151,7 +151,7 @@ def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: i
         for y in range(ridge + 3, eaves, 4):
             draw.line((slope, y, width - slope, y), fill=(*darken(colour, 0.86), CODE_FLAT))
         for bay in range(house.bays):
-            x = bay_centre_column(house, bay)
+            x = _bay_centre_column(house, bay)
             draw.rectangle(
                 (x - 12, ridge + 10, x + 12, eaves), fill=(*catalogue.trims[house.trim], CODE_SOLID)
             )
@@ -172,7 +172,7 @@ def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: i
         draw.rectangle((0, ridge + 6, width, eaves), fill=tiles)
 
 
-def draw_eaves(
+def _draw_eaves(
     draw: ImageDraw.ImageDraw, house: House, width: int, eaves: int, trim: Colour
 ) -> None:
     """Draw the cornice or parapet at row `eaves`."""
@@ -209,7 +209,7 @@ def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
     eaves = height - metres_to_pixels(house.eaves)
     picture = Image.new("RGBA", (width, height), (0, 0, 0, 0))
     trim = catalogue.trims[house.trim]
-    draw_roof(picture, house, catalogue, eaves)
+    _draw_roof(picture, house, catalogue, eaves)
     _wall(picture, catalogue.walls[house.wall], (0, eaves, width, height), rng)
     ground = height - metres_to_pixels(house.ground_floor)
     if house.base_wall >= 0:
@@ -223,7 +223,7 @@ def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
         (0, height - metres_to_pixels(0.35), width, height), fill=(*darken(trim, 0.62), CODE_SOLID)
     )
     _door(picture, house, catalogue)
-    draw_eaves(draw, house, width, eaves, trim)
+    _draw_eaves(draw, house, width, eaves, trim)
     draw.line((0, eaves, 0, height), fill=(*darken(trim, 0.5), CODE_SOLID))
     if house.drainpipe >= 0:
         x = int(house.drainpipe * (width - 3))
@@ -264,7 +264,7 @@ def _floors(
                 continue
             sprite = catalogue.windows[index][int(rng.integers(PANE_CODES))]
             kind = catalogue.window_types[index]
-            x = bay_centre_column(house, bay) - sprite.width // 2
+            x = _bay_centre_column(house, bay) - sprite.width // 2
             foot = 0.15 if kind.balcony else 0.85
             picture.paste(
                 sprite, (x, y - metres_to_pixels(foot) - sprite.height + 4), _solid(sprite)
@@ -281,7 +281,7 @@ def _street_level(
     height = picture.height
     pitch = house.width / house.bays
     for bay in range(house.bays):
-        middle = bay_centre_column(house, bay)
+        middle = _bay_centre_column(house, bay)
         if bay == house.door_bay:
             continue
         shop = house.shops[bay]
@@ -316,7 +316,7 @@ def _street_level(
 def _door(picture: Image.Image, house: House, catalogue: Catalogue) -> None:
     """Draw the door over the plinth, down to the pavement."""
     door = catalogue.doors[house.door]
-    x = bay_centre_column(house, house.door_bay) - door.width // 2
+    x = _bay_centre_column(house, house.door_bay) - door.width // 2
     picture.paste(door, (x, picture.height - door.height), _solid(door))
 
 

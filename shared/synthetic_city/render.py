@@ -43,7 +43,7 @@ WHITE_LINE = np.uint32(CODE_FLAT << 24 | 0xC8CCCC)
 KERB_STONE = np.uint32(CODE_FLAT << 24 | 0x8E9498)
 
 
-def draw_asphalt(seed: int) -> Image.Image:
+def _draw_asphalt(seed: int) -> Image.Image:
     """Draw a seamless square tile of TILE_M metres."""
     rng = random_stream(seed, "asphalt")
     light = 0.42 + 0.012 * rng.normal(0, 1, (TILE_PIXELS, TILE_PIXELS)).astype(np.float32)
@@ -60,7 +60,7 @@ def draw_asphalt(seed: int) -> Image.Image:
     return _tile(light, (1.0, 1.0, 1.03))
 
 
-def draw_paving(seed: int) -> Image.Image:
+def _draw_paving(seed: int) -> Image.Image:
     """Draw a seamless square tile of TILE_M metres: slabs of half a metre."""
     rng = random_stream(seed, "paving")
     rows, columns = np.mgrid[0:TILE_PIXELS, 0:TILE_PIXELS]
@@ -80,7 +80,7 @@ def _tile(light: GreyImage, tint: tuple[float, float, float]) -> Image.Image:
     return Image.fromarray(np.concatenate([colours, codes], axis=2))
 
 
-def paint_ground(
+def _paint_ground(
     view: RenderBuffers,
     camera: Camera,
     hits: RayHits,
@@ -118,8 +118,8 @@ def paint_ground(
     facing = np.where(hit, np.maximum(hits.facing, 1e-3), 1.0).astype(np.float32)
     wall = np.where(hit, hits.depth, 1e4).astype(np.float32)
     to_wall = (wall[:, None] - depth) * facing[:, None]  # metres in front of the facade
-    asphalt = cache.get("asphalt", lambda: draw_asphalt(quarter.seed), rim=False)
-    paving = cache.get("paving", lambda: draw_paving(quarter.seed), rim=False)
+    asphalt = cache.get("asphalt", lambda: _draw_asphalt(quarter.seed), rim=False)
+    paving = cache.get("paving", lambda: _draw_paving(quarter.seed), rim=False)
     road = to_wall > PAVEMENT_M
     base = np.where(
         road, asphalt.offsets[level].astype(np.int32), paving.offsets[level].astype(np.int32)
@@ -184,7 +184,7 @@ class QuarterRenderer:
             self.quarter.side_lengths[sides],
         )
         self._paint_facades(view, camera, session, hits, sides)
-        paint_ground(view, camera, hits, self.quarter, sides, self.cache)
+        _paint_ground(view, camera, hits, self.quarter, sides, self.cache)
         for item in sorted(
             self._objects.items(camera, session, sides[near[sides] < OBJECT_RANGE_M], slopes),
             key=lambda item: -item.depth,

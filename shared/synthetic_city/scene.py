@@ -57,7 +57,7 @@ class VehiclePanel:
     mirrored: bool = False
 
 
-def place_street_objects(
+def _place_street_objects(
     quarter: Quarter, street: Street, catalogue: Catalogue
 ) -> list[StreetObject]:
     """Place the permanent objects on the pavements of a street."""
@@ -89,7 +89,7 @@ def place_street_objects(
     return objects
 
 
-def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
+def _place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
     """Place the vehicles of one day: parked at both kerbs, and a few driving."""
     rng = random_stream(quarter.seed, quarter.name, "vehicles", street.number, day)
     vehicles = []
@@ -123,7 +123,9 @@ def _choose_vehicle(rng: np.random.Generator) -> int:
     return shape * len(VEHICLE_PAINTS) + int(rng.integers(len(VEHICLE_PAINTS)))
 
 
-def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[VehiclePanel]:
+def _vehicle_panels(
+    vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres
+) -> list[VehiclePanel]:
     """Return the panels of a vehicle (side, end, windscreen) that are visible from a point."""
     side = catalogue.vehicle_sides[vehicle.index]
     front = catalogue.vehicle_fronts[vehicle.index]
@@ -154,7 +156,7 @@ def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) ->
     return panels
 
 
-def shop_blades(
+def _shop_blades(
     quarter: Quarter, side: int, catalogue: Catalogue
 ) -> list[tuple[Metres, Metres, int]]:
     """Return the projecting shop signs of a facade row: foot, outward direction, index."""
@@ -223,7 +225,7 @@ class VisibleObjects:
                     yield item
             vehicles = self._vehicles_at(number, session.name)
             for i in _is_visible(camera, [v.position for v in vehicles], OBJECT_RANGE_M):
-                for panel in vehicle_panels(vehicles[i], self.catalogue, camera.position):
+                for panel in _vehicle_panels(vehicles[i], self.catalogue, camera.position):
                     item = _panel_item(camera, panel, slopes)
                     if item:
                         yield item
@@ -246,19 +248,19 @@ class VisibleObjects:
     def _objects_at(self, number: int) -> list[StreetObject]:
         if number not in self._objects:
             street = self.quarter.streets[number]
-            self._objects[number] = place_street_objects(self.quarter, street, self.catalogue)
+            self._objects[number] = _place_street_objects(self.quarter, street, self.catalogue)
         return self._objects[number]
 
     def _vehicles_at(self, number: int, day: str) -> list[Vehicle]:
         key = (number, day)
         if key not in self._vehicles:
             street = self.quarter.streets[number]
-            self._vehicles[key] = place_vehicles(self.quarter, street, day)
+            self._vehicles[key] = _place_vehicles(self.quarter, street, day)
         return self._vehicles[key]
 
     def _blades_at(self, side: int) -> list[tuple[Metres, Metres, int]]:
         if side not in self._blades:
-            self._blades[side] = shop_blades(self.quarter, side, self.catalogue)
+            self._blades[side] = _shop_blades(self.quarter, side, self.catalogue)
         return self._blades[side]
 
     def _billboard(

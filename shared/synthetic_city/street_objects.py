@@ -25,7 +25,7 @@ class Sprite:
     bottom: float = 0.0
 
 
-def object_pixels(metres: float) -> int:
+def _object_pixels(metres: float) -> int:
     """Convert metres to pixels of a sprite."""
     return round(metres * OBJECT_PIXELS_PER_METRE)
 
@@ -93,7 +93,7 @@ def draw_tree(
 
 def draw_lamp(colour: Colour, height: float) -> Sprite:
     """Draw a street lamp: a post with an arm on each side."""
-    width, tall = object_pixels(1.6), object_pixels(height)
+    width, tall = _object_pixels(1.6), _object_pixels(height)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     middle = width // 2
@@ -110,7 +110,7 @@ def draw_lamp(colour: Colour, height: float) -> Sprite:
 
 def draw_post_sign(kind: int, rng: np.random.Generator) -> Sprite:
     """Draw a traffic sign on its post."""
-    width, tall = object_pixels(0.66), object_pixels(2.6)
+    width, tall = _object_pixels(0.66), _object_pixels(2.6)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     middle = width // 2
@@ -138,7 +138,7 @@ def draw_post_sign(kind: int, rng: np.random.Generator) -> Sprite:
 def draw_box(colour: Colour, width: float, height: float) -> Sprite:
     """Draw a bin, a cabinet or a letter box."""
     picture = Image.new(
-        "RGBA", (object_pixels(width), object_pixels(height)), (*colour, CODE_SOLID)
+        "RGBA", (_object_pixels(width), _object_pixels(height)), (*colour, CODE_SOLID)
     )
     draw = ImageDraw.Draw(picture)
     draw.rectangle((0, 0, picture.width - 1, 3), fill=(*darken(colour, 1.25), CODE_FLAT))
@@ -178,10 +178,10 @@ VEHICLE_SHAPES = (
 
 def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
     """Draw a vehicle from its left side, front to the left."""
-    width, tall = object_pixels(shape.length), object_pixels(shape.height)
+    width, tall = _object_pixels(shape.length), _object_pixels(shape.height)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    low, bonnet = object_pixels(0.28), object_pixels(shape.bonnet)
+    low, bonnet = _object_pixels(0.28), _object_pixels(shape.bonnet)
     body, shade = (*paint, CODE_SOLID), (*darken(paint, 0.72), CODE_SOLID)
     front, back = (int(width * share) for share in shape.cabin)
     lean = int(width * shape.slope)
@@ -197,9 +197,9 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
         fill=body,
     )
     draw.line((front + lean, 1, back - lean, 1), fill=(*darken(paint, 1.2), CODE_FLAT), width=3)
-    draw.rectangle((1, tall - low - object_pixels(0.22), width - 2, tall - low), fill=shade)
-    sill = tall - bonnet + 1 if shape.bonnet < 2 else tall - object_pixels(1.35)
-    head = object_pixels(0.12)
+    draw.rectangle((1, tall - low - _object_pixels(0.22), width - 2, tall - low), fill=shade)
+    sill = tall - bonnet + 1 if shape.bonnet < 2 else tall - _object_pixels(1.35)
+    head = _object_pixels(0.12)
     inner_front, inner_back = front + max(4, lean // 3), back - max(4, lean // 3)
     for pane in range(shape.windows):
         left = inner_front + pane * (inner_back - inner_front) // shape.windows + 2
@@ -214,7 +214,7 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
         )
         draw.line((upper_left, head + 2, upper_right, head + 2), fill=(120, 134, 144, CODE_SOLID))
     for share in (0.18, 0.80):
-        _wheel(draw, int(width * share), tall - object_pixels(0.32), object_pixels(0.33))
+        _wheel(draw, int(width * share), tall - _object_pixels(0.32), _object_pixels(0.33))
     draw.rectangle((1, tall - bonnet + 6, 6, tall - bonnet + 14), fill=(236, 232, 210, CODE_LAMP))
     draw.rectangle(
         (width - 6, tall - bonnet + 6, width - 2, tall - bonnet + 14), fill=(170, 30, 28, CODE_LAMP)
@@ -236,16 +236,17 @@ def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
 
 def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
     """Draw the front or rear of the body, up to the bonnet."""
-    width, tall = object_pixels(shape.width), object_pixels(shape.bonnet)
+    width, tall = _object_pixels(shape.width), _object_pixels(shape.bonnet)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     draw.rectangle((4, tall - 12, width - 5, tall + 1), fill=(24, 24, 26, CODE_SOLID))
     draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=(*paint, CODE_SOLID))
     draw.line((4, 0, width - 5, 0), fill=(*darken(paint, 1.2), CODE_FLAT), width=2)
     draw.rectangle(
-        (1, tall - object_pixels(0.5), width - 2, tall - 9), fill=(*darken(paint, 0.72), CODE_SOLID)
+        (1, tall - _object_pixels(0.5), width - 2, tall - 9),
+        fill=(*darken(paint, 0.72), CODE_SOLID),
     )
-    top = 6 if shape.bonnet < 2 else tall - object_pixels(0.9)
+    top = 6 if shape.bonnet < 2 else tall - _object_pixels(0.9)
     lamp = (170, 30, 28, CODE_LAMP) if rear else (238, 234, 212, CODE_LAMP)
     for x in (3, width - 15):
         draw.rectangle((x, top, x + 11, top + 7), fill=lamp)
@@ -254,9 +255,9 @@ def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
         draw.rectangle(grille, fill=(*darken(paint, 0.45), CODE_SOLID))
     plate = (
         width // 2 - 10,
-        tall - object_pixels(0.45),
+        tall - _object_pixels(0.45),
         width // 2 + 10,
-        tall - object_pixels(0.45) + 5,
+        tall - _object_pixels(0.45) + 5,
     )
     draw.rectangle(plate, fill=(226, 226, 220, CODE_SOLID))
     return Sprite(picture, shape.width, (tall + 2) / OBJECT_PIXELS_PER_METRE)
@@ -265,10 +266,10 @@ def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
 def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Sprite:
     """Draw the cabin's front or back above the bonnet, with an overlap to avoid a gap."""
     overlap = 0.14
-    width, tall = object_pixels(shape.width), object_pixels(shape.height - shape.bonnet + overlap)
+    width, tall = _object_pixels(shape.width), _object_pixels(shape.height - shape.bonnet + overlap)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    lean, hem = width // 11, object_pixels(overlap)
+    lean, hem = width // 11, _object_pixels(overlap)
     outline = [(1, tall - 1), (lean, 0), (width - 1 - lean, 0), (width - 2, tall - 1)]
     draw.polygon(outline, fill=(*paint, CODE_SOLID))
     if tall > 3 * hem:

@@ -50,7 +50,7 @@ class Street:
 
 
 @dataclass(frozen=True, slots=True)
-class FacadeRow:
+class _FacadeRow:
     """The outer side of a block; seen from the street it runs left to right."""
 
     start: Metres
@@ -113,7 +113,7 @@ class Quarter:
             )
         return streets
 
-    def _build_blocks(self, rng: np.random.Generator, count: int) -> list[FacadeRow]:
+    def _build_blocks(self, rng: np.random.Generator, count: int) -> list[_FacadeRow]:
         sides = []
         for i in range(count - 1):
             for j in range(count - 1):
@@ -134,7 +134,7 @@ class Quarter:
                     start, end = outline[k], outline[(k + 1) % 4]
                     length = float(np.hypot(*(end - start)))
                     sides.append(
-                        FacadeRow(
+                        _FacadeRow(
                             start=start,
                             direction=(end - start) / length,
                             length=length,

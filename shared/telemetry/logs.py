@@ -38,7 +38,7 @@ STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {
 }
 
 
-class ContextFilter(logging.Filter):
+class _ContextFilter(logging.Filter):
     """Adds the service name, the request id and the trace id to each record."""
 
     def __init__(self, service: str) -> None:
@@ -54,7 +54,7 @@ class ContextFilter(logging.Filter):
         return True
 
 
-class JsonFormatter(logging.Formatter):
+class _JsonFormatter(logging.Formatter):
     """Formats a record as one JSON object per line.
 
     Members: `time` (UTC), `level`, `logger`, `service`, `message`, `request_id` and `trace_id` if
@@ -79,7 +79,7 @@ class JsonFormatter(logging.Formatter):
         return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
-class TextFormatter(logging.Formatter):
+class _TextFormatter(logging.Formatter):
     """Formats a record for people, with the request id and the `extra` values at the end.
 
     The lines of a traceback are indented, so that no text of an error can look like a log line.
@@ -117,8 +117,8 @@ def configure_logging(settings: Settings, service: str) -> None:
     Replaces the existing handlers of the root logger.
     """
     handler = logging.StreamHandler()
-    handler.addFilter(ContextFilter(service))
-    handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())
+    handler.addFilter(_ContextFilter(service))
+    handler.setFormatter(_JsonFormatter() if settings.log_format == "json" else _TextFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.INFO)

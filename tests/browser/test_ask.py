@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
+from PIL.ExifTags import Base
 from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Town, Visitor
@@ -140,6 +144,34 @@ def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
     expect(page.locator(".rings li")).to_have_text(rings)
     expect(page.locator("path.ring-68")).to_have_count(len(rings))
     expect(page.locator("path.ring-95, path.estimate")).to_have_count(0)
+
+
+def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
+    visitor: Visitor, town: Town, tmp_path: Path
+) -> None:
+    sideways = Image.Exif()
+    sideways[Base.Orientation] = 6
+    large = tmp_path / "large.jpg"
+    with Image.open(town.queries[0]) as photo:
+        upright = photo.resize((5000, round(5000 * photo.height / photo.width)))
+    upright.transpose(Image.Transpose.ROTATE_90).save(large, quality=95, exif=sideways)
+    sent: list[bytes] = []
+
+    def record(route: Route) -> None:
+        sent.append(route.request.post_data_buffer or b"")
+        route.continue_()
+
+    visitor.page.route("**/api/v1/similarity?*", record)
+    page = ask(visitor, large)
+    assert len(sent[0]) < large.stat().st_size / 2
+    with Image.open(io.BytesIO(sent[0][sent[0].index(b"\xff\xd8") :])) as small:
+        assert small.size == (2048, round(2048 * upright.height / upright.width))
+        assert not small.getexif()
+    best = town.ask(large)["similar_images"][0]
+    label = page.locator(".match").first.get_attribute("aria-label") or ""
+    assert best["original_filename"] in label
+    [similarity] = re.findall(r"similarity (\S+):", label)
+    assert float(similarity) == pytest.approx(best["similarity_score"], abs=0.05)
 
 
 def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:

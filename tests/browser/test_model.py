@@ -43,7 +43,7 @@ def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
 
 def test_the_state_of_things_is_told(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("status")
-    expect(page.locator(".parts li")).to_have_count(3)
+    expect(page.locator(".parts li")).to_have_count(5)
     expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
     photos = town.get("/database/stats")["total_images"]
     expect(page.locator(".tile").first).to_contain_text(str(photos))

@@ -6,7 +6,7 @@ from uuid import UUID
 
 import pytest
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from tests.support.catalog_rows import add_map
 
 

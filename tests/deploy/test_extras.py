@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import subprocess
 import sys
@@ -30,11 +31,13 @@ EXTRAS = {
 # What every image's command imports, whatever service it runs.
 COMMAND = [
     "services.cli.main",
+    "services.cli.operations.installation_checks",
+    "services.cli.operations.maintenance",
     "shared.catalog.installation",
     "shared.telemetry.heartbeat",
     # Imported at their first use.
     "alembic.command",
-    "shared.catalog.postgres",
+    "shared.catalog.database.postgres",
     "shared.storage.s3",
 ]
 HINTS = ["shared.jobs.celery_wakeups", "shared.jobs.celery_wakeups"]
@@ -76,6 +79,7 @@ def requirements(extra: str) -> set[str]:
     return names
 
 
+@functools.cache
 def installed_with(extra: str) -> set[str]:
     """Every distribution that would be in the image."""
     found: set[str] = set()

@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
 from shared.jobs.wakeups import WakeupQueue

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.telemetry.heartbeat import Heartbeat, seconds_since_heartbeat

@@ -16,8 +16,8 @@ import yaml
 from sqlalchemy import text, update
 
 from services.http_server import SHUTDOWN_GRACE_SECONDS
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import Job, JobState
 from tests.deploy.composition import ROOT, SERVICES, services

@@ -25,7 +25,9 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return services(SERVICES, folder, variables(make_env(folder)))
 
 
-def test_every_process_of_the_compose_file_is_asked_on_its_port(everything: dict[str, Any]) -> None:
+def test_every_process_of_the_compose_file_is_scraped_on_its_port(
+    everything: dict[str, Any],
+) -> None:
     config = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())
     assert config["rule_files"] == ["alerts.yml"]
     searched = {}

@@ -65,7 +65,7 @@ def _nothing_waits(server: ServerProcess) -> None:
         time.sleep(0.2)
 
 
-def test_one_upload_too_many_at_once_is_told_to_come_again(server: ServerProcess) -> None:
+def test_one_concurrent_upload_too_many_gets_retry_after(server: ServerProcess) -> None:
     slow, rest = half_received(server)
     with slow:
         # The queue's limit is 1 as well, and what was begun counts until the next look.

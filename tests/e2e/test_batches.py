@@ -126,7 +126,7 @@ def test_index_takes_an_archive_as_it_takes_a_folder(
     assert (report["uploaded"], report["already_there"], report["refused"]) == (0, 4, [])
 
 
-def test_index_says_what_is_no_archive_and_what_an_archive_can_not_be_told(
+def test_index_rejects_what_is_no_archive_and_options_that_archives_do_not_have(
     server: ServerProcess, tmp_path: Path
 ) -> None:
     path = tmp_path / "photos.zip"

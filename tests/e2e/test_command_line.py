@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -181,6 +183,13 @@ def test_index_reads_places_from_exif_and_from_names(
     assert found[UTM_FULL] == pytest.approx((45.07, 7.69), abs=1e-6)
     assert found[UTM_WITH_DEGREES] == (45.5, -7.25)
     assert found["3.JPG"] == (None, None)
+    named = server.client.get("/api/v1/search", params={"filename": "3.JPG"}).json()["images"]
+    paths = {image["original_filename"]: image["relative_path"] for image in named}
+    assert paths["3.JPG"] == "below/3.JPG"  # 13.JPG is found, too
+    assert (
+        f"1 other file skipped, {PHOTOS - 3} photos without coordinates."
+        in indexed.without_the_broken.stderr
+    )
     headed = server.client.get("/api/v1/search", params={"filename": UTM_FULL}).json()["images"]
     assert headed[0]["heading"] == 123.5
 
@@ -289,6 +298,34 @@ def test_a_refusal_is_one_line_or_one_document(placewise: CommandLine, tmp_path:
     assert placewise("query", tmp_path / "none.jpg").code == 2, "a usage error"
 
 
+@pytest.mark.usefixtures("indexed")
+def test_the_printed_command_reaches_this_server_from_another_folder(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    [line] = re.findall(r"(PLACEWISE_HOME=.+) query PHOTO", server.log_path.read_text())
+    home = shlex.split(line)[0].removeprefix("PLACEWISE_HOME=")
+    (tmp_path / "where.jpg").write_bytes(photo_bytes(2))
+    shown = CommandLine(tmp_path, Path(home))("query", tmp_path / "where.jpg", "--map", "default")
+    assert "No server runs" not in shown.stderr
+    assert f"Searched map default of {server.client.base_url}, which serves {server.home}" in (
+        shown.stdout
+    )
+
+
+def test_commands_name_the_map_and_the_server_that_they_use(
+    server: ServerProcess, indexed: Indexed, tmp_path: Path
+) -> None:
+    url = str(server.client.base_url)
+    assert f"Indexing into map default of {url}" in indexed.without_the_broken.stderr
+    elsewhere = CommandLine(tmp_path, tmp_path / "other home")
+    assert elsewhere("maps", "create", "yard", "--server", url).code == 0
+    report = elsewhere("index", indexed.folder, "--map", "yard", "--no-fit", "--server", url)
+    assert f"Indexing into map yard of {url}\n" in report.stderr
+    assert f"query PHOTO --map yard --server {url}\n" in report.stderr
+    assert elsewhere("maps", "delete", "yard", "--yes", "--server", url).code == 0
+    assert not (tmp_path / "other home").exists()
+
+
 # --- vocabulary ------------------------------------------------------------------------------
 
 
@@ -331,7 +368,9 @@ def test_commands_work_without_a_server(tmp_path: Path) -> None:
     photos.mkdir()
     for number in range(3):
         (photos / f"{number}.jpg").write_bytes(photo_bytes(number))
-    report = alone("index", photos, "--json").json()
+    indexed = alone("index", photos, "--json")
+    assert f"No server runs on {tmp_path / 'home'}: starting one" in indexed.stderr
+    report = indexed.json()
     assert (report["photos"], report["searchable"], report["vocabulary"]) == (3, 3, "none")
     answer = alone("query", photos / "1.jpg", "--json").json()
     assert answer["similar_images"][0]["original_filename"] == "1.jpg"
@@ -363,7 +402,7 @@ def test_a_command_that_describes_no_photo_never_imports_torch(tmp_path: Path) -
 def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path) -> None:
     photo = tmp_path / "photo.jpg"
     photo.write_bytes(photo_bytes(0))
-    # Hides the GPUs of this machine. It is read when torch is imported, so no process is forked.
+    # Hides the GPUs of this machine.
     env = {**environment(tmp_path / "home", device="cuda"), "CUDA_VISIBLE_DEVICES": ""}
     listed, indexed, served = (
         Run(run_command(*arguments, env=env, cwd=tmp_path))

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from tests.support.anyloc import AnylocHouse
+from tests.support.anyloc import AnylocInstallation
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 
 
 @pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> AnylocHouse:
+def anyloc(tmp_path_factory: pytest.TempPathFactory) -> AnylocInstallation:
     """Four photos in rows, one of them twice and one without its file; one that no row names."""
-    made = AnylocHouse(tmp_path_factory.mktemp("anyloc"))
+    made = AnylocInstallation(tmp_path_factory.mktemp("anyloc"))
     made.add(
         "5f0e.jpg",
         photo_bytes(10),
@@ -32,10 +32,10 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> AnylocHouse:
 
 
 def import_it(
-    server: ServerProcess, house: AnylocHouse, cwd: Path, code: int = 0
+    server: ServerProcess, anyloc: AnylocInstallation, cwd: Path, code: int = 0
 ) -> dict[str, Any]:
     ended = run_command(
-        "import-anyloc", house.root, "--json", env=environment(server.home), cwd=cwd
+        "import-anyloc", anyloc.root, "--json", env=environment(server.home), cwd=cwd
     )
     assert ended.returncode == code, ended.stdout + ended.stderr
     report: dict[str, Any] = json.loads(ended.stdout)
@@ -50,9 +50,9 @@ def images(server: ServerProcess, **filters: str) -> list[dict[str, Any]]:
 
 
 def test_photos_are_imported_and_found_by_their_original_names(
-    server: ServerProcess, house: AnylocHouse, tmp_path: Path
+    server: ServerProcess, anyloc: AnylocInstallation, tmp_path: Path
 ) -> None:
-    report = import_it(server, house, tmp_path, code=1)  # a photo is missing
+    report = import_it(server, anyloc, tmp_path, code=1)  # a photo is missing
     assert (report["rows"], report["photos"], report["unlisted"]) == (4, 3, 1)
     assert (report["imported"], report["already_there"]) == (3, 0)
     assert [item["filename"] for item in report["missing"]] == ["lost.jpg"]
@@ -76,19 +76,19 @@ def test_photos_are_imported_and_found_by_their_original_names(
     similar = server.ask(photo_bytes(10), top_k=1).json()["similar_images"]
     assert similar[0]["original_filename"] == "Piazza Castello.jpg"
 
-    again = import_it(server, house, tmp_path, code=1)
+    again = import_it(server, anyloc, tmp_path, code=1)
     assert (again["imported"], again["already_there"]) == (0, 3)
     assert again["searchable"] == report["searchable"]
 
 
 def test_what_is_refused_is_named_and_ends_with_exit_code_1(
-    server: ServerProcess, house: AnylocHouse, tmp_path: Path
+    server: ServerProcess, anyloc: AnylocInstallation, tmp_path: Path
 ) -> None:
-    house.add("text.jpg", b"Only text, named as a photo.", original_filename="[odd] name.jpg")
-    report = import_it(server, house, tmp_path, code=1)
+    anyloc.add("text.jpg", b"Only text, named as a photo.", original_filename="[odd] name.jpg")
+    report = import_it(server, anyloc, tmp_path, code=1)
     assert [item["filename"] for item in report["refused"]] == ["[odd] name.jpg"]
     assert "JPEG" in report["refused"][0]["reason"]
-    shown = run_command("import-anyloc", house.root, env=environment(server.home), cwd=tmp_path)
+    shown = run_command("import-anyloc", anyloc.root, env=environment(server.home), cwd=tmp_path)
     assert shown.returncode == 1
     assert "4 database rows" not in shown.stderr
     assert "0 photos imported, 3 already stored" in shown.stderr

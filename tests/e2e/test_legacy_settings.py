@@ -1,14 +1,15 @@
-"""DEBUG and UPLOAD_DIR, as the predecessor's `.env` has them."""
+"""The `.env` and the calls of the AnyLoc service, as its README prints them."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import START_SECONDS, ServerProcess, environment, run_command
 
 
 def test_original_photos_lie_in_the_upload_dir(tmp_path: Path) -> None:
@@ -65,3 +66,62 @@ def test_debug_logs_calls_and_refusals_and_changes_no_answer(tmp_path: Path, deb
         assert "SELECT" not in log
         assert "0123456789-secret" not in log
         assert "Bearer pw_" not in log
+
+
+# As the predecessor's README prints it.
+PUBLISHED_ENV = """
+# API Configuration
+DEBUG=false
+HOST=0.0.0.0
+PORT=8000
+
+# File Handling
+MAX_FILE_SIZE=10485760  # 10MB
+UPLOAD_DIR=./uploads
+
+# AnyLoc Settings
+DEVICE=auto
+DINO_MODEL=dinov2_vitg14
+DESC_LAYER=31
+DESC_FACET=value
+VLAD_CLUSTERS=64
+VLAD_DESC_DIM=1536
+"""
+
+
+def test_the_published_env_and_calls_work_and_health_names_the_missing_weights(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / ".env").write_text(PUBLISHED_ENV)
+    # HOST and PORT of the environment have priority; without weights nothing is downloaded.
+    server = ServerProcess(tmp_path / "home", dino_weights=tmp_path / "nowhere.pth", device="cpu")
+    del server._environment["EXTRACTOR"]
+    with server:
+        call = server.client.request
+        deadline = time.monotonic() + START_SECONDS
+        while (health := call("GET", "/api/v1/health")).status_code == 200:
+            assert time.monotonic() < deadline, health.text
+            time.sleep(0.5)
+        part = health.json()["parts"]["extractors"]
+        assert (health.json()["status"], part["status"]) == ("degraded", "degraded")
+        assert "weights_missing" in part["detail"]
+        assert part["processes"][0]["device"] == "cpu"
+
+        uploaded = call(
+            "POST",
+            "/api/v1/upload",
+            files={"file": ("street.jpg", photo_bytes(1))},
+            headers={"Prefer": "wait=30"},
+        )
+        assert uploaded.status_code == 202
+        assert "nowhere.pth" in uploaded.json()["message"]
+        file_id = uploaded.json()["file_id"]
+        problem(call("POST", f"/api/v1/similarity/{file_id}?top_k=5"), 409, "not_searchable")
+        stats = call("GET", "/api/v1/database/stats").json()
+        assert (stats["total_images"], stats["device"]) == (1, "cpu")
+        found = call("GET", "/api/v1/search?filename=street&upload_after=2020-01-01").json()
+        assert [image["image_id"] for image in found["images"]] == [file_id]
+        assert (tmp_path / "uploads").is_dir()
+        assert call("DELETE", f"/api/v1/uploads/{file_id}").is_success
+        assert call("GET", "/docs").is_success
+        assert call("GET", "/redoc").is_success

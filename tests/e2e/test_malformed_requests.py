@@ -80,7 +80,7 @@ def test_the_answer_to_a_waiting_upload_says_how_it_ended(server: ServerProcess)
 
 
 def test_doctor_writes_nothing(tmp_path: Path) -> None:
-    from services.cli.operations.doctor import _check_home, _check_server
+    from services.cli.operations.installation_checks import _check_home, _check_server
     from shared.config.settings import Settings
 
     settings = Settings(placewise_home=tmp_path / "not" / "there")

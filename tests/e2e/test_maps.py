@@ -293,7 +293,7 @@ def wait_until_gone(path: Path) -> None:
 # --- by command ------------------------------------------------------------------------------
 
 
-def test_maps_are_made_filled_asked_and_deleted_by_command(
+def test_maps_are_created_filled_searched_and_deleted_by_command(
     server: ServerProcess, tmp_path: Path
 ) -> None:
     env = environment(server.home, **SETTINGS)

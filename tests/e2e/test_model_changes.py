@@ -181,11 +181,11 @@ def test_answers_say_whose_vocabulary_they_were_made_with(
     own = done(server, server.client.post(VOCABULARIES, json={"clusters": 4, "seed": 7}))
     assert own["clusters"] == 4
     for body in (got(server.ask(photo_bytes(3))), got(server.similar(before.photos[3]))):
-        assert body["vocabulary"] == "own"
+        assert body["vocabulary"] == "provisional"
         assert body["generation_id"] == own["generation_id"]
     assert got(server.ask(photo_bytes(3)))["similar_images"][0]["image_id"] == before.photos[3]
     stats = got(server.client.get("/api/v1/database/stats"))
-    assert (stats["vocabulary"], stats["feature_dimension"]) == ("own", 4 * WIDTH)
+    assert (stats["vocabulary"], stats["feature_dimension"]) == ("provisional", 4 * WIDTH)
     assert vocabulary(server, own["vocabulary_id"])["provenance"]["seed"] == 7
 
 
@@ -201,7 +201,7 @@ def test_a_map_goes_back_to_a_vocabulary_that_it_had(
     assert active(server)["vocabulary_id"] == fitted["vocabulary_id"]
     states = {g["generation_id"]: g["state"] for g in got(server.client.get(GENERATIONS))}
     assert states[imported["generation_id"]] == "retired"
-    assert got(server.similar(before.photos[0]))["vocabulary"] == "own"
+    assert got(server.similar(before.photos[0]))["vocabulary"] == "provisional"
 
 
 @pytest.mark.usefixtures("fitted")

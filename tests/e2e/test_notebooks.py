@@ -6,14 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
+
+from tests.support.training_runs import write_tiny_places
 
 REPOSITORY = Path(__file__).parents[2]
 CELL_SECONDS = 850  # of a busy machine
 
 SMALL = {
     "train": """
+DATA = "city"
 PLACES = 6
 SIZE = "64x64"
 IMAGE_SIZE = [64, 64]
@@ -22,7 +26,7 @@ MAX_STEPS = 1
 ACCELERATOR = "cpu"
 """,
     "pictures": """
-DATA = None
+DATA = SET = PREDICTIONS = CHECKPOINT = None
 PLACES = 4
 SIZE = "64x64"
 EXTRACTOR = "test-tiny-avg"
@@ -30,22 +34,39 @@ EXTRACTOR = "test-tiny-avg"
 }
 
 
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", sorted(SMALL))
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
-def test_notebook_runs_on_generated_places(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture(autouse=True)
+def _environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     monkeypatch.setenv("DECODE_PROCESSES", "1")
     monkeypatch.setenv("DEVICE", "cpu")
     monkeypatch.setenv("MPLBACKEND", "agg")
+
+
+def run_notebook(name: str, parameters: str, folder: Path) -> None:
     file = REPOSITORY / "docs" / "notebooks" / f"{name}.ipynb"
     notebook: Any = nbformat.read(file, as_version=4)  # type: ignore[no-untyped-call]
     assert all(not cell.get("outputs") for cell in notebook.cells), "commit it without outputs"
-    (parameters,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
-    parameters.source = SMALL[name]
-    resources = {"metadata": {"path": str(tmp_path)}}
+    (cell,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
+    cell.source = parameters
+    resources = {"metadata": {"path": str(folder)}}
     NotebookClient(notebook, timeout=CELL_SECONDS, resources=resources).execute()
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", sorted(SMALL))
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
+def test_notebook_runs_on_generated_places(name: str, tmp_path: Path) -> None:
+    run_notebook(name, SMALL[name], tmp_path)
     reports = list(tmp_path.glob("results/**/report.html"))
     assert len(reports) == {"train": 2, "pictures": 1}[name]
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
+def test_pictures_of_a_predictions_file_need_no_model(tmp_path: Path) -> None:
+    write_tiny_places(tmp_path / "places", places=3)
+    found = np.random.default_rng(0).permuted(np.tile(np.arange(6), (3, 1)), axis=1)
+    np.save(tmp_path / "found.npy", found)
+    parameters = 'DATA, PREDICTIONS = "places", "found.npy"\nSET = CHECKPOINT = EXTRACTOR = None'
+    run_notebook("pictures", parameters, tmp_path)
+    assert np.array_equal(np.load(tmp_path / "results" / "predictions_places.npy"), found)

@@ -92,7 +92,7 @@ def test_probes_and_health_say_that_every_part_works(server: ServerProcess) -> N
     body = got(server.client.get(f"{API}/health"))
     assert body["status"] == "healthy"
     assert body["uptime_seconds"] > 0
-    assert set(body["parts"]) == {"catalog", "object_store", "search"}
+    assert set(body["parts"]) == {"catalog", "object_store", "search", "extractors", "uploads"}
     assert {part["status"] for part in body["parts"].values()} == {"healthy"}
 
 
@@ -113,7 +113,7 @@ def test_every_call_is_described_once(server: ServerProcess) -> None:
     assert form["required"] == ["file"]
     assert set(form["properties"]) == {
         *("file", "latitude", "longitude", "heading"),
-        *("captured_at", "place", "tags", "metadata", "role"),
+        *("captured_at", "place", "tags", "metadata", "role", "relative_path"),
     }
 
 

@@ -41,7 +41,7 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     done = server.finished(job["job_id"])
     assert done["state"] == "succeeded"
     assert done["result"] == {**done["result"], "photos": 17, "clusters": 64, "failed": 0}
-    own = ranks(server, real_photos, "own")
+    own = ranks(server, real_photos, "provisional")
     print("rank of the true place, foreign vocabulary:", foreign, "own:", own)
     for query in EASY:
         assert foreign[query] == 1
@@ -51,7 +51,7 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     assert sum(own.values()) <= 25
 
 
-def test_what_makes_real_places_similar_is_said_and_reranking_keeps_the_easy_ones_first(
+def test_what_makes_real_places_similar_is_explained_and_reranking_keeps_the_easy_ones_first(
     server: ServerProcess, real_photos: Path
 ) -> None:
     for name in EASY:

@@ -15,10 +15,10 @@ import httpx2
 import pytest
 
 from shared.catalog.chunks import find_descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredSearchWorker
-from shared.catalog.session import Catalog
 from shared.search_api.client import HttpSearchClient
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from tests.support.photos import photo_bytes

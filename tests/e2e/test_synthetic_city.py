@@ -67,7 +67,7 @@ def test_answer_counts_what_lies_on_disk(city: dict[str, Any], out: Path) -> Non
     assert len(list((out / "queries").iterdir())) == 10
 
 
-def test_every_photo_has_a_name_of_the_convention_and_the_size_asked_for(out: Path) -> None:
+def test_every_photo_has_a_name_of_the_convention_and_the_requested_size(out: Path) -> None:
     photos = list(out.rglob("*.jpg"))
     assert len(photos) == 48 + 10 + 48
     for path in photos:
@@ -137,8 +137,8 @@ def test_ladder_has_six_rungs_with_recalls_that_grow_with_k(command: Command) ->
         "colour histogram",
         "thumbnail 16x16",
         "untrained network",
-        "efficientnet-lite0-vlad, shipped vocabulary",
-        "efficientnet-lite0-vlad, fitted vocabulary",
+        "efficientnet-lite0-vlad128, shipped vocabulary",
+        "efficientnet-lite0-vlad128, fitted vocabulary",
     ]
     for rung in rungs:
         for kind in ("recall", "recall_in_map", "recall_other_way"):

@@ -14,6 +14,7 @@ MAP = "city"
 STEPS = 3
 COMMAND_SECONDS = 600.0  # seconds of work, of which a busy machine makes minutes
 TRAINING = {
+    "backbone_arch": "resnet18",
     "pretrained": "False",
     "layers_to_freeze": "-1",
     "layers_to_crop": "[3,4]",

@@ -239,7 +239,7 @@ def test_form_fields_win_over_exif(server: ServerProcess) -> None:
     )
 
 
-def test_everything_that_is_said_of_a_photo_is_kept(server: ServerProcess) -> None:
+def test_all_metadata_of_a_photo_is_stored(server: ServerProcess) -> None:
     found = photo(
         server,
         server.indexed(

@@ -19,7 +19,7 @@ def command(server: ServerProcess, *arguments: str | Path) -> subprocess.Complet
     return run
 
 
-def test_a_small_map_is_told_in_numbers_why_it_gets_no_weights(
+def test_a_small_map_gets_no_weights_and_the_reason_in_numbers(
     server: ServerProcess, tmp_path: Path
 ) -> None:
     early = command(server, "evaluate", "--word-weights")

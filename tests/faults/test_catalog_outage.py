@@ -21,15 +21,15 @@ from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_threads import start_service_thread
+from services.service_process import start_service_thread
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, find_descriptor
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_or_create_default_map, lock_map
 from shared.catalog.photos import Photo
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.search_api.protocol import SearchRequest
@@ -52,7 +52,7 @@ def breakable() -> Iterator[PostgresServer]:
         yield server
 
 
-class House:
+class Deployment:
     """Every service's parts in this process, on one PostgreSQL."""
 
     def __init__(self, url: str, folder: Path) -> None:
@@ -85,10 +85,10 @@ class House:
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
         evaluator = EvaluationWorker(self.catalog, store, self.search, settings, "evaluator")
-        self.died = threading.Event()
+        self.crashed = threading.Event()
         self._stop = threading.Event()
         self._parts = [
-            start_service_thread(name, part, self._stop, self.died.set)
+            start_service_thread(name, part, self._stop, self.crashed.set)
             for name, part in (
                 ("search", self.search.run),
                 ("presence", WorkerHeartbeat(self.catalog, self.search, "search").run),
@@ -148,8 +148,8 @@ class House:
 
 
 @pytest.fixture
-def house(breakable: PostgresServer, tmp_path: Path) -> Iterator[House]:
-    made = House(breakable.new_database(), tmp_path)
+def deployment(breakable: PostgresServer, tmp_path: Path) -> Iterator[Deployment]:
+    made = Deployment(breakable.new_database(), tmp_path)
     try:
         yield made
     finally:
@@ -157,20 +157,20 @@ def house(breakable: PostgresServer, tmp_path: Path) -> Iterator[House]:
 
 
 def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
-    house: House, breakable: PostgresServer, caplog: pytest.LogCaptureFixture
+    deployment: Deployment, breakable: PostgresServer, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert breakable.process is not None
-    first = house.upload(0).json()["file_id"]
-    house.wait_for(1)
-    request = house.request(first)
-    house.search.sync()
+    first = deployment.upload(0).json()["file_id"]
+    deployment.wait_for(1)
+    request = deployment.request(first)
+    deployment.search.sync()
     acknowledged, refused, strange = {first}, threading.Event(), []
     stop = threading.Event()
 
     def upload(numbers: Iterator[int]) -> None:
         for number in numbers:
             while not stop.is_set():
-                answer = house.upload(number)
+                answer = deployment.upload(number)
                 if answer.status_code in (200, 202):
                     acknowledged.add(answer.json()["file_id"])
                     break
@@ -191,12 +191,12 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     breakable.process.kill()
     try:
         assert refused.wait(ANSWER_SECONDS)
-        assert house.call("GET", "/livez").status_code == 200
-        assert house.call("GET", "/readyz").status_code == 503
-        assert house.call("GET", f"{API}/search").status_code == 503
-        parts = house.call("GET", f"{API}/health")
+        assert deployment.call("GET", "/livez").status_code == 200
+        assert deployment.call("GET", "/readyz").status_code == 503
+        assert deployment.call("GET", f"{API}/search").status_code == 503
+        parts = deployment.call("GET", f"{API}/health")
         assert (parts.status_code, parts.json()["parts"]["catalog"]["status"]) == (503, "unhealthy")
-        assert house.search.search(request).hits, "search answers from memory"
+        assert deployment.search.search(request).hits, "search answers from memory"
         time.sleep(3.0)  # every loop meets it several times
     finally:
         breakable.process.start()
@@ -205,41 +205,43 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     stop.set()
     assert not strange
     assert len(acknowledged) == 31
-    house.wait_for(31)
-    assert house.call("GET", "/readyz").status_code == 200
-    assert not house.died.is_set(), "a part ended"
+    deployment.wait_for(31)
+    assert deployment.call("GET", "/readyz").status_code == 200
+    assert not deployment.crashed.is_set(), "a part ended"
     for part in ("steward", "worker extractor", "worker evaluator"):
         messages = [r.message for r in caplog.records if f"the {part} waits" in r.message]
         assert len(messages) == 1, f"once per outage: {messages}"
 
 
-def test_silent_catalog_is_given_up_within_seconds(house: House, breakable: PostgresServer) -> None:
+def test_silent_catalog_is_given_up_within_seconds(
+    deployment: Deployment, breakable: PostgresServer
+) -> None:
     assert breakable.process is not None
-    assert house.call("GET", f"{API}/search").status_code == 200
+    assert deployment.call("GET", f"{API}/search").status_code == 200
     breakable.process.pause()
     try:
-        assert house.call("GET", f"{API}/search").status_code == 503
-        assert house.call("GET", "/readyz").status_code == 503
-        assert house.call("GET", "/livez").status_code == 200
+        assert deployment.call("GET", f"{API}/search").status_code == 503
+        assert deployment.call("GET", "/readyz").status_code == 503
+        assert deployment.call("GET", "/livez").status_code == 200
     finally:
         breakable.process.resume()
     deadline = time.monotonic() + RECOVERY_SECONDS
-    while house.call("GET", "/readyz").status_code != 200 and time.monotonic() < deadline:
+    while deployment.call("GET", "/readyz").status_code != 200 and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert house.call("GET", f"{API}/search").status_code == 200
-    assert not house.died.is_set()
+    assert deployment.call("GET", f"{API}/search").status_code == 200
+    assert not deployment.crashed.is_set()
 
 
-def test_locked_map_and_an_empty_pool_are_busy_and_not_an_error(house: House) -> None:
-    with house.catalog.write() as session:
+def test_locked_map_and_an_empty_pool_are_busy_and_not_an_error(deployment: Deployment) -> None:
+    with deployment.catalog.write() as session:
         lock_map(session, get_map(session, "default").id)
-        locked = house.call("DELETE", f"{API}/maps/default")
+        locked = deployment.call("DELETE", f"{API}/maps/default")
     assert (locked.status_code, locked.json()["code"]) == (503, "catalog_busy")
     with contextlib.ExitStack() as taken:
         with contextlib.suppress(Exception):
             while True:
-                taken.enter_context(house.catalog.read()).scalar(select(1))
-        empty = house.call("GET", f"{API}/search")
+                taken.enter_context(deployment.catalog.read()).scalar(select(1))
+        empty = deployment.call("GET", f"{API}/search")
     assert (empty.status_code, empty.json()["code"]) == (503, "catalog_busy")
-    assert house.call("GET", f"{API}/search").status_code == 200
-    assert not house.died.is_set()
+    assert deployment.call("GET", f"{API}/search").status_code == 200
+    assert not deployment.crashed.is_set()

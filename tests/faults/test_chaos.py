@@ -28,7 +28,14 @@ def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong(
     faults = [fault for fault in all_faults() if fault.name not in ANOTHER_OF_ITS_KIND]
     assert len(faults) == len(all_faults()) - len(ANOTHER_OF_ITS_KIND)
     run = run_chaos(
-        tmp_path, photos=150, fault_seconds=1.0, seed=20_261_121, faults=faults, executed=False
+        tmp_path,
+        photos=6 * len(faults),  # two before, two during and two after each fault
+        fault_seconds=1.0,
+        seed=20_261_121,
+        faults=faults,
+        queries_per_fault=3,
+        query_interval_seconds=0.4,
+        executed=False,
     )
     assert run.good, "\n".join([*map(str, run.outcomes), *run.details])
     assert len(run.outcomes) == len(faults)

@@ -13,13 +13,13 @@ import httpx2
 import psutil
 
 from benchmarks.chaos.run import check_invariants, count_unfinished_jobs
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
 
-PHOTOS = 300
+PHOTOS = 150
 KILLS = 10
 AGAIN_SECONDS = 0.05
 UPLOAD_SECONDS = 120.0
@@ -106,7 +106,7 @@ def test_a_fit_that_is_killed_goes_on_after_the_restart(tmp_path: Path) -> None:
         job = server.finished(job_id)
         assert job["state"] == "succeeded", job
         assert job["result"]["photos"] == 40
-        assert server.client.get("/api/v1/database/stats").json()["vocabulary"] == "own"
+        assert server.client.get("/api/v1/database/stats").json()["vocabulary"] == "provisional"
 
 
 def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:

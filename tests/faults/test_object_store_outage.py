@@ -163,7 +163,7 @@ def test_connection_that_is_cut_is_tried_once_more(listener: socket.socket) -> N
     ],
     ids=["page", "missing page", "no HTTP"],
 )
-def test_server_that_is_no_s3_is_said_to_be_none(listener: socket.socket, answer: bytes) -> None:
+def test_server_that_is_no_s3_is_reported(listener: socket.socket, answer: bytes) -> None:
     done = threading.Event()
 
     def serve() -> None:

@@ -12,7 +12,7 @@ import httpx2
 import pytest
 from sqlalchemy import select
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from tests.e2e.test_separate_services import Deployment, until

@@ -11,8 +11,8 @@ from services.gateway.app import create_app
 from services.gateway.authentication import ApiKeyAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.security.api_keys import hash_api_key
@@ -36,8 +36,12 @@ class Door:
         self._client = TestClient(self.app, base_url="http://places.example")
 
     def __call__(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:
+        return self.call(key, method, f"/api/v1{path}", **options)
+
+    def call(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:
+        """A call to any path of the server."""
         headers = {"Authorization": f"Bearer {key}", **options.pop("headers", {})}
-        return self._client.request(method, f"/api/v1{path}", headers=headers, **options)
+        return self._client.request(method, path, headers=headers, **options)
 
     def key(self, *scopes: str, **fields: Any) -> dict[str, Any]:
         """A new one, as it was answered."""

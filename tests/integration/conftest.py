@@ -12,8 +12,8 @@ import pytest
 from services.extractor import worker as worker_module
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.worker import ExtractorWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.imaging.decode import DecodedPhoto

@@ -14,7 +14,7 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.storage import OwnedStore

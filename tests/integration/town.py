@@ -18,9 +18,9 @@ from sqlalchemy import select
 
 from services.search.worker import SearchWorker
 from services.steward.evaluation_worker import EvaluationWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.maps import DEFAULT_MAP
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority

@@ -17,6 +17,7 @@ from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -24,7 +25,6 @@ from shared.catalog.generations import (
 )
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor

@@ -45,7 +45,7 @@ CREATE INDEX idx_search_time ON search_history(search_time);
 """
 
 
-class AnylocHouse:
+class AnylocInstallation:
     """One that grows: `backend/app/` with its database in WAL mode, its uploads and the rest."""
 
     def __init__(self, root: Path, app: str = "backend/app") -> None:

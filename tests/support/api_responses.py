@@ -38,6 +38,7 @@ PHOTO: dict[str, Any] = {
     "image_id": PHOTO_ID,
     "image_path": "/image",
     "original_filename": "street.jpg",
+    "relative_path": "Day 2/street.jpg",
     "upload_time": TIME,
     "file_size": 5,
     "width": 4,
@@ -94,6 +95,7 @@ GENERATION: dict[str, Any] = {
     "ended_at": None,
 }
 STATS: dict[str, Any] = {
+    "device": None,
     "map": "default",
     "map_version": 1,
     "total_images": 2,

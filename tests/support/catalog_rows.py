@@ -14,14 +14,14 @@ import numpy as np
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, get_photo, mark_photo_deleted
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, claim_jobs
 from shared.jobs.transitions import cancel_job

@@ -42,7 +42,7 @@ MODULES = (
     "shared.descriptors.vocabulary_file",
     # What is imported at its first use.
     "alembic.command",
-    "shared.catalog.postgres",
+    "shared.catalog.database.postgres",
     "shared.storage.s3",
     "PIL.JpegImagePlugin",
     "anyio._backends._asyncio",

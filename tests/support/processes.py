@@ -27,6 +27,8 @@ READ_AT_START = frozenset(
     {name.upper() for name in Settings.model_fields}
     | {"PLACEWISE_SERVER", "PLACEWISE_KEY", "PYTEST_CURRENT_TEST"}
 )
+# Torch reads it when it first looks for a GPU, not at its import.
+READ_AT_FIRST_USE = frozenset({"CUDA_VISIBLE_DEVICES"})
 ANSWER_BYTES = 1024
 LOOK_SECONDS = 0.01
 
@@ -44,6 +46,12 @@ def _inherited() -> dict[str, str]:
 # The environment of the tests without the developer's settings, as it was before they changed it:
 # libraries write into it when a test imports them.
 INHERITED = _inherited()
+
+
+def _before(env: Mapping[str, str]) -> dict[str, str]:
+    """The variables that a library may have read when it was imported."""
+    late = READ_AT_START | READ_AT_FIRST_USE
+    return {name: value for name, value in env.items() if name not in late}
 
 
 class Process(Protocol):
@@ -80,8 +88,7 @@ def start(
     takes seconds, or `env` has what a library may read at its import.
     """
     words = list(map(str, command))
-    others = {name: value for name, value in env.items() if name not in READ_AT_START}
-    forked = words[0] == PLACEWISE and not executed and others == INHERITED
+    forked = words[0] == PLACEWISE and not executed and _before(env) == _before(INHERITED)
     if forked and sys.platform == "linux":
         return _fork_server().start(words, env, cwd, stdout, stderr)
     return subprocess.Popen(

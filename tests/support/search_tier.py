@@ -15,7 +15,7 @@ from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listen, reachable_url
 from services.search.service import create_search_app
 from services.search.worker import SearchWorker
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.search_api.client import HttpSearchClient

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse

@@ -11,7 +11,7 @@ from psycopg import sql
 from sqlalchemy.engine import make_url
 
 import shared.catalog.tables  # noqa: F401 (all of them)
-from shared.catalog.base import Base
+from shared.catalog.database.base import Base
 from tests.support.servers import PostgresServer
 
 # What migrations have written, and no test changes but in a database of its own.

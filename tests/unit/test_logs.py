@@ -34,7 +34,7 @@ def set_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[Set]:
         logging.getLogger(name).setLevel(was)
 
 
-def test_json_lines_hold_what_was_said_by_whom_and_for_which_request(
+def test_json_lines_hold_message_logger_and_request_id(
     set_up: Set, capsys: pytest.CaptureFixture[str]
 ) -> None:
     set_up(LOG_FORMAT="json")

@@ -29,7 +29,7 @@ SEED = 0
 Rows = NDArray[np.float32]
 
 
-def fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[float] | None:
+def _fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[float] | None:
     """Fit a weight per visual word on pairs of near and far photos.
 
     Args:
@@ -52,7 +52,7 @@ def fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[f
     return weights
 
 
-def fit_and_apply_word_weights(queries: Rows, weights: Sequence[float]) -> Rows:
+def _fit_and_apply_word_weights(queries: Rows, weights: Sequence[float]) -> Rows:
     """Weight the words of each query; a query without weighted words is left unchanged."""
     weighted_queries = [apply_word_weights(query, weights) for query in queries]
     return np.stack(
@@ -151,10 +151,10 @@ def _add_word_weighted(
     for name, rows in described:
         database, queries = rows[: len(names)], rows[len(names) :]
         entries.append((name, queries, database))
-        weights = fit_word_weights(database, names, words[name]) if name in words else None
+        weights = _fit_word_weights(database, names, words[name]) if name in words else None
         if weights is not None:
             entries.append(
-                (f"{name}, word weights", fit_and_apply_word_weights(queries, weights), database)
+                (f"{name}, word weights", _fit_and_apply_word_weights(queries, weights), database)
             )
     return entries
 

@@ -18,15 +18,17 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.markup import escape
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.datasets.synth import synth
 from services.cli.output import (
     JsonOption,
+    Table,
     console,
     err_console,
     print_json,
     print_result,
+    print_table,
     printable_path,
     progress_bar,
     report_errors,
@@ -172,7 +174,7 @@ def _print_training(figures: Json) -> None:
     table = Table("city", Column("places", justify="right"), Column("photos", justify="right"))
     for city, counts in figures["cities"].items():
         table.add_row(escape(city), str(counts["places"]), str(counts["photos"]))
-    console.print(table)
+    print_table(table)
 
 
 def _print_evaluation(summary: Json) -> None:
@@ -343,7 +345,7 @@ def _print_suspects(suspects: list[SuspectLabel]) -> None:
             escape(suspect.query_name),
             escape(suspect.database_name),
         )
-    console.print(table)
+    print_table(table)
     if len(suspects) > MAX_SUSPECTS_SHOWN:
         console.print(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
 

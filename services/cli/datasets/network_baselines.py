@@ -22,7 +22,7 @@ from shared.descriptors.pca_fit import fit_pca, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS
 
-EXTRACTOR = "efficientnet-lite0-vlad"
+EXTRACTOR = "efficientnet-lite0-vlad128"
 BATCH_PHOTOS = 16
 FIT_SAMPLE_PHOTOS = 300
 SEED = 0

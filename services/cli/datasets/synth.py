@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.datasets.baselines import BASELINE_KS, evaluate_baselines
-from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
+from services.cli.output import (
+    JsonOption,
+    Table,
+    console,
+    print_json,
+    print_table,
+    progress_bar,
+    report_errors,
+)
 from shared.synthetic_city.plan import CityOptions, CityPlan, make_plan
 from shared.synthetic_city.write import (
     NOT_COMPARABLE,
@@ -133,7 +141,7 @@ def _print_figures(figures: Json) -> None:
                 for kind in ("in_map", "other_way")
             ),
         )
-    console.print(table)
+    print_table(table)
     console.print(
         f"Recall over {kinds.get('in_map', 0)} queries in the map and "
         f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m.",

@@ -23,8 +23,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.cli.output import atomic_write, printable_path
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.decoder_pool import DecoderPool
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.schema import check_schema
+from shared.catalog.database.errors import explain_outage
+from shared.catalog.database.schema import check_schema
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
@@ -87,7 +87,7 @@ def _added_backbone(
             store = open_store(settings, exclusive=False)
             return AddedModelLoader(catalog, store, settings).load(name, device)
         except SQLAlchemyError as error:
-            unavailable = to_unavailable(error)
+            unavailable = explain_outage(error)
             if unavailable is None:
                 raise
             raise unavailable from error

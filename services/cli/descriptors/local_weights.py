@@ -29,7 +29,7 @@ class WeightsRecord:
     size_bytes: int
 
 
-def load_record(key: str) -> WeightsRecord | None:
+def _load_record(key: str) -> WeightsRecord | None:
     """Look up a record in the cache; None if it is missing."""
     try:
         return WeightsRecord(**_load_cache()[key])
@@ -48,7 +48,7 @@ def save_record(key: str, record: WeightsRecord) -> None:
     Path(file.name).replace(path)
 
 
-def file_key(extractor: str, path: Path) -> str:
+def _file_key(extractor: str, path: Path) -> str:
     """Cache key of a weights file; it changes with the file's size and modification time."""
     stat = path.stat()
     return f"{extractor} {path} {stat.st_size} {stat.st_mtime_ns}"
@@ -203,7 +203,7 @@ def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
         folder = find_local_code(hub)
     except Misconfigured as error:
         return LocalWeights(hub.name, source, False, error.detail, None, None, "unknown", None)
-    known = load_record(torchhub_key(hub, code_fingerprint(folder)))
+    known = _load_record(torchhub_key(hub, code_fingerprint(folder)))
     return LocalWeights(
         hub.name,
         source,
@@ -221,8 +221,8 @@ def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
 def _cached_record(
     name: str, path: Path, fingerprint: Callable[[Path], str], on_reading: Callable[[Path], object]
 ) -> WeightsRecord:
-    key = file_key(name, path)
-    known = load_record(key)
+    key = _file_key(name, path)
+    known = _load_record(key)
     if known is None:
         on_reading(path)
         known = WeightsRecord(fingerprint(path), path.stat().st_size)

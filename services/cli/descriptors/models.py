@@ -22,7 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
     TransferSpeedColumn,
 )
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.client import connect, wait_for_job
 from services.cli.descriptors.local_weights import (
@@ -39,10 +39,12 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
+    Table,
     console,
     err_console,
     print_json,
     print_result,
+    print_table,
     progress_bar,
     report_errors,
 )
@@ -135,7 +137,7 @@ def list_added(
                 escape(", ".join(model.maps)),
                 escape(model.note or ""),
             )
-        console.print(table)
+        print_table(table)
 
 
 def remove(
@@ -190,7 +192,7 @@ def list_(as_json: JsonOption = False) -> None:
             escape(weights.licence),
             (weights.fingerprint or "")[:12],
         )
-    console.print(table)
+    print_table(table)
 
 
 @app.command("fetch")

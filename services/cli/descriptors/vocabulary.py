@@ -9,7 +9,7 @@ from uuid import UUID
 
 import typer
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import Generation, Job
 from placewise.client import Client
@@ -20,11 +20,12 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
+    Table,
     atomic_write,
-    console,
     print_failures,
     print_json,
     print_result,
+    print_table,
     printable_path,
     progress_bar,
     report_errors,
@@ -172,7 +173,7 @@ def list_(
             return
         # IDs are folded, not truncated, so that they can be copied.
         name = Column("vocabulary", overflow="fold", min_width=36)
-        table = Table("", name, "origin", "clusters", "dimension", "photos", "created")
+        table = Table("active", name, "origin", "clusters", "dimension", "photos", "created")
         for v in vocabularies:
             is_active = v.vocabulary_id == active_id
             table.add_row(
@@ -185,7 +186,7 @@ def list_(
                 str(v.provenance.get("photos", "")),
                 f"{v.created_at:%Y-%m-%d %H:%M:%S}",
             )
-        console.print(table)
+        print_table(table)
 
 
 def _validate_id(vocabulary_id: str) -> None:

@@ -49,6 +49,7 @@ class ReportOptions:
     grids: int
     only_wrong: bool
     faiss_gpu: bool
+    place_labels_are_paths: bool
     as_json: bool
 
 
@@ -59,7 +60,7 @@ def evaluate(
             exists=True,
             file_okay=False,
             help="Evaluate on a data set (see `datasets check`) instead of a live map. "
-            "With --predictions: root folder of the listed photos.",
+            "With --ground-truth: root folder of the listed photos.",
         ),
     ] = None,
     sets: Annotated[
@@ -107,7 +108,11 @@ def evaluate(
     ] = None,
     ground_truth: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="With --predictions: ground truth, .npy."),
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="With --predictions: ground truth, .npy. If omitted: that of --data and --set.",
+        ),
     ] = None,
     database: Annotated[
         Path | None,
@@ -164,6 +169,13 @@ def evaluate(
             help="With --sequences: walk, bicycle, car, train, or a maximum speed in m/s."
         ),
     ] = "car",
+    place_labels_are_paths: Annotated[
+        bool,
+        typer.Option(
+            "--place-labels-are-paths",
+            help="With --data: `/` separates the levels of place labels.",
+        ),
+    ] = False,
     sample: Annotated[
         int | None,
         typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
@@ -189,12 +201,21 @@ def evaluate(
     set. With --predictions, evaluate a file of predictions.
     """
     report_options = ReportOptions(
-        out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json
+        out,
+        against,
+        pairs,
+        depth,
+        grids,
+        only_wrong,
+        faiss_gpu,
+        place_labels_are_paths,
+        as_json,
     )
     map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
+        "--place-labels-are-paths": place_labels_are_paths,
     }  # fmt: skip
     file_options: OptionValues = {
         "--ground-truth": ground_truth,
@@ -209,17 +230,29 @@ def evaluate(
         # Must be set before torch is loaded below; see services/cli/__init__.py.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         if predictions is not None:
-            _reject_options("with --predictions", map_options | model_options)
-            if ground_truth is None:
-                raise InvalidRequest(
-                    "no_ground_truth", "--predictions requires --ground-truth GT.npy."
-                )
+            rules: OptionValues = {"--protocol": protocol, "--rule": rule}
+            models = {name: value for name, value in model_options.items() if name not in rules}
+            _reject_options("with --predictions", map_options | models)
             require_packages()
-            from services.cli.evaluation.results import evaluate_predictions
-
-            evaluate_predictions(
-                predictions, ground_truth, database, queries, data, sets, report_options
+            from services.cli.evaluation.results import (
+                evaluate_predictions,
+                evaluate_predictions_of_set,
             )
+
+            if ground_truth is not None:
+                _reject_options("with --ground-truth", rules)
+                evaluate_predictions(
+                    predictions, ground_truth, database, queries, data, sets, report_options
+                )
+                return
+            if data is None:
+                raise InvalidRequest(
+                    "no_ground_truth",
+                    "--predictions requires the data set, --data DIR --set NAME, or a ground "
+                    "truth file, --ground-truth GT.npy.",
+                )
+            _reject_options("without --ground-truth", file_options)
+            evaluate_predictions_of_set(predictions, data, sets, protocol, rule, report_options)
             return
         if data is not None:
             _reject_options("with --data", map_options | file_options)

@@ -16,12 +16,19 @@ from typing import Any
 import numpy as np
 import torch
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.environment import read_settings
 from services.cli.evaluation.data_sets import progress_bars
 from services.cli.evaluation.describers import checkpoint_describer, extractor_describer
-from services.cli.output import console, print_json, printable_path, progress_bar
+from services.cli.output import (
+    Table,
+    console,
+    print_json,
+    print_table,
+    printable_path,
+    progress_bar,
+)
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import choose_device
@@ -313,7 +320,7 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
             f"{result.bytes_a_photo:,}",
             result.against_first(),
         )
-    console.print(table)
+    print_table(table)
     clusters = compared[0].measured.clusters
     console.print(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "

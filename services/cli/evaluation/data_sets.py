@@ -34,11 +34,13 @@ from services.cli.output import progress_bar
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import Conflict, InvalidRequest, NotFound, Unavailable, Unprocessable
-from shared.evaluation.exact_knn import Rankings
+from shared.evaluation.dataset_places import measure_places
+from shared.evaluation.exact_knn import Rankings, exact_knn
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH
+from shared.evaluation.place_levels import LevelScheme
 from shared.evaluation.ranking import (
-    DEFAULT_KS,
     ProgressCallback,
-    evaluate_recall,
+    describe_evaluation_set,
     refused_photos_error,
 )
 from shared.evaluation.results import EvaluationResult, EvaluationRun
@@ -245,6 +247,12 @@ def evaluate_sets(
         Misconfigured: `out_unwritable`, and errors of loading the model.
     """
     target.check()
+    if options.place_labels_are_paths and target.checkpoint is None and target.extractor is None:
+        raise InvalidRequest(
+            "options_contradict",
+            "--place-labels-are-paths requires --checkpoint or --extractor: with --server, levels "
+            "are not measured. To measure those of a map: placewise evaluate --map NAME.",
+        )
     check_output_folders(options)
     settings = read_settings()
     set_names = names or evaluation_set_names(data)
@@ -271,7 +279,7 @@ def evaluate_sets(
                 )
             else:
                 describer = make_describer(evaluation_set, target, settings, progress)
-                result = _evaluate_describer(evaluation_set, describer, options, progress)
+                result = _evaluate_describer(evaluation_set, describer, options, settings, progress)
                 run = EvaluationRun(describer.name, describer.fingerprint, describer.about)
             results.append(result)
     assert run is not None, "at least one set was evaluated"
@@ -296,25 +304,44 @@ def make_describer(
 
 
 def _evaluate_describer(
-    evaluation_set: EvaluationSet, describer: Describer, options: ReportOptions, progress: Progress
+    evaluation_set: EvaluationSet,
+    describer: Describer,
+    options: ReportOptions,
+    settings: Settings,
+    progress: Progress,
 ) -> EvaluationResult:
     on_progress = progress_bars(progress, evaluation_set.name)
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
     )
-    result = evaluate_recall(
-        describer.describe,
-        evaluation_set,
-        ks=[*(k for k in DEFAULT_KS if k <= options.depth), options.depth],
-        faiss_gpu=options.faiss_gpu,
-        on_progress=on_progress,
+    depth = max(options.depth, EVIDENCE_DEPTH)
+    scheme = LevelScheme(
+        labels_are_paths=options.place_labels_are_paths, radii_m=settings.level_radii_m
     )
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
+        database,
+        queries,
+    ):
+        ranked = exact_knn(
+            queries,
+            database,
+            depth,
+            faiss_gpu=options.faiss_gpu,
+            on_progress=lambda done, total: on_progress("search", done, total),
+        )
+        places = measure_places(
+            evaluation_set, database, ranked, scheme, settings.estimate_radius_m
+        )
+        dimension = database.shape[1]
     figures: dict[str, Any] = {
-        "dimension": result.dimension,
-        "bytes_a_photo": 4 * result.dimension,
+        "dimension": dimension,
+        "bytes_a_photo": 4 * dimension,
         "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
     }
-    return evaluate_rankings(evaluation_set, result.ranked, options, has_scores=True, about=figures)
+    shown = Rankings(ranked.indices[:, : options.depth], ranked.scores[:, : options.depth])
+    return evaluate_rankings(
+        evaluation_set, shown, options, has_scores=True, about=figures, places=places
+    )
 
 
 def progress_bars(progress: Progress, name: str) -> ProgressCallback:

@@ -6,12 +6,12 @@ from itertools import islice
 from uuid import UUID
 
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import Json, console, print_json, progress_bar
+from services.cli.output import Json, Table, console, print_json, print_table, progress_bar
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
@@ -91,42 +91,61 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
                 f"{recall['queries']} {kind}",
                 *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
-    console.print(table)
+    print_table(table)
     figures = evaluations[0].figures
     # Evaluations of earlier releases have no `places`.
     if places := (figures.get("with_word_weights") or figures).get("places"):
-        console.print(_answers_table(places))
+        print_table(answers_table(places))
     for line in _estimate_lines(figures.get("with_word_weights") or figures):
         console.print(line, soft_wrap=True)
 
 
-def _answers_table(places: Json) -> Table:
+def answers_table(places: Json) -> Table:
+    """Answers of a place model at each certainty, with 95 % intervals, and the ECE of the levels.
+
+    Args:
+        places: Figures of `evaluate_places` or `measure_places`.
+    """
     errors = ", ".join(
         "-" if level["calibration_error"] is None else f"{level['calibration_error']:.3f}"
         for level in places["levels"]
     )
+    from_queries = "outside_at_finest_level" in places["answers"][0]
+    others = ("outside the map", "outside_at_finest_level")
+    if not from_queries:
+        others = ("impostors", "impostors_at_finest_level")
     source = places["source"].replace("_", " ")
+    measured = f"queries; fitted on {source}" if from_queries else f"{source}, cross-validated"
     table = Table(
-        "certainty",
+        Column("certainty", justify="right"),
         *(
             Column(name, justify="right")
-            for name in ("answered", "at the finest level", "correct", "mean level", "impostors")
+            for name in ("answered", "at the finest level", "correct", "mean level", others[0])
         ),
-        caption=f"{places['samples']} {source}, cross-validated. Expected calibration error by "
-        f"level, finest first: {errors}.",
+        caption=f"{places['samples']} {measured}. Expected calibration error by level, finest "
+        f"first: {errors}.",
     )
     for answers in places["answers"]:
         mean_level = answers["mean_level"]
         table.add_row(
             f"{answers['certainty']:g}",
             *(
-                _format_percent(answers[key]["mean"])
+                format_share(answers[key])
                 for key in ("answered", "answered_at_finest_level", "precision")
             ),
             "-" if mean_level is None else f"{mean_level:.2f}",
-            _format_percent(answers["impostors_at_finest_level"]),
+            _format_percent(answers[others[1]]),
         )
     return table
+
+
+def format_share(figure: Json) -> str:
+    """Format a share with its 95 % interval, if it has one."""
+    text = _format_percent(figure["mean"])
+    if figure["interval"] is None:
+        return text
+    low, high = figure["interval"]
+    return f"{text} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def _recall_rows(figures: Json) -> list[tuple[str, Json]]:

@@ -11,18 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
-from services.cli.output import console, print_json, printable_path
+from services.cli.evaluation.live_map import answers_table
+from services.cli.output import Json, Table, console, print_json, print_table, printable_path
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
-from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet
+from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet, open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
 from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.bootstrap import ConfidenceInterval, cluster_queries, singleton_clusters
-from shared.evaluation.exact_knn import Rankings
+from shared.evaluation.exact_knn import Indices, Rankings
 from shared.evaluation.ranking import DEFAULT_KS
 from shared.evaluation.report.page import render_report
 from shared.evaluation.results import (
@@ -60,6 +61,7 @@ def evaluate_rankings(
     *,
     has_scores: bool,
     about: dict[str, object],
+    places: Json | None = None,
 ) -> EvaluationResult:
     """Compute all metrics of one set, and the comparison with an earlier run, if requested.
 
@@ -70,6 +72,7 @@ def evaluate_rankings(
         options: Output options.
         has_scores: Whether the scores of `ranked` are meaningful.
         about: Further figures to report, such as the descriptor dimension.
+        places: Answers at the levels of places (`measure_places`), if they were measured.
     """
     measured = compute_metrics(
         ranked.indices,
@@ -111,6 +114,7 @@ def evaluate_rankings(
             if evaluation_set.database
             else ()
         ),
+        places=places,
     )
 
 
@@ -165,7 +169,7 @@ def _print_result(result: EvaluationResult) -> None:
     table.add_row(
         f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
     )
-    console.print(table)
+    print_table(table)
     console.print(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; "
@@ -178,6 +182,8 @@ def _print_result(result: EvaluationResult) -> None:
         soft_wrap=True,
         markup=False,
     )
+    if result.places is not None:
+        print_table(answers_table(result.places))
     if result.against is not None:
         for k, difference in result.against.differences.items():
             bounds = difference.interval_in_points()
@@ -234,11 +240,9 @@ def evaluate_predictions(
     """
     if (database is None) != (queries is None):
         raise InvalidRequest("one_list", "--database and --queries must be given together.")
-    if sets and len(sets) > 1:
-        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
     check_output_folders(options)
     ranked = read_predictions(predictions)
-    name = sets[0] if sets else ground_truth.stem
+    name = _only_set(sets) or ground_truth.stem
     rule = None
     photo_lists: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
     if database is not None and queries is not None:
@@ -265,6 +269,47 @@ def evaluate_predictions(
         rule=rule or f"given by {ground_truth.name}",
         protocol=PREDICTIONS_PROTOCOL,
     )
+    _output_predictions(predictions, ranked, evaluation_set, options)
+
+
+def evaluate_predictions_of_set(
+    predictions: Path,
+    data: Path,
+    sets: Sequence[str] | None,
+    protocol: str | None,
+    rule: str | None,
+    options: ReportOptions,
+) -> None:
+    """Evaluate a file of predictions on a set of a data set, with the set's own ground truth.
+
+    Args:
+        predictions: (queries, k) database indices, best first, `.npy`, in the order of the set.
+        data: Folder of the data set.
+        sets: At most one name; may be omitted if there is only one set.
+        protocol: One of the layout's protocols, or None.
+        rule: Positive-match criterion, or None.
+        options: Output options.
+
+    Raises:
+        InvalidRequest: `which_set`, and errors of opening the set and reading the predictions.
+        Misconfigured: `out_unwritable`.
+    """
+    evaluation_set = open_evaluation_set(data, _only_set(sets), protocol=protocol, rule=rule)
+    check_output_folders(options)
+    ranked = read_predictions(predictions)
+    check_predictions(predictions, ranked, evaluation_set.positives, len(evaluation_set.database))
+    _output_predictions(predictions, ranked, evaluation_set, options)
+
+
+def _only_set(sets: Sequence[str] | None) -> str | None:
+    if sets and len(sets) > 1:
+        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
+    return sets[0] if sets else None
+
+
+def _output_predictions(
+    predictions: Path, ranked: Indices, evaluation_set: EvaluationSet, options: ReportOptions
+) -> None:
     truncated = ranked[:, : options.depth]
     rankings = Rankings(truncated, np.zeros(truncated.shape, np.float32))
     result = evaluate_rankings(evaluation_set, rankings, options, has_scores=False, about={})

@@ -5,12 +5,17 @@ The server reads EXIF itself and uses it for every field that is not given here.
 
 from __future__ import annotations
 
+import glob
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from services.cli.output import printable_path
 from shared.datasets.utm_filenames import upload_fields_of_file_name
-from shared.errors import InvalidRequest
+from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
+from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import (
     MAX_REPORTED_LINES,
     bad_lines_error,
@@ -28,32 +33,84 @@ class LocalPhoto:
     """Form fields of `POST /upload`."""
     name: str | None = None
     """Name to store; None for the file's own name."""
+    relative_path: str | None = None
+    """Path in the folder that is indexed."""
+
+
+def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
+    """Expand patterns, and return the folders and photos; None unless all sources are such.
+
+    Raises:
+        InvalidRequest: `no_photos` if a pattern matches nothing.
+    """
+    paths: list[Path] = []
+    for source in sources:
+        found = [Path(source)]
+        if not found[0].exists() and glob.has_magic(source):
+            found = sorted(map(Path, glob.glob(source, recursive=True)))  # noqa: PTH207 absolute, too
+            if not found:
+                raise InvalidRequest("no_photos", f"No file matches the pattern {source}.")
+        paths += found
+    if all(p.is_dir() or (p.is_file() and p.suffix.lower() in PHOTO_SUFFIXES) for p in paths):
+        return paths
+    return None
+
+
+def count_other_files(source: Path) -> int:
+    """Count the files below a folder that are no photos; hidden files are left out."""
+    return sum(
+        path.is_file()
+        and path.suffix.lower() not in PHOTO_SUFFIXES
+        and not path.name.startswith(".")
+        for path in source.rglob("*")
+    )
+
+
+def has_coordinates(photo: LocalPhoto) -> bool:
+    """Return whether a photo has coordinates in its fields or its EXIF.
+
+    A file that can't be read counts as one with: its upload reports what is wrong with it.
+    """
+    if "latitude" in photo.fields:
+        return True
+    try:
+        with photo.path.open("rb") as file:
+            return read_photo_header(file, sys.maxsize).latitude is not None
+    except (OSError, PlacewiseError):
+        return True
 
 
 def find_photos(
-    folder: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
+    source: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
 ) -> list[LocalPhoto]:
-    """Find the photos below a folder, sorted by path, with their metadata.
+    """Find the photos below a folder, sorted by path, or one photo, with their metadata.
 
     Args:
-        folder: Searched recursively.
+        source: A photo, or a folder, which is searched recursively.
         table: CSV file with metadata; it takes precedence over names of files and folders.
         utm_zone: Zone for `@UTM@` file names that don't contain it, such as `32T`.
         places_by_folder: Use the name of a photo's parent folder as its place label. Photos
-            directly in `folder` get none.
+            directly in `source`, and single photos, get none.
 
     Raises:
         InvalidRequest: The table refers to a photo that does not exist, or contains coordinates
             that can't be parsed; `no_photos` if the folder contains none.
     """
-    paths = list_photos(folder)
+    folder = source if source.is_dir() else source.parent
+    paths = [source] if source != folder else list_photos(folder)
     table_fields = _read_csv_fields(folder, table, set(paths)) if table else {}
     photos = []
     for path in paths:
         fields = upload_fields_of_file_name(path.name, utm_zone)
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
-        photos.append(LocalPhoto(path, {**fields, **table_fields.get(path, {})}))
+        photos.append(
+            LocalPhoto(
+                path,
+                {**fields, **table_fields.get(path, {})},
+                relative_path=printable_path(path.relative_to(folder)),
+            )
+        )
     return photos
 
 
@@ -75,7 +132,11 @@ def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
         if not path.is_file():
             missing.append((line.line, f"photo {path} does not exist"))
         photos.append(
-            LocalPhoto(path, {**upload_fields_of_file_name(path.name, None), **line.fields})
+            LocalPhoto(
+                path,
+                {**upload_fields_of_file_name(path.name, None), **line.fields},
+                relative_path=line.name,
+            )
         )
     if missing:
         raise bad_lines_error("bad_manifest", str(manifest), missing[:MAX_REPORTED_LINES])

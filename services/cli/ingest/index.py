@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from services.cli.client import connect
+from placewise.client import Client
+from services.cli.client import connect, describe_target
 from services.cli.environment import read_settings
 from services.cli.ingest.batches import (
     check_archive,
@@ -21,7 +22,14 @@ from services.cli.ingest.batches import (
     manifest_has_keys,
     upload_archive,
 )
-from services.cli.ingest.geotags import LocalPhoto, find_photos, read_photo_manifest
+from services.cli.ingest.geotags import (
+    LocalPhoto,
+    count_other_files,
+    find_local_sources,
+    find_photos,
+    has_coordinates,
+    read_photo_manifest,
+)
 from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
 from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
@@ -43,12 +51,13 @@ from shared.errors import InvalidRequest
 
 
 def index(
-    source: Annotated[
-        str,
+    sources: Annotated[
+        list[str],
         typer.Argument(
-            metavar="DIR|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
-            help="A folder (searched recursively); a zip, tar or gzipped tar archive; a JSONL "
-            "manifest with one photo per line; or a prefix of the server's own bucket.",
+            metavar="DIR|PHOTO...|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
+            help="Folders (searched recursively), photos and patterns such as 'trip/*.jpg'; or one "
+            "zip, tar or gzipped tar archive; or one JSONL manifest with one photo per line; or "
+            "one prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
@@ -111,13 +120,16 @@ def index(
     with report_errors(as_json):
         if failures is not None:
             check_output_path(failures, ".jsonl", "a list of failures")
-        path = Path(source)
-        if source.startswith("s3://"):
-            _reject_options("a bucket prefix", local_file_options)
-            with connect(server, map_name, key) as client, progress_bar() as progress:
-                report = import_prefix(client, source, fit, progress)
-        elif path.is_dir():
-            photos = find_photos(path, table, utm_zone, places_by_folder=places)
+        source, path = sources[0], Path(sources[0])
+        local = find_local_sources(sources)
+        if local is not None:
+            if len(sources) > 1 or not path.is_dir():
+                _reject_options("photos and several folders", {"--csv": table})
+            photos = [
+                photo
+                for one in local
+                for photo in find_photos(one, table, utm_zone, places_by_folder=places)
+            ]
             if role != PhotoRole.DATABASE:
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
             # Vocabularies are fitted on database photos only.
@@ -125,12 +137,24 @@ def index(
             report = _upload_photos(
                 photos, fit_after_upload, update, journal, server, map_name, key
             )
+            report["other_files"] = sum(map(count_other_files, local))
+            report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
+        elif len(sources) > 1:
+            raise InvalidRequest(
+                "several_sources",
+                f"{source} and {len(sources) - 1} more: index archives, manifests and bucket "
+                "prefixes one at a time. Only folders, photos and patterns can be combined.",
+            )
+        elif source.startswith("s3://"):
+            _reject_options("a bucket prefix", local_file_options)
+            with _connect(server, map_name, key) as client, progress_bar() as progress:
+                report = import_prefix(client, source, fit, progress)
         elif path.suffix == ".jsonl":
             _reject_options("a manifest", folder_options)
             data = _read_manifest(path)
             if manifest_has_keys(data):
                 _reject_options("a manifest of object keys", local_file_options)
-                with connect(server, map_name, key) as client, progress_bar() as progress:
+                with _connect(server, map_name, key) as client, progress_bar() as progress:
                     report = import_keys(client, data, fit, progress)
             else:
                 photos = read_photo_manifest(path, data)
@@ -138,11 +162,19 @@ def index(
         else:
             check_archive(path)
             _reject_options("an archive", local_file_options)
-            with connect(server, map_name, key) as client, progress_bar() as progress:
+            with _connect(server, map_name, key) as client, progress_bar() as progress:
                 report = upload_archive(client, path, fit, progress)
         if failures is not None:
             _write_failures(failures, report)
-        _finish_command(report, map_name, role, as_json)
+        _finish_command(report, server, map_name, role, as_json)
+
+
+@contextlib.contextmanager
+def _connect(server: str | None, map_name: str | None, key: str | None) -> Iterator[Client]:
+    with connect(server, map_name, key) as client:
+        target = describe_target(client, server, map_name)
+        err_console.print(f"Indexing into {target}", soft_wrap=True, markup=False)
+        yield client
 
 
 def _upload_photos(
@@ -155,7 +187,7 @@ def _upload_photos(
     key: str | None,
 ) -> Json:
     with (
-        connect(server, map_name, key) as client,
+        _connect(server, map_name, key) as client,
         progress_bar() as progress,
         contextlib.ExitStack() as stack,
     ):
@@ -192,23 +224,36 @@ def _write_failures(out: Path, report: Json) -> None:
                 file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
-def _finish_command(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:
+def _finish_command(
+    report: Json, server: str | None, map_name: str | None, role: PhotoRole, as_json: bool
+) -> None:
     if as_json:
         print_json(report)
     else:
-        _print_report(report, map_name, role)
+        _print_report(report, server, map_name, role)
     if report["refused"] or report["failed"]:
         raise typer.Exit(1)
 
 
-def _print_report(report: Json, map_name: str | None, role: PhotoRole) -> None:
+def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
     err_console.print(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
         f"The map now has {report['searchable']} searchable photos "
         f"(vocabulary: {report['vocabulary']}).",
         soft_wrap=True,
     )
+    if report.get("other_files") or report.get("without_coordinates"):
+        err_console.print(
+            f"{_count(report['other_files'], 'other file')} skipped, "
+            f"{_count(report['without_coordinates'], 'photo')} without coordinates.",
+            soft_wrap=True,
+        )
     print_failures(report, "refused", "failed")
-    map_option = f" --map {map_name}" if map_name else ""
+    options = f" --map {map_name}" if map_name else ""
+    options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    err_console.print(f"Next: {sys.argv[0]} {command}{map_option}", soft_wrap=True)
+    err_console.print(f"Next: {sys.argv[0]} {command}{options}", soft_wrap=True)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -19,8 +19,8 @@ from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
 from services.cli.output import Json, err_console, printable_path
 from shared.errors import Conflict, NotFound, PlacewiseError
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 
-MIN_PHOTOS_TO_FIT = 50
 UPLOAD_CONCURRENCY = 4
 # How long calls are retried while the server is unavailable. A busy server (429) is retried for as
 # long as its Retry-After says.
@@ -150,7 +150,7 @@ def fit_vocabulary_if_needed(
     Returns:
         The map's statistics afterwards, and the job of the fit or None.
     """
-    if stats.vocabulary not in ("foreign", None) or stats.total_images < MIN_PHOTOS_TO_FIT:
+    if stats.vocabulary in ("own", "none") or stats.total_images < MIN_PHOTOS_TO_FIT:
         return stats, None
     vocabulary = fit_and_wait(client, {}, progress)
     return client.stats(), vocabulary
@@ -160,7 +160,7 @@ def _upload_concurrently(
     client: Client, photos: list[LocalPhoto], update: bool
 ) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
     def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
-        fields: dict[str, Any] = dict(photo.fields)
+        fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
 
         def send() -> Uploaded:
             return client.upload(photo.path, filename=photo.name, **fields)
@@ -200,9 +200,9 @@ def _wait_for_jobs(
     waiting: PendingJobs = []
     for photo, job_id in pending:
         try:
-            for job in client.watch(job_id, poll_seconds=POLL_SECONDS):
-                if job.waiting_for:
-                    break
+            job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
+            while not job.finished and not job.waiting_for:
+                job = client.job(job_id, POLL_SECONDS)
         except NotFound:  # recorded in the journal and deleted since
             progress.advance(bar)
             continue

@@ -1,14 +1,13 @@
 """`placewise backup`, `restore` and `rebuild-catalog`.
 
 A backup is a folder with the catalog's rows and the objects that they refer to. `rebuild-catalog`
-recovers a lost catalog from the object store alone. `open_storage` gives other maintenance commands
-access to the catalog and the store.
+recovers a lost catalog from the object store alone. `maintenance` does the work; it is imported
+when a command runs.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -28,57 +26,10 @@ from services.cli.output import (
     progress_bar,
     report_errors,
 )
-from shared.backup.create import create_backup
-from shared.backup.folder import BackupProgress, open_backup
-from shared.backup.restore import restore_backup
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.installation import get_or_create_installation, open_installation_store
-from shared.catalog.schema import check_schema, migrate, opening
-from shared.catalog.session import NO_TIMEOUTS, Catalog
-from shared.catalog.tables import open_catalog
-from shared.config.embedded_home import lock_home
-from shared.config.settings import Settings
-from shared.errors import Misconfigured
-from shared.storage import OwnedStore
-from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner
 
 if TYPE_CHECKING:
+    from shared.backup.folder import BackupProgress
     from shared.rebuild.recover import RecoveryReport
-
-
-@contextlib.contextmanager
-def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
-    """Open the catalog and the object store, whether or not services are running.
-
-    Args:
-        settings: Settings that locate both.
-        command: Name of the command, shown as the database connection's application name.
-
-    Raises:
-        Misconfigured: `nothing_stored` if PLACEWISE_HOME contains no catalog, and the errors of
-            `check_schema` and `open_installation_store`.
-        Unavailable: The database or the object store can't be reached.
-    """
-    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
-        raise Misconfigured(
-            "nothing_stored",
-            f"No catalog found in {settings.placewise_home}. Set PLACEWISE_HOME to the folder of "
-            "the installation, or set DATABASE_URL.",
-        )
-    catalog = open_catalog(settings, command, NO_TIMEOUTS)
-    try:
-        with opening(catalog):
-            check_schema(catalog)
-        yield catalog, open_installation_store(catalog, settings, exclusive=False)
-    except SQLAlchemyError as error:
-        unavailable = to_unavailable(error)
-        if unavailable is None:
-            raise
-        raise unavailable from error
-    finally:
-        catalog.close()
-
 
 MAX_KEYS_SHOWN = 10
 
@@ -95,13 +46,9 @@ def backup(
     then contains everything else.
     """
     with report_errors(as_json), progress_reporter() as progress:
-        settings = read_settings()
-        with open_storage(settings, "backup") as (catalog, store):
-            with catalog.write() as session:
-                installation_id = get_or_create_installation(session).id
-            manifest = create_backup(
-                catalog, store, installation_id, out, settings.import_prefix, progress
-            )
+        from services.cli.operations.maintenance import back_up
+
+        manifest = back_up(read_settings(), out, progress)
     if as_json:
         print_json(asdict(manifest))
     else:
@@ -131,26 +78,10 @@ def restore(
 
     An interrupted restore resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as stack:
-        settings = read_settings()
-        folder, manifest = open_backup(source)
-        if settings.database_url is None:
-            stack.enter_context(lock_home(settings.placewise_home))
-        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
-            stack.enter_context(folder.exclusive_lock())
-        catalog = open_catalog(settings, "restore")
-        stack.callback(catalog.close)
-        migrate(catalog)
-        exclusive = settings.database_url is None
-        restored = restore_backup(
-            folder,
-            manifest,
-            catalog,
-            lambda: open_installation_store(catalog, settings, exclusive=exclusive),
-            settings.import_prefix,
-            progress,
-            store_owner=read_owner(open_store(settings, exclusive=False)),
-        )
+    with report_errors(as_json), progress_reporter() as progress:
+        from services.cli.operations import maintenance
+
+        manifest, restored = maintenance.restore(read_settings(), source, progress)
     print_result(
         asdict(restored),
         as_json,
@@ -191,22 +122,10 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     Recovers photos with their metadata, maps, generations and vocabularies. An interrupted rebuild
     resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as stack:
-        # Imported here: it decodes photos, whose libraries not every image contains.
-        from shared.rebuild.recover import begin_rebuild, recover_catalog
+    with report_errors(as_json), progress_reporter() as progress:
+        from services.cli.operations.maintenance import rebuild
 
-        settings = read_settings()
-        exclusive = settings.database_url is None
-        if exclusive:
-            stack.enter_context(lock_home(settings.placewise_home))
-        catalog = open_catalog(settings, "rebuild-catalog", NO_TIMEOUTS)
-        stack.callback(catalog.close)
-        migrate(catalog)
-        begin_rebuild(catalog, open_store(settings, exclusive=exclusive))
-        store = open_installation_store(catalog, settings, exclusive=exclusive)
-        taken = recover_catalog(
-            catalog, store, settings, unnamed_age_seconds=0.0, progress=progress
-        )
+        taken = rebuild(read_settings(), progress)
     if as_json:
         print_json(asdict(taken))
         return

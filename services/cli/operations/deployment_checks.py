@@ -15,17 +15,18 @@ import httpx2
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.base import db_now, db_now_plus
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.errors import explain_outage
+from shared.catalog.database.schema import check_schema
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, Job
-from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, ProcessStatus, list_processes
-from shared.catalog.schema import check_schema
-from shared.catalog.session import Catalog
+from shared.catalog.processes import ProcessStatus, list_processes
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.ids import new_id
 from shared.search_api.workers import WorkerUnavailable, fetch_status
+from shared.storage.open_store import open_store
 
 # How long a lease may be expired before it counts as overdue. The steward checks every second.
 OVERDUE_LEASE_SECONDS = 30.0
@@ -106,7 +107,7 @@ def check_processes(settings: Settings, role: str) -> str:
         raise _catalog_error(error) from error
     finally:
         catalog.close()
-    live = [p for p in processes if p.seconds_since_heartbeat < PROCESS_TIMEOUT_SECONDS]
+    live = [process for process in processes if process.is_live]
     if live:
         return _names_by_release(live)
     last = min((p.seconds_since_heartbeat for p in processes), default=None)
@@ -202,7 +203,7 @@ def _names_by_release(processes: list[ProcessStatus]) -> str:
 
 
 def _catalog_error(error: SQLAlchemyError) -> PlacewiseError:
-    return to_unavailable(error) or Misconfigured(
+    return explain_outage(error) or Misconfigured(
         "catalog_unreadable",
         f"The catalog can't be queried ({type(error).__name__}). See the check postgresql.",
     )
@@ -235,7 +236,7 @@ def check_postgres(settings: Settings) -> str:
             )
         check_schema(catalog)
     except SQLAlchemyError as error:
-        raise to_unavailable(error) or Misconfigured(
+        raise explain_outage(error) or Misconfigured(
             "catalog_unreadable",
             f"PostgreSQL rejected the query ({type(error).__name__}). Check DATABASE_URL and the "
             "privileges of its user.",
@@ -304,8 +305,6 @@ def check_object_store(settings: Settings) -> str:
             `object_store_unfit` if it ignores ranges or prefixes; `clocks_differ`.
         Unavailable: The store can't be reached.
     """
-    from shared.storage.open_store import open_store  # importing the minio client is slow
-
     store = open_store(settings, exclusive=False)
     store.check()  # some servers create missing buckets on write: a misspelt name must fail here
     key = f"work/doctor-{new_id()}/probe"

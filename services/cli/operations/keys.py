@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import UUID
 
 import typer
-from rich.table import Table
 
 from placewise.answers import CreatedKey, Key
 from placewise.client import Client
@@ -22,9 +21,10 @@ from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
-    console,
+    Table,
     print_json,
     print_result,
+    print_table,
     report_errors,
 )
 from shared.errors import Conflict, NotFound
@@ -33,7 +33,7 @@ from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
     from shared.catalog.api_keys import ApiKey
-    from shared.catalog.session import Catalog
+    from shared.catalog.database.session import Catalog
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -46,6 +46,10 @@ def create(
         str, typer.Argument(metavar="NAME", help="Name of the key: its owner or purpose.")
     ],
     scope: Annotated[list[Scope], typer.Option("--scope", help="Scope to grant. Can be repeated.")],
+    maps: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="Only map that the key may use. Can be repeated. Default: all."),
+    ] = None,
     days: Annotated[
         float | None,
         typer.Option(min=0.001, max=36_500, help="Lifetime in days. Default: no expiry."),
@@ -74,7 +78,7 @@ def create(
     }
     with report_errors(as_json):
         with _open_keys(server, key) as keys:
-            created = keys.create_key(name, list(scope), days=days, **limits)
+            created = keys.create_key(name, list(scope), days=days, maps=maps or None, **limits)
         if as_json:
             print_json(created)
             return
@@ -92,17 +96,18 @@ def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
         if as_json:
             print_json(listed)
             return
-        table = Table("key", "name", "scopes", "created", "last used", "state")
+        table = Table("key", "name", "scopes", "maps", "created", "last used", "state")
         for item in listed:
             table.add_row(
                 f"{item.prefix}...",
                 item.name,
                 ", ".join(item.scopes),
+                "all" if item.maps is None else ", ".join(item.maps),
                 f"{item.created_at:%Y-%m-%d}",
                 f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
                 _key_status(item),
             )
-        console.print(table)
+        print_table(table)
 
 
 @app.command("revoke")
@@ -126,14 +131,24 @@ class _CatalogKeys:
         self._catalog = catalog
 
     def create_key(
-        self, name: str, scopes: Sequence[Scope], days: float | None, **limits: int | None
+        self,
+        name: str,
+        scopes: Sequence[Scope],
+        days: float | None,
+        maps: list[str] | None,
+        **limits: int | None,
     ) -> CreatedKey:
         from shared.catalog.api_keys import KeyLimits, create_api_key
 
         life_seconds = None if days is None else days * SECONDS_PER_DAY
         with self._catalog.write() as session:
             row, secret = create_api_key(
-                session, name, set(scopes), life_seconds=life_seconds, limits=KeyLimits(**limits)
+                session,
+                name,
+                set(scopes),
+                life_seconds=life_seconds,
+                limits=KeyLimits(**limits),
+                maps=maps,
             )
             return CreatedKey(**_key_fields(row), key=secret)
 
@@ -158,7 +173,7 @@ def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _Catalo
             yield client
         return
     # Imported here: the clients of a server need no database.
-    from shared.catalog.schema import wait_for_schema
+    from shared.catalog.database.schema import wait_for_schema
     from shared.catalog.tables import open_catalog
 
     settings = read_settings()

@@ -1,22 +1,19 @@
 """`placewise verify` and `placewise storage`: integrity checks and object store maintenance.
 
 `verify` checks every chunk against its hash and the catalog. `storage` creates the bucket, assigns
-the store to a catalog, and manages orphaned objects and the trash. Modules of the steward are
-imported where they are used, because not every image contains them.
+the store to a catalog, and manages orphaned objects and the trash.
 """
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from services.cli.environment import read_settings
-from services.cli.operations.backup import open_storage, print_taken_in, progress_reporter
+from services.cli.operations.backup import print_taken_in, progress_reporter
 from services.cli.output import (
     JsonOption,
     console,
@@ -25,36 +22,12 @@ from services.cli.output import (
     print_result,
     report_errors,
 )
-from shared.backup.folder import BackupProgress
-from shared.catalog.installation import adopt_store, get_or_create_installation
-from shared.catalog.schema import check_schema, migrate
-from shared.catalog.session import NO_TIMEOUTS, Catalog
-from shared.catalog.tables import open_catalog
-from shared.config.embedded_home import find_running_server, lock_home
-from shared.config.settings import Settings
-from shared.errors import Conflict
-from shared.integrity.verify import FaultKind, IntegrityReport, repair_descriptors, verify_store
-from shared.jobs import InProcessWakeups
-from shared.journal.outbox import Lag, catalog_lag
-from shared.storage import ObjectStore
-from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner
-from shared.storage.trash import (
-    Hold,
-    HoldReason,
-    measure_trash,
-    read_hold,
-    restore_trash,
-    write_hold,
-)
 
 if TYPE_CHECKING:
     from services.steward.tasks.orphans import StoreCount
-    from shared.rebuild.recover import RecoveryReport
-
+    from shared.integrity.verify import IntegrityReport
 
 MAX_FAULTS_SHOWN = 20
-UPLOAD_SECONDS = 3600.0  # an older original does not belong to an upload in progress
 REMEDIES = {
     "chunk": "placewise verify --repair queues their photos again",
     "manifest": "placewise verify --repair queues the photos of their chunks again",
@@ -82,52 +55,23 @@ def verify(
     object store, --repair also recovers the missing records from the store's journal.
     """
     with report_errors(as_json), progress_reporter() as progress:
-        from services.steward.tasks.orphans import find_orphans
+        from services.cli.operations.maintenance import verify_storage
 
-        settings = read_settings()
-        with open_storage(settings, "verify") as (catalog, store):
-            lag, recovered = catalog_lag(catalog, store), None
-            if lag is not None and repair:
-                recovered = _recover_from_journal(catalog, store, settings, lag, progress)
-            report = verify_store(catalog, store, originals=originals, progress=progress)
-            for info in find_orphans(catalog, store, age_seconds=0.0):
-                report.orphans += 1
-                report.orphan_bytes += info.size_bytes
-                progress("orphaned objects", report.orphans, report.orphans)
-            trash = measure_trash(store)
-            report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
-            # No wakeup message is needed: workers poll, and the steward sends messages.
-            queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
+        result = verify_storage(read_settings(), progress, originals=originals, repair=repair)
     if as_json:
         recovery = {
-            "lag": lag.detail if lag else None,
-            "taken_in": asdict(recovered) if recovered else None,
+            "lag": result.lag.detail if result.lag else None,
+            "taken_in": asdict(result.recovered) if result.recovered else None,
         }
-        print_json(_report_as_json(report, queued) | recovery)
+        print_json(_report_as_json(result.report, result.queued_photos) | recovery)
     else:
-        if recovered is not None:
-            print_taken_in(recovered)
-        elif lag is not None:
-            err_console.print(f"[red]behind[/red] {escape(lag.detail)}", soft_wrap=True)
-        _print_report(report, queued)
-    if report.faults or lag is not None:
+        if result.recovered is not None:
+            print_taken_in(result.recovered)
+        elif result.lag is not None:
+            err_console.print(f"[red]behind[/red] {escape(result.lag.detail)}", soft_wrap=True)
+        _print_report(result.report, result.queued_photos)
+    if result.report.faults or result.lag is not None:
         raise typer.Exit(1)
-
-
-def _recover_from_journal(
-    catalog: Catalog, store: ObjectStore, settings: Settings, lag: Lag, progress: BackupProgress
-) -> RecoveryReport:
-    if lag.since is None:
-        raise Conflict("rebuild_unfinished", lag.detail)
-    from shared.rebuild.recover import recover_catalog  # decodes photos: not in every image
-
-    may_be_serving = settings.database_url is not None or find_running_server(
-        settings.placewise_home
-    )
-    age_seconds = UPLOAD_SECONDS if may_be_serving else 0.0
-    return recover_catalog(
-        catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress
-    )
 
 
 def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, Any]:
@@ -182,7 +126,7 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
             err_console.print(f"{kind}s: {REMEDIES[kind]}", soft_wrap=True)
     if queued is not None:
         console.print(f"Queued {queued} photos for description.")
-    if any(f.wrong == FaultKind.MISSING and f.what == "original" for f in report.faults):
+    if any(f.wrong == "missing" and f.what == "original" for f in report.faults):
         err_console.print("Photos without their originals can't be described again.")
 
 
@@ -222,34 +166,14 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     services with the previous catalog refuse to start afterwards. Objects that are not in this
     catalog are kept until you run `placewise storage collect --confirm`.
     """
-    with report_errors(as_json), contextlib.ExitStack() as stack:
-        from services.steward.tasks.orphans import count_store
+    with report_errors(as_json):
+        from services.cli.operations.maintenance import adopt_storage
 
-        settings = read_settings()
-        if settings.database_url is None:
-            stack.enter_context(lock_home(settings.placewise_home))
-        catalog = open_catalog(settings, "storage", NO_TIMEOUTS)
-        stack.callback(catalog.close)
-        store = open_store(settings, exclusive=False)
-        store.check()
-        if confirm and catalog.is_sqlite:
-            migrate(catalog)
-        is_new = catalog.is_sqlite and not Path(catalog.url.database or "").exists()
-        if not is_new:
-            check_schema(catalog)
-            _check_not_owned(catalog, read_owner(store))
-        count = count_store(None if is_new else catalog, store)
-        unknown = count.orphans.total()
-        if confirm:
-            # The hold comes first: without it, this catalog's steward could collect the objects.
-            if unknown:
-                unknown_bytes = count.orphan_bytes.total()
-                write_hold(store, Hold(HoldReason.ADOPTED, unknown, unknown_bytes, count.objects))
-            adopt_store(catalog, store)
+        count = adopt_storage(read_settings(), confirm=confirm)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects, {unknown} of them not in this catalog")
+    console.print(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
     _print_orphans(count)
     if confirm:
         console.print("This catalog is now the owner of the store.")
@@ -270,15 +194,10 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     overrides a hold on garbage collection. Services can keep running.
     """
     with report_errors(as_json):
-        from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
+        from services.cli.operations.maintenance import collect_storage
 
         settings = read_settings()
-        with open_storage(settings, "storage") as (catalog, store):
-            count, moved, hold = StoreCount(), 0, read_hold(store)
-            for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
-                pass
-            if confirm:
-                moved = collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
+        count, moved, hold = collect_storage(settings, confirm=confirm)
     if as_json:
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
@@ -313,25 +232,16 @@ def restore(
     rebuilds a catalog from all objects.
     """
     with report_errors(as_json):
-        settings = read_settings()
-        restored, skipped = 0, 0
-        with open_storage(settings, "storage") as (_, store):
-            for _, was_restored in restore_trash(store, prefix):
-                restored += was_restored
-                skipped += not was_restored
+        from services.cli.operations.maintenance import restore_from_trash
+
+        counts = restore_from_trash(read_settings(), prefix)
+    restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})
         return
     console.print(f"Restored {restored} objects to their keys.")
     if skipped:
         console.print(f"{skipped} objects stay in the trash: their keys are in use again.")
-
-
-def _check_not_owned(catalog: Catalog, owner: str | None) -> None:
-    with catalog.write() as session:
-        installation_id = get_or_create_installation(session).id
-    if owner == str(installation_id):
-        raise Conflict("already_owner", "This catalog already owns the store.")
 
 
 def _as_dict(count: StoreCount) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import explain_outage
 from shared.catalog.installation import Installation
 from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
@@ -90,7 +90,7 @@ def _installation_id(settings: Settings) -> UUID | None:
         with catalog.read() as session:
             return session.scalar(select(Installation.id))
     except SQLAlchemyError as error:
-        raise to_unavailable(error) or Misconfigured(
+        raise explain_outage(error) or Misconfigured(
             "catalog_unreadable",
             f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
             "restore it from a backup.",

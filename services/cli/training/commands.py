@@ -22,10 +22,18 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.environment import require_packages
-from services.cli.output import JsonOption, console, err_console, print_json, report_errors
+from services.cli.output import (
+    JsonOption,
+    Table,
+    console,
+    err_console,
+    print_json,
+    print_table,
+    report_errors,
+)
 from services.cli.training.options import given_options, with_training_options
 from services.trainer.arguments import build_arguments, load_yaml
 from shared.errors import InvalidRequest
@@ -106,7 +114,7 @@ def print_summary(report: Json) -> None:
                 str(set_info["queries"]),
                 f"{set_info['fingerprint'][:12]} {set_info['protocol']}, {set_info['rule']}",
             )
-        console.print(table)
+        print_table(table)
     best = report["best"]
     console.print(
         f"Checkpoint: {best['path']} ({best['dimension']} dimensions, {best['fingerprint'][:12]})",
@@ -195,7 +203,12 @@ def grid(
         "LOGS/grid"
     ),
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Validate and list all runs without training.")
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="List all runs without training, and check device, data sets and weights. "
+            "Missing weights are downloaded.",
+        ),
     ] = False,
     as_json: JsonOption = False,
     **arguments: Any,
@@ -203,7 +216,8 @@ def grid(
     """Train every run of a grid: aggregators x losses x miners, or any other arguments.
 
     Finished runs are skipped and interrupted runs are resumed. A failed run is reported, and the
-    grid continues. Options of `placewise train` override those of every run.
+    grid continues, unless no other run can start for the same reason. Options of `placewise train`
+    override those of every run.
     """
     with report_errors(as_json):
         require_packages(*TRAINING_PACKAGES)
@@ -218,6 +232,7 @@ def _run_grid_command(
     from services.trainer.grid import (
         RunOutcome,
         RunState,
+        find_grid_obstacles,
         load_grid_plan,
         load_outcome,
         run_grid,
@@ -230,7 +245,11 @@ def _run_grid_command(
         outcomes = [load_outcome(planned, out) for planned in plan.runs]
         _print_rows([{"run": o.run.name, "state": str(o.state), **_to_strings(o.run.arguments)}
                for o in outcomes], as_json)  # fmt: skip
-        return 0
+        obstacles = find_grid_obstacles(plan)
+        for obstacle, blocked in obstacles.items():
+            names = ", ".join(blocked) if len(blocked) < len(plan.runs) else "every run"
+            err_console.print(f"{names} can't start: {obstacle}", markup=False, soft_wrap=True)
+        return len(obstacles)
 
     def write(outcomes: list[RunOutcome]) -> None:
         out.mkdir(parents=True, exist_ok=True)
@@ -268,4 +287,4 @@ def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
     table = Table(*columns)
     for row in rows:
         table.add_row(*(row.get(column, "") for column in columns))
-    console.print(table)
+    print_table(table)

@@ -22,7 +22,6 @@ from services.trainer.arguments import (
 
 FIELDS = TrainingArguments.model_fields
 BOOLEANS = {name for name, field in FIELDS.items() if field.annotation is bool}
-BOOLEAN_WORDS = {"true", "false", "yes", "no", "on", "off", "1", "0"}
 SIZES = ("image_size", "test_image_size")
 
 
@@ -79,7 +78,22 @@ def _format_default(value: Any) -> str:
 
 
 class TrainingCommand(TyperCommand):
-    """Accepts booleans and sizes as GSV-Cities scripts write them."""
+    """Accepts booleans and sizes as GSV-Cities scripts write them; its help cuts no name."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        from rich.table import Table
+        from typer import rich_utils
+
+        class OptionsTable(Table):
+            """Wraps descriptions, but not the names in the first or second column."""
+
+            def add_row(self, *cells: Any, **styles: Any) -> None:
+                super().add_row(*cells, **styles)
+                for column in self.columns[:2]:
+                    column.no_wrap = True
+
+        rich_utils.Table = OptionsTable  # type: ignore[attr-defined]
+        super().format_help(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, add_values(args))
@@ -91,7 +105,8 @@ def add_values(tokens: Sequence[str]) -> list[str]:
     while remaining:
         token = remaining.pop(0)
         name = normalise_name(token.removeprefix("--")) if token.startswith("--") else ""
-        has_value = remaining and remaining[0].lower() in BOOLEAN_WORDS
+        # A word is its value, right or wrong; a path is the file of `placewise grid`.
+        has_value = remaining and remaining[0].isalnum()
         if name in BOOLEANS and not has_value:
             token = f"--{name}=true"
         elif name.startswith("no_") and name.removeprefix("no_") in BOOLEANS:

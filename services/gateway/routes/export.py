@@ -44,6 +44,7 @@ CSV_COLUMNS = (
     "captured_at",
     "place",
     "role",
+    "relative_path",
 )
 TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
     200: {
@@ -136,6 +137,7 @@ def _write_tables(
                 Photo.captured_at,
                 Photo.place,
                 Photo.role,
+                Photo.relative_path,
             )
             .join(Photo, Photo.id == Descriptor.photo_id)
             .where(Descriptor.chunk_id == chunk.id, Photo.deleted_at.is_(None))
@@ -145,13 +147,16 @@ def _write_tables(
         writer = csv.writer(lines)
         if not chunks:
             writer.writerow(CSV_COLUMNS)
-        for _, photo_id, name, latitude, longitude, heading, captured_at, place, role in photo_rows:
-            captured = captured_at.isoformat() if captured_at else None
+        for photo in photo_rows:
+            captured = photo.captured_at.isoformat() if photo.captured_at else None
             writer.writerow(
-                [number, photo_id, name, latitude, longitude, heading, captured, place, str(role)]
+                [
+                    *(number, photo.id, photo.filename, photo.latitude, photo.longitude),
+                    *(photo.heading, captured, photo.place, str(photo.role), photo.relative_path),
+                ]
             )
             # A file name may contain line breaks.
-            names.write(" ".join(name.splitlines()).encode() + b"\n")
+            names.write(" ".join(photo.filename.splitlines()).encode() + b"\n")
             number += 1
         table.write(lines.getvalue().encode())
         chunks.append(_ChunkRows(chunk.object_key, chunk.sha256, [row[0] for row in photo_rows]))

@@ -12,15 +12,17 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
-from services.gateway.dependencies import NO_PARAMETERS, GatewayContext, GatewayDep
+from services.gateway.dependencies import ALL_MAPS, NO_PARAMETERS, GatewayContext, GatewayDep
 from services.gateway.schemas import ResponseModel
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.maps import Map
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.jobs import is_job_overdue
+from shared.catalog.maps import Map, list_extractors_in_use, list_maps_without_vocabulary
+from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
-from shared.errors import PlacewiseError, StorageFull
+from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 
 probe_router = APIRouter(tags=["operations"])
-router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS])
+router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS, ALL_MAPS])
 
 STATUSES_WORST_FIRST = ("unhealthy", "degraded", "healthy")
 
@@ -49,10 +51,33 @@ class ComponentStatus(ResponseModel):
     detail: str | None = None
 
 
+class ExtractorProcess(ResponseModel):
+    """A running extractor."""
+
+    name: str
+    device: str | None = Field(description="`cpu` or `cuda`; null while it starts")
+    models: list[str] = Field(description="loaded extractors")
+    errors: dict[str, str] = Field(
+        description="extractors that can't be loaded, with the error code, such as weights_missing"
+    )
+
+
+class ExtractorsStatus(ComponentStatus):
+    """Whether photos can be described.
+
+    `degraded`: no extractor is alive, or a map's extractor can't be loaded.
+    """
+
+    processes: list[ExtractorProcess] = Field(description="extractors with a recent heartbeat")
+    waiting_for_vocabulary: list[str] = Field(
+        description="maps whose photos wait until a vocabulary is fitted or imported"
+    )
+
+
 class LoadResponse(ResponseModel):
     """Load and limits of this gateway.
 
-    At a limit, requests are refused (429, 507), but the service is not unhealthy.
+    At a limit, requests are refused (429, 507), and the service is degraded, not unhealthy.
     """
 
     waiting_jobs: int = Field(description="queued jobs, without queries and jobs of model changes")
@@ -75,7 +100,7 @@ class HealthResponse(ResponseModel):
     status: str
     version: str
     uptime_seconds: float
-    parts: dict[str, ComponentStatus]
+    parts: dict[str, ExtractorsStatus | ComponentStatus]
     load: LoadResponse | None = Field(description="null while the catalog is unreachable")
 
 
@@ -119,9 +144,14 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 
-    `degraded`: chunks or shards can't be searched, or uploads are refused because the disk is full.
+    `degraded`: chunks or shards can't be searched, photos can't be described, or uploads are
+    refused because the disk or the job queue is full.
     """
-    components = _check_components(gateway, admission)
+    components: dict[str, ExtractorsStatus | ComponentStatus] = {
+        **_check_components(gateway, admission),
+    }
+    if components["catalog"].status == "healthy":
+        components["extractors"] = _check_extractors(gateway)
     statuses = {component.status for component in components.values()}
     response.status_code = 200 if statuses == {"healthy"} else 503
     return HealthResponse(
@@ -158,6 +188,7 @@ def _check_components(
         "catalog": _check_catalog(gateway),
         "object_store": _check_object_store(gateway, admission),
         "search": _check_search(gateway),
+        "uploads": _check_uploads(admission),
     }
 
 
@@ -183,6 +214,16 @@ def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) ->
     return ComponentStatus(status="healthy")
 
 
+def _check_uploads(admission: AdmissionControl) -> ComponentStatus:
+    try:
+        admission.check_queue()
+    except TooManyRequests as error:
+        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
+    except SQLAlchemyError:
+        return ComponentStatus(status="degraded", detail="uploads are refused: see catalog")
+    return ComponentStatus(status="healthy")
+
+
 def _check_search(gateway: GatewayContext) -> ComponentStatus:
     try:
         status = gateway.search.status()
@@ -202,3 +243,39 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
     return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")
+
+
+def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
+    with gateway.catalog.read() as session:
+        extractors = [p for p in list_processes(session) if p.role == "extractor"]
+        used = list_extractors_in_use(session)
+        overdue = is_job_overdue(session, PROCESS_TIMEOUT_SECONDS)
+        waiting = list_maps_without_vocabulary(session)
+    live = [
+        ExtractorProcess(
+            name=process.name,
+            device=process.state.get("device"),
+            models=process.state.get("models", []),
+            errors={
+                name: code for name, code in process.state.get("errors", {}).items() if name in used
+            },
+        )
+        for process in extractors
+        if process.is_live
+    ]
+    problems = sorted(
+        {
+            f"{name} can't be loaded ({code}); the extractor's log has the details"
+            for process in live
+            for name, code in process.errors.items()
+        }
+    )
+    # Extractors that are scaled to zero while no job is queued unregister when they stop.
+    if not live and (extractors or overdue):
+        problems.append("no extractor is running: photos are stored, but not described")
+    return ExtractorsStatus(
+        status="degraded" if problems else "healthy",
+        detail="; ".join(problems) or f"{len(live)} running",
+        processes=live,
+        waiting_for_vocabulary=waiting,
+    )

@@ -27,7 +27,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import JobResponse, JobsResponse
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState

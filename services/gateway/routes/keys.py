@@ -28,6 +28,13 @@ class CreateKeyRequest(RequestModel):
 
     name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
     scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))
+    maps: list[str] | None = Field(
+        None,
+        min_length=1,
+        max_length=100,
+        description="names of the only maps that the key may use, which need not exist yet; null: "
+        "all maps. Not with the scope admin",
+    )
     days: float | None = Field(
         None,
         gt=0,
@@ -45,6 +52,7 @@ class KeyResponse(ResponseModel):
     name: str
     prefix: str = Field(description="first characters of the key")
     scopes: list[Scope]
+    maps: list[str] | None = Field(description="the only maps that it may use; null: all maps")
     requests_per_minute: int | None
     upload_bytes_per_day: int | None
     max_photos: int | None
@@ -76,7 +84,12 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
     life_seconds = None if body.days is None else body.days * DAY_SECONDS
     with gateway.catalog.write() as session:
         api_key, secret = create_api_key(
-            session, body.name, set(body.scopes), life_seconds=life_seconds, limits=limits
+            session,
+            body.name,
+            set(body.scopes),
+            life_seconds=life_seconds,
+            limits=limits,
+            maps=body.maps,
         )
         fields = KeyResponse.model_validate(api_key).model_dump()
         return CreatedKeyResponse(**fields, key=secret)

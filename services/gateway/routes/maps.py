@@ -7,12 +7,12 @@ from datetime import datetime
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter, Depends, Path, Request
 from pydantic import Field, field_validator
 from sqlalchemy.orm import Session
 
-from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
+from services.gateway.authentication import READ, WRITE, get_caller
+from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.generations import active_generation
@@ -39,6 +39,13 @@ router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
+
+
+def _check_map(request: Request, name: MapNamePath) -> None:
+    get_caller(request).check_map(name)
+
+
+CHECK_MAP = Depends(_check_map)
 
 
 class CreateMapRequest(RequestModel):
@@ -80,7 +87,7 @@ class MapResponse(ResponseModel):
     counted_at: datetime = Field(description="when the three counts above were computed")
     generation_id: UUID | None
     vocabulary: str | None = Field(
-        description="`own`, `foreign` or `none`; null before the first photo"
+        description="`own`, `provisional`, `foreign` or `none`; null before the first photo"
     )
     dimension: int | None = Field(
         description="dimension of its descriptors; null before the first photo"
@@ -99,13 +106,18 @@ class DeletedMapResponse(ResponseModel):
 
 
 @router.get("/maps", operation_id="list_maps", dependencies=[READ])
-def read_maps(gateway: GatewayDep) -> list[MapResponse]:
-    """List all maps by name."""
+def read_maps(request: Request, gateway: GatewayDep) -> list[MapResponse]:
+    """List the maps that the caller may use, by name."""
+    allowed = get_caller(request).maps
     with gateway.catalog.read() as session:
-        return [_map_response(session, map_) for map_ in list_maps(session)]
+        return [
+            _map_response(session, map_)
+            for map_ in list_maps(session)
+            if allowed is None or map_.name in allowed
+        ]
 
 
-@router.post("/maps", operation_id="create_map", status_code=201, dependencies=[WRITE])
+@router.post("/maps", operation_id="create_map", status_code=201, dependencies=[WRITE, ALL_MAPS])
 def create_new_map(
     gateway: GatewayDep, body: CreateMapRequest, idempotent: IdempotentDep
 ) -> MapResponse:
@@ -128,14 +140,14 @@ def create_new_map(
     return response
 
 
-@router.get("/maps/{name}", operation_id="get_map", dependencies=[READ])
+@router.get("/maps/{name}", operation_id="get_map", dependencies=[READ, CHECK_MAP])
 def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     """Get one map."""
     with gateway.catalog.read() as session:
         return _map_response(session, get_map(session, name))
 
 
-@router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE])
+@router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
     """Change whether the map's place labels are paths.
 
@@ -151,7 +163,7 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
     return gateway.catalog.run(update)
 
 
-@router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE])
+@router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE, CHECK_MAP])
 def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
     """Delete a map with all its photos. An empty map `default` is created again.
 

@@ -17,7 +17,13 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import ADMIN, READ
-from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, MapQuery
+from services.gateway.dependencies import (
+    ALL_MAPS,
+    NO_NUL_PATTERN,
+    NO_PARAMETERS,
+    GatewayDep,
+    MapQuery,
+)
 from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
 from services.gateway.schemas import JobAcceptedResponse, ResponseModel
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
@@ -159,7 +165,7 @@ async def upload_model(
     return accepted
 
 
-@router.get("/models", operation_id="list_models", dependencies=[READ, NO_PARAMETERS])
+@router.get("/models", operation_id="list_models", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
 def read_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
@@ -167,7 +173,9 @@ def read_models(gateway: GatewayDep) -> ModelsResponse:
     return ModelsResponse(models=models)
 
 
-@router.get("/models/{name}", operation_id="get_model", dependencies=[READ, NO_PARAMETERS])
+@router.get(
+    "/models/{name}", operation_id="get_model", dependencies=[READ, NO_PARAMETERS, ALL_MAPS]
+)
 def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:

@@ -46,6 +46,7 @@ from shared.errors import NotFound, invalid_field_error
 from shared.ingest.photo_metadata import (
     check_coordinate_pair,
     check_metadata,
+    parse_relative_path,
     parse_tags,
     parse_time,
 )
@@ -80,6 +81,9 @@ class PhotoUpdate(RequestModel):
     tags: list[Annotated[str, Field(pattern=NO_NUL_PATTERN)]] | None = None
     metadata: dict[str, Any] | None = None
     role: PhotoRole | None = None
+    relative_path: Annotated[str | None, Field(max_length=1000, pattern=NO_NUL_PATTERN)] = Field(
+        None, description="path in its folder or archive, such as Day 2/IMG_2078.jpg"
+    )
 
     def to_columns(self) -> dict[str, Any]:
         """Return the new values of the photo's columns, for the fields that are set."""
@@ -90,6 +94,8 @@ class PhotoUpdate(RequestModel):
             columns["heading"] %= 360
         if "place" in columns:
             columns["place"] = (columns["place"] or "").strip() or None
+        if "relative_path" in columns:
+            columns["relative_path"] = parse_relative_path(columns["relative_path"] or "")
         if "tags" in columns:
             columns["tags"] = parse_tags(columns["tags"] or [])
         if "metadata" in columns:

@@ -43,7 +43,7 @@ from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import UPLOAD_RESPONSES, UploadOutcome, respond_to_upload
 from services.gateway.schemas import ResponseModel, UploadResponse, accepted_headers, url_in_map
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload

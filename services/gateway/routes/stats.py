@@ -15,6 +15,7 @@ from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_map_statistics, list_searches
+from shared.catalog.processes import list_processes
 from shared.catalog.vocabularies import vocabulary_standing
 
 router = APIRouter(tags=["operations"])
@@ -64,6 +65,9 @@ class StatsResponse(ResponseModel):
     feature_dimension: int | None
     max_images_per_chunk: int
     extractor: str
+    device: str | None = Field(
+        description="where extractors compute, `cpu` or `cuda`; null while none is running"
+    )
     vocabulary: str | None
     total_searches: int
     recent_uploads_24h: int
@@ -103,6 +107,14 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
             feature_dimension=generation.dimension if generation else None,
             max_images_per_chunk=gateway.settings.slot_rows,
             extractor=generation.extractor if generation else map_.extractor,
+            device=next(
+                (
+                    process.state["device"]
+                    for process in list_processes(session)
+                    if process.is_live and "device" in process.state
+                ),
+                None,
+            ),
             vocabulary=vocabulary_standing(session, generation) if generation else None,
             total_searches=statistics.searches,
             recent_uploads_24h=statistics.uploads_24h,

@@ -50,6 +50,10 @@ UPLOAD_FORM = multipart_schema(
     place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},
     tags={**_TEXT_SCHEMA, "description": "separated by commas"},
     metadata={**_TEXT_SCHEMA, "description": "a JSON object"},
+    relative_path={
+        **_TEXT_SCHEMA,
+        "description": "path in its folder or archive, such as Day 2/IMG_2078.jpg",
+    },
     role={
         "type": "string",
         "enum": list(PhotoRole),
@@ -210,11 +214,14 @@ def _store_upload(
 
 
 def _outcome_message(stored: StoreResult, job: Job | None) -> str:
-    if not stored.queued:
-        return "The map already has this photo."
-    if job is None or job.state in UNFINISHED_STATES:
-        return "The photo is stored. It is being described in the background."
-    if job.state == JobState.SUCCEEDED:
-        return "The photo is stored and searchable."
+    beginning = "The photo is stored" if stored.queued else "The map already has this photo"
+    if job is None or job.state == JobState.SUCCEEDED:
+        return f"{beginning} and searchable." if stored.queued else f"{beginning}."
     reason = (job.error or {}).get("detail", "")
-    return f"The photo is stored, but its job is {job.state}. {reason}".strip()
+    if job.state not in UNFINISHED_STATES:
+        return f"{beginning}, but its job is {job.state}. {reason}".strip()
+    if job.waiting_for:
+        return f"{beginning}. Its job is waiting for {job.waiting_for}."
+    if reason:
+        return f"{beginning}. Describing it failed and will be tried again: {reason}"
+    return f"{beginning}. It is being described in the background."

@@ -80,7 +80,10 @@ def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
 
 
 @router.post(
-    "/webhooks", operation_id="create_webhook", status_code=201, dependencies=[ADMIN, NO_PARAMETERS]
+    "/webhooks",
+    operation_id="create_webhook",
+    status_code=201,
+    dependencies=[ADMIN, NO_PARAMETERS],
 )
 def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
     """Create a webhook: events are POSTed to the URL, signed with the returned secret.
@@ -101,7 +104,9 @@ def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> Created
 
 
 @router.delete(
-    "/webhooks/{webhook_id}", operation_id="delete_webhook", dependencies=[ADMIN, NO_PARAMETERS]
+    "/webhooks/{webhook_id}",
+    operation_id="delete_webhook",
+    dependencies=[ADMIN, NO_PARAMETERS],
 )
 def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
     """Delete a webhook, its pending deliveries and its delivery log."""

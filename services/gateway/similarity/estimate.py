@@ -20,7 +20,10 @@ from shared.search_api.protocol import SearchHit
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Join hits with the locations of their photos."""
-    return [RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id])) for hit in hits]
+    return [
+        RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id]), hit.photo_id)
+        for hit in hits
+    ]
 
 
 def estimate_place(

@@ -28,9 +28,10 @@ from services.gateway.schemas import (
     job_url,
 )
 from services.gateway.similarity.estimate import add_levels, estimate_place, locate_hits
+from services.gateway.similarity.neighbours import Neighbours
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, Search, get_map
 from shared.catalog.photos import Photo, get_live_photos, get_photo
@@ -288,23 +289,40 @@ def _rank_neighbours(
     hits: Sequence[SearchHit],
     weights: tuple[float, ...],
 ) -> list[RankedPhoto]:
-    """Returns the ranking of the best photo itself, without it and the query."""
+    """Return the ranking of the best photo itself, without it and the query."""
     if not hits:
         return []
-    with gateway.catalog.read() as session:
-        located = find_descriptor(session, query.generation.id, hits[0].photo_id)
-    if located is None:  # deleted since
-        return []
-    best = replace(
-        query, object_key=located[1].object_key, row=located[0].row, photo_id=hits[0].photo_id
+    best = hits[0].photo_id
+    limits = (search_params.mode, search_params.most_rows, search_params.most_seconds)
+    neighbours = gateway.neighbours.get_or_search(
+        (query.generation.id, query.map.version, best, weights, *limits),
+        partial(_search_neighbours, gateway, query, search_params, best, weights),
     )
+    return [ranked for photo_id, ranked in neighbours if photo_id != query.photo_id]
+
+
+def _search_neighbours(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    photo_id: UUID,
+    weights: tuple[float, ...],
+) -> tuple[Neighbours, bool]:
+    """Search with a stored photo; return its ranking, and whether all of the map was searched."""
+    with gateway.catalog.read() as session:
+        located = find_descriptor(session, query.generation.id, photo_id)
+    if located is None:  # deleted since
+        return (), False
+    descriptor, chunk = located
+    photo = replace(query, object_key=chunk.object_key, row=descriptor.row, photo_id=photo_id)
     try:
-        found, photos, _ = _search_live_photos(
-            gateway, best, search_params, NO_FILTER, EVIDENCE_DEPTH + 1, weights=weights
+        hits, photos, response = _search_live_photos(
+            gateway, photo, search_params, NO_FILTER, EVIDENCE_DEPTH + 1, weights=weights
         )
     except Gone:  # its chunk was merged into another one between the two reads
-        return []
-    return locate_hits([hit for hit in found if hit.photo_id != query.photo_id], photos)
+        return (), False
+    ranking = zip((hit.photo_id for hit in hits), locate_hits(hits, photos), strict=True)
+    return tuple(ranking), not response.missing
 
 
 def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:

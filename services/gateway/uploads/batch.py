@@ -92,7 +92,7 @@ async def parse_batch_upload(
     )
     parts = _BatchPartHandler(store, settings)
     form = MultipartFormParser(
-        request, parts, max_bytes, lambda: batch_too_large_error(settings.max_archive_size)
+        request, parts, max_bytes, lambda: _batch_too_large_error(settings.max_archive_size)
     )
     try:
         async for piece in request.stream():
@@ -123,7 +123,7 @@ def discard_batch_upload(store: ObjectStore, received: BatchUpload) -> None:
             store.delete(file.key)
 
 
-def batch_too_large_error(max_bytes: int) -> PlacewiseError:
+def _batch_too_large_error(max_bytes: int) -> PlacewiseError:
     """Build the 413 error for a batch of more than `max_bytes`."""
     return TooLarge(
         "batch_too_large",
@@ -220,7 +220,7 @@ class _BatchPartHandler:
             return
         self._files_bytes += len(piece)
         if self._files_bytes > self._settings.max_archive_size:
-            raise batch_too_large_error(self._settings.max_archive_size)
+            raise _batch_too_large_error(self._settings.max_archive_size)
         assert self._file is not None
         self._write_queue.append((self._file, piece))
 

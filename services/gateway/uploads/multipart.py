@@ -94,12 +94,12 @@ class MultipartFormParser:
         try:
             self._parser.write(piece)
         except MultipartParseError as error:
-            raise malformed_body_error(str(error)) from error
+            raise _malformed_body_error(str(error)) from error
 
     def finish(self) -> None:
         """Raise InvalidRequest (`malformed_body`) if the body is incomplete."""
         if not self._ended:
-            raise malformed_body_error("the body ends before the last boundary")
+            raise _malformed_body_error("the body ends before the last boundary")
 
     def _on_part_begin(self) -> None:
         self._disposition = b""
@@ -119,7 +119,7 @@ class MultipartFormParser:
         _, options = parse_options_header(self._disposition)
         name = options.get(b"name", b"").decode("utf-8", "replace")
         if not name:
-            raise malformed_body_error("a part has no name")
+            raise _malformed_body_error("a part has no name")
         filename = options.get(b"filename")
         self._handler.begin(name, None if filename is None else filename.decode("utf-8", "replace"))
 
@@ -130,7 +130,7 @@ class MultipartFormParser:
         self._ended = True
 
 
-def malformed_body_error(reason: str) -> PlacewiseError:
+def _malformed_body_error(reason: str) -> PlacewiseError:
     """Build the 400 error for a body that can't be parsed."""
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
@@ -155,7 +155,7 @@ def _parse_boundary(request: Request) -> bytes:
         )
     boundary = options.get(b"boundary", b"")
     if not 0 < len(boundary) <= 70:
-        raise malformed_body_error("the boundary is missing or too long")
+        raise _malformed_body_error("the boundary is missing or too long")
     return boundary
 
 
@@ -319,5 +319,5 @@ class _SingleFileHandler:
         try:
             self.fields[self._field] = self._value.decode("utf-8")
         except UnicodeDecodeError:
-            raise malformed_body_error(f"the field {self._field!r} is not UTF-8") from None
+            raise _malformed_body_error(f"the field {self._field!r} is not UTF-8") from None
         self._value.clear()

@@ -134,7 +134,7 @@ def _to_items(
         line = manifest_lines.get(name)
         item: dict[str, Any] = {
             "name": name,
-            "source": member_location(member),
+            "source": _member_location(member),
             "line": line.line if line else None,
         }
         try:
@@ -167,13 +167,13 @@ def _validate_member(
     }
 
 
-def member_location(member: ArchiveMember) -> dict[str, Any]:
+def _member_location(member: ArchiveMember) -> dict[str, Any]:
     """Return the location of a member as JSON, for `member_from_location`."""
     return {"offset": member.offset, "size_bytes": member.size_bytes}
 
 
 def member_from_location(name: str, location: dict[str, Any]) -> ArchiveMember:
-    """Return the member at a location that `member_location` returned."""
+    """Return the member at a location that `_member_location` returned."""
     return ArchiveMember(name, MemberKind.FILE, location["offset"], location["size_bytes"])
 
 

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 from uuid import UUID
 
@@ -43,12 +44,13 @@ from shared.catalog.batch_items import (
     sync_item_states,
     update_batch_progress,
 )
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import WaitingFor, claimable_condition
-from shared.catalog.session import Catalog
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
 from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
+from shared.ingest.photo_metadata import parse_relative_path
 from shared.ingest.store_photo import PhotoQuota, StoreResult, insert_photo, retry_on_conflict
 from shared.ingest.validation import (
     StoredUpload,
@@ -112,6 +114,9 @@ class BatchItemImporter:
             photo = validate_photo(
                 self._store, stored_upload, self._settings.max_image_pixels, key_id
             )
+            if photo.fields.relative_path is None:
+                path = parse_relative_path(item.name.removeprefix(self._settings.import_prefix))
+                photo = replace(photo, fields=replace(photo.fields, relative_path=path))
             with self._reserve_quota(job, key_id):
                 result = retry_on_conflict(lambda: self._commit(job, item, photo))
         except Unavailable:

@@ -13,10 +13,10 @@ from uuid import UUID
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
 from shared.catalog.maps import get_map_statistics, list_maps, lock_map
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority

@@ -10,12 +10,12 @@ import numpy as np
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
 from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
 from shared.storage import ObjectStore

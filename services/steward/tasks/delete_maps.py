@@ -15,14 +15,14 @@ from uuid import UUID
 from sqlalchemy import delete, select
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from shared.catalog.base import affected_rows, is_journaled
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import affected_rows, is_journaled
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.jobs.transitions import cancel_jobs
 from shared.storage import ObjectStore

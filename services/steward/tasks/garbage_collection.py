@@ -14,8 +14,9 @@ from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from shared.catalog.base import db_now, db_now_plus, is_journaled
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import db_now, db_now_plus, is_journaled
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import (
     MODEL_CHANGE_JOBS,
@@ -26,7 +27,6 @@ from shared.catalog.jobs import (
 )
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening
 from shared.config.settings import Settings
 from shared.storage import ObjectStore

@@ -15,12 +15,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.steward.tasks import model_changes
-from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.catalog.processes import unreadable_keys
-from shared.catalog.session import Catalog
 from shared.errors import NotFound, PlacewiseError, Unavailable
 from shared.integrity.verify import discard_chunk
 from shared.jobs import Job

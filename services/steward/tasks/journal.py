@@ -11,10 +11,10 @@ import logging
 from sqlalchemy import or_, select
 
 from services.steward.metrics import StewardMetrics
-from shared.catalog.base import Condition, db_now_plus, is_journaled
+from shared.catalog.database.base import Condition, db_now_plus, is_journaled
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.journal.outbox import Lag, catalog_lag, write_journal
 from shared.storage import ObjectStore

@@ -9,7 +9,8 @@ import logging
 
 from sqlalchemy import delete, exists, or_, select
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.jobs import Job, JobState, Priority, claimable_condition
 from shared.catalog.maps import (
@@ -20,7 +21,6 @@ from shared.catalog.maps import (
     list_maps,
 )
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.catalog.webhooks import Delivery
 from shared.jobs import Wakeups, reclaim_expired_leases
 from shared.jobs.wakeups import WakeupQueue

@@ -14,8 +14,9 @@ from uuid import UUID
 from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session, aliased
 
-from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.catalog.chunks import Descriptor, estimate_described
+from shared.catalog.database.base import Condition, db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -26,10 +27,10 @@ from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.processes import delete_dead_search_workers, list_lagging_workers
-from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import StoredWhitening
+from shared.catalog.vocabularies import StoredWhitening, vocabulary_standing
 from shared.catalog.webhooks import EventKind, enqueue_event
 from shared.errors import Conflict
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.model_changes import start_model_change
@@ -114,10 +115,19 @@ def advance_model_changes(catalog: Catalog, wakeups: Wakeups) -> None:
 
 
 def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
-    """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one."""
+    """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one.
+
+    A provisional vocabulary is replaced once the map has as many photos, and at least
+    MIN_PHOTOS_TO_FIT.
+    """
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
-        ready = [id_ for id_ in maps if _has_enough_waiting_photos(session, id_, auto_fit_photos)]
+        ready = [
+            id_
+            for id_ in maps
+            if _has_enough_waiting_photos(session, id_, auto_fit_photos)
+            or _has_outgrown_its_vocabulary(session, id_, auto_fit_photos)
+        ]
     for map_id in ready:
         with catalog.write() as session:
             if _last_change_failed(session, map_id):
@@ -146,6 +156,31 @@ def _has_enough_waiting_photos(session: Session, map_id: UUID, min_photos: int) 
         .limit(min_photos)
     )
     return session.scalar(select(func.count()).select_from(waiting.subquery())) == min_photos
+
+
+def _has_outgrown_its_vocabulary(session: Session, map_id: UUID, min_photos: int) -> bool:
+    """Return whether the map's vocabulary is provisional and the map has enough photos for another.
+
+    A PCA whitening was fitted on descriptors of the vocabulary, so a user has to replace both.
+    """
+    active = active_generation(session, map_id)
+    if (
+        active is None
+        or active.pca_from is not None
+        or vocabulary_standing(session, active) != "provisional"
+    ):
+        return False
+    required = max(min_photos, MIN_PHOTOS_TO_FIT)
+    photos = (
+        select(Photo.id)
+        .where(
+            Photo.map_id == map_id,
+            Photo.deleted_at.is_(None),
+            Photo.role == PhotoRole.DATABASE,
+        )
+        .limit(required)
+    )
+    return session.scalar(select(func.count()).select_from(photos.subquery())) == required
 
 
 def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:

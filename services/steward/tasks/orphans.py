@@ -21,13 +21,13 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
 from shared.journal.outbox import accept_segments, catalog_lag

@@ -1,4 +1,4 @@
-"""Alembic's environment script; `shared.catalog.schema.migrate` passes it a connection."""
+"""Alembic's environment script; `shared.catalog.database.schema.migrate` passes it a connection."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from alembic import context
 from sqlalchemy import delete, insert, inspect
 
 import shared.catalog.tables  # noqa: F401  (registers every table)
-from shared.catalog.base import Base
+from shared.catalog.database.base import Base
 from shared.catalog.tables import SchemaCompatibility
 
 connection = context.config.attributes.get("connection")

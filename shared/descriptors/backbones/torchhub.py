@@ -40,11 +40,11 @@ LICENCE_FILES = re.compile(r"(licen[cs]e|copying)([.-].*)?", re.IGNORECASE)
 NETWORK_ERRORS = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
 
 
-def ignore_progress(_done: int, _total: int | None) -> None:
+def _ignore_progress(_done: int, _total: int | None) -> None:
     """Progress callback that does nothing."""
 
 
-def cached_code_folder(hub: TorchHubEntry) -> Path:
+def _cached_code_folder(hub: TorchHubEntry) -> Path:
     """Return the folder of the entry's code, whether or not it exists."""
     if hub.folder is not None:
         return Path(hub.folder)
@@ -52,33 +52,33 @@ def cached_code_folder(hub: TorchHubEntry) -> Path:
     return Path(torch.hub.get_dir(), f"{hub.repository.replace('/', '_')}_{hub.commit}")
 
 
-def find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_progress) -> Path:
+def _find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = _ignore_progress) -> Path:
     """Return the folder of the code; a repository is downloaded from GitHub if it is missing.
 
     Raises Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
     """
-    folder = cached_code_folder(hub)
+    folder = _cached_code_folder(hub)
     if hub.folder is None and not folder.exists():
         try:
             _download_repository(hub, folder, on_progress)
         except (*NETWORK_ERRORS, OSError) as error:
-            raise code_missing_error(
+            raise _code_missing_error(
                 hub, f"its code can't be downloaded: {first_error_line(error)}"
             ) from error
     return find_local_code(hub)
 
 
 def find_local_code(hub: TorchHubEntry) -> Path:
-    """As `find_or_download_code`, without downloading: raises `weights_missing` instead."""
-    folder = cached_code_folder(hub)
+    """As `_find_or_download_code`, without downloading: raises `weights_missing` instead."""
+    folder = _cached_code_folder(hub)
     if not (folder / HUBCONF).is_file():
         reason = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not downloaded"
-        raise code_missing_error(hub, reason)
+        raise _code_missing_error(hub, reason)
     return folder
 
 
-def load_module(
-    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = ignore_progress
+def _load_module(
+    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = _ignore_progress
 ) -> torch.nn.Module:
     """Execute the entry of the folder's `hubconf.py` with its arguments.
 
@@ -100,12 +100,12 @@ def load_module(
             message += ". It asks a question (as torch.hub does about a further repository), but "
             message += "there is no interactive input"
         if any(isinstance(cause, NETWORK_ERRORS) for cause in _exception_chain(error)):
-            raise code_missing_error(
+            raise _code_missing_error(
                 hub, f"a file that it needs can't be downloaded: {message}"
             ) from error
-        raise torchhub_unfit_error(hub, f"loading it failed with {message}") from error
+        raise _torchhub_unfit_error(hub, f"loading it failed with {message}") from error
     if not isinstance(module, torch.nn.Module):
-        raise torchhub_unfit_error(
+        raise _torchhub_unfit_error(
             hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module"
         )
     return module
@@ -137,7 +137,7 @@ def find_licence(folder: Path) -> str:
     return "none found"
 
 
-def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
+def _code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     """Return the error for code or weights that are missing.
 
     API clients see the message: it names no local folder that is not in the extractor's name.
@@ -163,7 +163,7 @@ def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     )
 
 
-def torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
+def _torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     """Return the error for an entry that can't be used."""
     return Misconfigured(
         "torchhub_unfit",
@@ -268,21 +268,25 @@ class TorchHubBackbone:
     facet: str | None = None
 
     def __init__(
-        self, hub: TorchHubEntry, device: torch.device, *, on_progress: OnProgress = ignore_progress
+        self,
+        hub: TorchHubEntry,
+        device: torch.device,
+        *,
+        on_progress: OnProgress = _ignore_progress,
     ) -> None:
         """Load the entry, which executes its code, and check it on two images of noise.
 
         Raises Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
         """
         self._hub = hub
-        folder = find_or_download_code(hub, on_progress)
+        folder = _find_or_download_code(hub, on_progress)
         # Before anything is executed: the code may change its own folder.
         self.code_fingerprint = code_fingerprint(folder)
         self.name = hub.module
         self.layer = hub.entry
         self.licence = find_licence(folder)
         self.device = device
-        module = load_module(hub, folder, on_progress)
+        module = _load_module(hub, folder, on_progress)
         self._module = module.eval().requires_grad_(False).to(device)
         self.fingerprint, size_bytes = module_fingerprint(self._module)
         self.card: dict[str, Any] = {
@@ -315,32 +319,32 @@ class TorchHubBackbone:
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
         except Exception as error:  # third-party networks may raise anything
-            raise torchhub_unfit_error(
+            raise _torchhub_unfit_error(
                 hub,
                 f"with 2 photos of {hub.height} x {hub.width} pixels it fails with "
                 f"{type(error).__name__}: {first_error_line(error)}",
             ) from error
         if not isinstance(both, torch.Tensor) or not both.is_floating_point():
-            raise torchhub_unfit_error(
+            raise _torchhub_unfit_error(
                 hub, f"it returns a {_describe_value(both)}, not a tensor of floats"
             )
         if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
-            raise torchhub_unfit_error(
+            raise _torchhub_unfit_error(
                 hub,
                 f"for 2 photos it returns the shape {tuple(both.shape)}, for one "
                 f"{tuple(alone.shape)}; expected one descriptor per photo: (2, D) and (1, D)",
             )
         if both.shape[1] > MAX_WIDTH:
-            raise torchhub_unfit_error(
+            raise _torchhub_unfit_error(
                 hub, f"{both.shape[1]} dimensions exceed the maximum of {MAX_WIDTH}"
             )
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
+            raise _torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()):
-            raise torchhub_unfit_error(hub, "its descriptors are zero")
+            raise _torchhub_unfit_error(hub, "its descriptors are zero")
         cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
         if cosine < MIN_REPEAT_COSINE:
-            raise torchhub_unfit_error(
+            raise _torchhub_unfit_error(
                 hub,
                 "the descriptor of a photo depends on the other photos of its batch (cosine "
                 f"{cosine:.3f}), and the composition of batches varies",

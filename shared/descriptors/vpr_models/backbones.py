@@ -220,7 +220,7 @@ def check_weights_file(path: Path, name: str) -> Path:
         what = "is not a file" if path.exists() else "does not exist"
         raise Misconfigured(
             "weights_missing",
-            f"{path}, given as the file of the pretrained weights of {name}, {what}.",
+            f"{path}, given as the pretrained weights of {name} (--weights), {what}.",
         )
     return path
 
@@ -274,8 +274,8 @@ def _pretrained_missing_error(name: str, url: str, reason: str) -> Misconfigured
         "weights_missing",
         f"{reason} Ways to get the pretrained weights of {name}: (1) with internet access they are "
         f"downloaded on first use; (2) copy {url} from another machine to {folder}; (3) pass a "
-        "file of them; (4) pretrained=False starts with random weights, which needs far more "
-        "photos and epochs.",
+        "file of them with --weights FILE; (4) --pretrained False starts with random weights, "
+        "which needs far more photos and epochs.",
     )
 
 
@@ -383,6 +383,8 @@ def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbo
     name = config.backbone_arch
     backbone = _BUILDERS[name](name, config.pretrained, weights)
     assert len(backbone.stages) == STAGES[name]
+    if not config.backbone_norm:
+        backbone.norm = nn.Identity()
     backbone.crop(config.stages)
     backbone.freeze(config.layers_to_freeze)
     return backbone.eval()

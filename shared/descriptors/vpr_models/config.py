@@ -27,6 +27,8 @@ STAGES = {
 """Backbones and their number of stages after the stem: layer1 to layer4 of a ResNet, the blocks of
 a transformer. The 8th stage of an EfficientNet is the convolution before its classifier."""
 
+NORMED_BACKBONES = ("dinov2", "swin")
+
 ALIASES = {
     "resnext50": "resnext50_32x4d",
     "tf_efficientnet_lite0": "efficientnet_lite0",
@@ -65,6 +67,9 @@ class VprModelConfig(BaseModel):
     layers keep their weights and their BatchNorm statistics during training."""
     layers_to_crop: tuple[int, ...] = ()
     """Stage numbers, from 1: the lowest of them and all later stages are removed."""
+    backbone_norm: Annotated[bool, Field(exclude_if=bool)] = True
+    """Whether the final LayerNorm of DINOv2 and Swin is applied to the map. Left out of the stored
+    configuration if true, so that fingerprints of models without this field remain."""
     agg_arch: str = "AVG"
     agg_config: dict[str, Any] = {}
     """Arguments of the aggregator. Missing ones have the published defaults; the sizes of the map
@@ -117,6 +122,10 @@ class VprModelConfig(BaseModel):
             raise _bad_config_error(
                 f"layers_to_freeze={self.layers_to_freeze}: {self.backbone_arch} has {count} "
                 f"stages; set a number from {NO_FREEZING} (train everything) to {count}."
+            )
+        if not self.backbone_norm and not self.backbone_arch.startswith(NORMED_BACKBONES):
+            raise _bad_config_error(
+                f"backbone_norm=False: {self.backbone_arch} has no final norm; remove it."
             )
         outside = [n for n in self.layers_to_crop if not MIN_STAGE_TO_CROP <= n <= count]
         if outside:

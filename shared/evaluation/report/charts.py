@@ -11,7 +11,7 @@ import io
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,26 @@ def precision_chart(result: EvaluationResult) -> str | None:
     axes.plot(curve.recall, curve.precision, color=BLUE, label=f"area {curve.area:.3f}")
     axes.legend()
     return render_chart(figure, "Precision and recall of the first match")
+
+
+def reliability_chart(levels: Sequence[dict[str, Any]]) -> str:
+    """Render the observed share of right answers over the stated probability, a line a level.
+
+    Args:
+        levels: Figures of each level (`reliability_figures`), finest first.
+    """
+    figure, axes = percent_chart("stated probability", "observed share")
+    axes.plot([0, 1], [0, 1], "--", color=GREY)
+    for level in levels:
+        bins = level["reliability"]
+        stated = [each["stated"] for each in bins]
+        observed = [each["observed"]["mean"] for each in bins]
+        (line,) = axes.plot(stated, observed, ".-", label=f"level {level['level']}")
+        for x, each in zip(stated, bins, strict=True):
+            if (interval := each["observed"]["interval"]) is not None:
+                axes.vlines(x, *interval, color=line.get_color(), alpha=0.4)
+    axes.legend()
+    return render_chart(figure, "Reliability of the probabilities of levels")
 
 
 def distance_chart(result: EvaluationResult) -> str | None:

@@ -14,6 +14,7 @@ from shared.evaluation.report.charts import (
     positions_chart,
     precision_chart,
     recall_chart,
+    reliability_chart,
 )
 from shared.evaluation.report.retrieval_grids import differences_section, retrieval_grids
 from shared.evaluation.results import EvaluationResult, EvaluationRun, package_versions
@@ -65,6 +66,8 @@ def _set_section(result: EvaluationResult, grids_shown: int, only_wrong: bool) -
     charts = [recall_chart(result), precision_chart(result), distance_chart(result)]
     figures = "".join(f"<figure>{chart}</figure>" for chart in charts if chart)
     parts.append(f'<div class="charts">{figures}</div>')
+    if result.places is not None:
+        parts.append(_places_section(result.places))
     if result.against:
         parts.append(differences_section(result, result.against, grids_shown))
     if (positions := positions_chart(result)) is not None:
@@ -129,6 +132,64 @@ def _other_metrics(result: EvaluationResult) -> dict[str, Any]:
     for name, value in result.about.items():
         facts[name.replace("_", " ")] = f"{value:.1f}" if isinstance(value, float) else value
     return facts
+
+
+def _places_section(places: dict[str, Any]) -> str:
+    """Answers at each certainty, and the reliability of the levels (`measure_places`)."""
+    heads = "".join(
+        f"<th>{head}</th>"
+        for head in (
+            "certainty",
+            "answered",
+            "at the finest level",
+            "correct",
+            "mean level",
+            "outside the map, at the finest level",
+        )
+    )
+    rows = "".join(
+        f"<tr><th>{each['certainty']:g}</th>"
+        + "".join(
+            f'<td class="n">{cell}</td>'
+            for cell in (
+                *(
+                    _format_figure(each[key])
+                    for key in ("answered", "answered_at_finest_level", "precision")
+                ),
+                "-" if each["mean_level"] is None else f"{each['mean_level']:.2f}",
+                _format_percent(each["outside_at_finest_level"]),
+            )
+        )
+        + "</tr>"
+        for each in places["answers"]
+    )
+    errors = {
+        f"level {level['level']}: calibration error (ECE)": (
+            f"{_format_number(level['calibration_error'])} over {level['samples']} queries, "
+            f"{_format_percent(level['accuracy'])} correct"
+        )
+        for level in places["levels"]
+    }
+    source = f"The probabilities were fitted on {places['own_photos']} database photos"
+    if places["source"] == "prior":
+        source = "The data set has too few photos of known places: the probabilities are the prior"
+    return (
+        f"<h3>Levels of places</h3><table><tr>{heads}</tr>{rows}</table>"
+        f'<p class="note">{source}. {places["samples"]} queries have an estimate and a known '
+        "location. Level 0 is the finest. 95 % intervals: bootstrap over queries.</p>"
+        f"<figure>{reliability_chart(places['levels'])}</figure>{_facts_table(errors)}"
+    )
+
+
+def _format_figure(figure: dict[str, Any]) -> str:
+    text = _format_percent(figure["mean"])
+    if figure["interval"] is None:
+        return text
+    return "{} ({:.1%} to {:.1%})".format(text, *figure["interval"])
+
+
+def _format_percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.1%}"
 
 
 def _published_table(result: EvaluationResult) -> str:

@@ -55,14 +55,14 @@ def retrieval_grids(
     return [
         (
             f"{heading}: {min(max_rows, len(queries))} of {len(queries)}",
-            retrieval_grid(result, queries[:max_rows]),
+            _retrieval_grid(result, queries[:max_rows]),
         )
         for heading, queries in grids
         if queries
     ]
 
 
-def retrieval_grid(result: EvaluationResult, queries: Sequence[int]) -> str:
+def _retrieval_grid(result: EvaluationResult, queries: Sequence[int]) -> str:
     """Render an HTML table with a row per query.
 
     If a query has no positive among the shown matches, a last column shows one.
@@ -147,5 +147,5 @@ def differences_section(result: EvaluationResult, comparison: RunComparison, sho
         if queries:
             count = min(shown, len(queries))
             parts.append(f"<h4>{outcome} at rank 1: {count} of {len(queries)}</h4>")
-            parts.append(retrieval_grid(result, queries[:shown]))
+            parts.append(_retrieval_grid(result, queries[:shown]))
     return "".join(parts)

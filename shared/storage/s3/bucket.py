@@ -72,7 +72,7 @@ BUSY_RETRY_SECONDS = 5
 FULL_RETRY_SECONDS = 60
 
 
-class RetryUnlessTimeout(urllib3.Retry):
+class _RetryUnlessTimeout(urllib3.Retry):
     """Retries requests that were rejected or disconnected, but never those that timed out.
 
     Retrying after a timeout would double the time limit.
@@ -121,7 +121,7 @@ class Bucket:
             num_pools=2,
             maxsize=MAX_CONNECTIONS,
             timeout=urllib3.Timeout(connect=seconds, read=seconds),
-            retries=RetryUnlessTimeout(
+            retries=_RetryUnlessTimeout(
                 total=1,
                 backoff_factor=RETRY_SECONDS,
                 status_forcelist=(500, 502, 503, 504),

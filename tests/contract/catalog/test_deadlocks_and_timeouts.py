@@ -13,14 +13,14 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from shared.catalog.database_errors import to_unavailable
-from shared.catalog.maps import Map, lock_map
-from shared.catalog.session import (
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.session import (
     MAX_TRANSACTION_ATTEMPTS,
     Catalog,
     PoolConfig,
     TransactionTimeouts,
 )
+from shared.catalog.maps import Map, lock_map
 from tests.support.catalog_rows import add_map
 from tests.support.servers import PostgresServer
 
@@ -159,7 +159,7 @@ def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
         assert session.scalar(select(1)) == 1
 
 
-def test_no_free_connection_is_told_within_the_configured_wait(catalog: Catalog) -> None:
+def test_no_free_connection_is_an_error_within_the_configured_wait(catalog: Catalog) -> None:
     with catalog.read() as a, catalog.read() as b, catalog.read() as c:
         for session in (a, b, c):
             session.scalar(select(1))

@@ -1,4 +1,4 @@
-"""Keys of calls in the catalog: who may do a call, what is kept of it, and when it is forgotten."""
+"""Idempotency keys in the catalog: claims, stored responses, expiry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from sqlalchemy import func, select, update
 
 from services.steward.tasks import maintenance as retention
 from services.steward.tasks.maintenance import delete_expired_idempotency_keys
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import (
     IdempotencyRecord,
     RequestIdentity,
@@ -21,7 +22,6 @@ from shared.catalog.idempotency import (
     release_idempotency_key,
     store_response,
 )
-from shared.catalog.session import Catalog
 from shared.errors import Conflict, Unprocessable
 
 CALL = RequestIdentity("someone", "key-1", "POST /api/v1/maps", "f" * 64)
@@ -56,7 +56,7 @@ def expire(catalog: Catalog) -> None:
         session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
 
 
-def test_a_kept_answer_is_given_again_as_it_was(catalog: Catalog) -> None:
+def test_a_stored_response_is_replayed_unchanged(catalog: Catalog) -> None:
     keep(catalog, token(catalog))
     assert claim(catalog) == ANSWER
     assert claim(catalog) == ANSWER

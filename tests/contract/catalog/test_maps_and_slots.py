@@ -12,6 +12,7 @@ from hypothesis import strategies as some
 from sqlalchemy import select
 
 from shared.catalog.chunks import allocate_slot
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
 )
@@ -31,7 +32,6 @@ from shared.catalog.photos import (
     get_photo,
     list_photos_changed_since,
 )
-from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from tests.support.catalog_rows import add_map, add_photo, delete
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
 from services.search.photo_columns import PhotoColumns, build_row_mask
+from shared.catalog.database.session import Catalog
 from shared.catalog.photo_search import MetadataFilter, filter_conditions, search_photos
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
-from shared.catalog.session import Catalog
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
 from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters

@@ -10,11 +10,11 @@ from uuid import UUID
 
 from sqlalchemy import text
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.photo_search import MetadataFilter, search_photos
 from shared.catalog.photos import (
     Photo,
 )
-from shared.catalog.session import Catalog
 from shared.search_api.photo_filter import PhotoFilter
 from tests.contract.catalog.test_session import MOMENT
 from tests.support.catalog_rows import add_job, add_map, add_photo
@@ -103,7 +103,7 @@ def test_a_tags_case_matters_and_parts_do_not_match(catalog: Catalog, map_id: UU
     assert found(catalog, map_id, tags=("night",)) == set()
 
 
-def test_all_tags_are_wanted(catalog: Catalog, map_id: UUID) -> None:
+def test_all_tags_are_required(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         add_photo(session, map_id, filename="both", tags=["wet", "night"])
         add_photo(session, map_id, filename="one", tags=["night"])

@@ -12,9 +12,9 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 import shared.catalog.tables  # noqa: F401
-from shared.catalog.base import Base
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import Base
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 
 ROOT = Path(__file__).parents[3]
 
@@ -33,7 +33,7 @@ def test_migrations_lead_to_the_tables_that_the_code_describes(catalog: Catalog)
 
 OPEN = """
 import json
-from shared.catalog.base import Base
+from shared.catalog.database.base import Base
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 open_catalog(Settings(), "a service").close()

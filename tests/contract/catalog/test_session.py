@@ -9,7 +9,8 @@ import pytest
 from sqlalchemy import Select, select
 from sqlalchemy.exc import DBAPIError, IntegrityError, StatementError
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -24,7 +25,6 @@ from shared.catalog.photos import (
     count_live_photos,
     find_photo_by_sha256,
 )
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from tests.support.catalog_rows import add_generation, add_map, add_photo, delete
 

@@ -1,4 +1,4 @@
-"""A catalog that is damaged, full or no catalog: said at the start, and at run time, in words."""
+"""Errors of a catalog that is damaged, full or no catalog, at the start and at run time."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
-from shared.catalog.database_errors import to_unavailable
+from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.schema import check_pages, migrate
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.schema import check_pages, migrate
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, StorageFull
 from shared.jobs import InProcessWakeups
@@ -98,7 +98,7 @@ def test_a_file_that_may_not_be_written_is_named(
     file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its permissions are not changed: to root they mean nothing."""
-    monkeypatch.setattr("shared.catalog.schema.os.access", lambda path, mode: False)
+    monkeypatch.setattr("shared.catalog.database.schema.os.access", lambda path, mode: False)
     with pytest.raises(Misconfigured, match="permissions") as caught:
         migrate(catalog)
     assert (caught.value.code, str(file) in caught.value.detail) == ("catalog_unreadable", True)
@@ -184,7 +184,7 @@ def test_postgresql_without_room_is_full_and_not_away() -> None:
     assert isinstance(error, StorageFull)
 
 
-def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
+def test_a_full_disk_at_the_start_is_reported_with_the_free_bytes(
     file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -194,7 +194,7 @@ def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
 
     event.listen(catalog.engine, "begin", full)
     usage = shutil._ntuple_diskusage(100, 100, 0)
-    monkeypatch.setattr("shared.catalog.schema.shutil.disk_usage", lambda folder: usage)
+    monkeypatch.setattr("shared.catalog.database.schema.shutil.disk_usage", lambda folder: usage)
     with pytest.raises(Misconfigured, match="Free space") as caught:
         migrate(catalog)
     assert caught.value.code == "disk_full"

@@ -169,10 +169,27 @@ def test_report_is_one_file_that_fetches_nothing(
         "Recall@k",
         "Precision and recall of the first match",
         "Distance of the first match",
+        "Reliability of the probabilities of levels",
         "Map of queries and their first matches",
     ]
     assert town.fingerprint in text
     assert "No published results are shown" in text
+
+
+def test_answers_at_the_levels_are_reported(city: Path, tmp_path: Path) -> None:
+    given = ["--data", city, "--extractor", "test-tiny-avg"]
+    places = run_json("evaluate", *given, "--out", tmp_path)["places"]
+    assert places["source"] == "prior", "ten photos are too few to fit the model on"
+    assert places["samples"] == 6
+    assert [each["certainty"] for each in places["answers"]] == [0.8, 0.9, 0.95, 0.99]
+    assert [each["level"] for each in places["levels"]] == [0, 1, 2, 3], "four radii"
+    stored = json.loads((tmp_path / "metrics.json").read_text())["sets"]["town"]
+    assert stored["places"] == places
+    assert "Levels of places" in (tmp_path / "report.html").read_text()
+    refused = run_json(
+        "evaluate", "--data", city, "--server", "http://x", "--place-labels-are-paths", code=1
+    )
+    assert refused["code"] == "options_contradict"
 
 
 def test_only_wrong_leaves_right_queries_out_of_the_report(city: Path, tmp_path: Path) -> None:
@@ -212,12 +229,12 @@ def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
         np.concatenate(list(describe([shot.path for shot in shots])))
         for shots in (town.queries, town.database)
     )
-    wanted = recall_at_k(rank_by_similarity(queries, database, 5), town.positives, (1, 5))
-    assert answer["recall"]["1"] == pytest.approx(wanted[1])
-    assert answer["recall"]["5"] == pytest.approx(wanted[5])
+    expected = recall_at_k(rank_by_similarity(queries, database, 5), town.positives, (1, 5))
+    assert answer["recall"]["1"] == pytest.approx(expected[1])
+    assert answer["recall"]["5"] == pytest.approx(expected[5])
 
 
-def test_checkpoint_sees_photos_as_they_are_when_told_so(city: Path, checkpoint: Path) -> None:
+def test_checkpoint_sees_photos_unresized_with_that_option(city: Path, checkpoint: Path) -> None:
     """The photos have 64 x 64 pixels."""
     native = run_json(
         "evaluate", "--data", city, "--checkpoint", checkpoint, "--image-size", "native"
@@ -263,7 +280,7 @@ def test_set_that_is_not_there_is_named(city: Path) -> None:
 
 def test_people_are_shown_a_table(city: Path) -> None:
     shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg")
-    for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m"):
+    for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m", "certainty", "0.95"):
         assert part in shown
 
 
@@ -271,8 +288,8 @@ def test_descriptors_are_compared_by_recall_time_and_size(
     city: Path, tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlad = "test-tiny-vlad:clusters=3,preprocessing=demo1024+fit+pca4"
-    asked = f"test-tiny-avg,{vlad},{checkpoint}"
-    report = run_json("compare", city, "--extractors", asked, "--out", tmp_path / "out")
+    extractors = f"test-tiny-avg,{vlad},{checkpoint}"
+    report = run_json("compare", city, "--extractors", extractors, "--out", tmp_path / "out")
     sizes = [one["bytes_a_photo"] for one in report["extractors"]]
     assert sizes == [16 * 4, 4 * 4, 128 * 4]
     assert all(one["milliseconds_a_photo"] > 0 for one in report["extractors"])
@@ -285,7 +302,7 @@ def test_descriptors_are_compared_by_recall_time_and_size(
         assert one["extractor"] in "".join(charts[0][1].itertext())
     monkeypatch.setattr(ExtractorDescriber, "__call__", forbid)
     monkeypatch.setattr(ModelDescriber, "__call__", forbid)
-    again = run_json("compare", city, "--extractors", asked)
+    again = run_json("compare", city, "--extractors", extractors)
     assert [one["recall"] for one in again["extractors"]] == [
         one["recall"] for one in report["extractors"]
     ]

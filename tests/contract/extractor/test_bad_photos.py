@@ -191,7 +191,7 @@ def test_very_long_photo_has_the_descriptor_of_what_it_shows_squeezed(
 
 @pytest.mark.parametrize("name", ["demo1024", "round14"])
 @pytest.mark.parametrize("size", [(1, 1), (20_000, 3)])
-def test_photo_of_less_than_a_patch_is_refused_where_sizes_are_kept(
+def test_photo_of_less_than_a_patch_is_rejected_where_photos_are_not_resized(
     pool: DecoderPool,
     extractors: dict[str, Extractor],
     centres: ClusterCentres,

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.extractor.decoder_pool import MAX_DECODE_ATTEMPTS, DecoderPool
+from services.extractor.decoder_pool import MAX_DECODE_ATTEMPTS, SCHEDULED_PER_PROCESS, DecoderPool
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto
@@ -98,6 +98,45 @@ def test_good_photos_are_decoded_beside_bad_ones_in_their_order(pool: DecoderPoo
         assert isinstance(outcome, DecodedPhoto)
         assert outcome.pixels[0, 0].tolist() == colour
     assert not np.array_equal(first.pixels, last.pixels)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_of_200_megapixels_is_decoded_within_the_memory_limit(
+    settings: Settings, progressive: bool
+) -> None:
+    limits = Settings.model_fields
+    with pool_with(
+        settings,
+        max_image_pixels=limits["max_image_pixels"].default,
+        decode_memory_bytes=limits["decode_memory_bytes"].default,
+        decode_timeout_seconds=500.0,
+    ) as pool:
+        buffer = io.BytesIO()
+        stripes = Image.effect_noise((200, 200), 50).resize((20_000, 10_000)).convert("RGB")
+        stripes.save(buffer, "JPEG", quality=60, progressive=progressive)
+        (outcome,) = pool.decode([buffer.getvalue()], SQUARE)
+        assert is_good(outcome)
+        peak_kib = in_child(pool, "__import__('resource').getrusage(0).ru_maxrss")
+    assert 1024 * peak_kib < limits["decode_memory_bytes"].default
+
+
+def test_photos_are_read_as_they_are_decoded(
+    pool: DecoderPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished: list[DecodedPhoto | PlacewiseError] = []
+    result = pool._result
+
+    def counted(*arguments: Any) -> DecodedPhoto | PlacewiseError:
+        finished.append(result(*arguments))
+        return finished[-1]
+
+    def photos() -> Iterator[bytes]:
+        for number in range(12):
+            assert number - len(finished) <= SCHEDULED_PER_PROCESS
+            yield GOOD
+
+    monkeypatch.setattr(pool, "_result", counted)
+    assert len(pool.decode(photos(), SQUARE)) == 12
 
 
 def test_nothing_to_decode_is_nothing(pool: DecoderPool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 from uuid import UUID
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.errors import Unprocessable
 from shared.jobs import (
     Job,

@@ -9,11 +9,11 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.jobs import (
     Job,
@@ -222,7 +222,7 @@ def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresS
     catalog.close()
 
 
-def test_jobs_are_listed_newest_first_and_by_what_is_wanted(catalog: Catalog, map_id: UUID) -> None:
+def test_jobs_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         other = add_map(session, "other").id
     queue(catalog, other)

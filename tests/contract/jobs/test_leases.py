@@ -14,11 +14,11 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import OperationalError
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import get_job
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import (
     Job,
@@ -214,7 +214,7 @@ def test_everyones_lease_is_freed_on_request(catalog: Catalog, map_id: UUID) -> 
     assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
 
 
-def test_what_fell_in_a_batch_comes_back_alone_and_without_an_attempt(
+def test_jobs_of_a_crashed_batch_are_retried_alone_without_counting_an_attempt(
     catalog: Catalog, map_id: UUID
 ) -> None:
     waiting = queue(catalog, map_id, 3)
@@ -231,7 +231,7 @@ def test_what_fell_in_a_batch_comes_back_alone_and_without_an_attempt(
     assert [len(take(catalog)) for _ in waiting] == [1, 1, 1]
 
 
-def test_what_fell_alone_has_used_an_attempt_and_fails_with_the_last(
+def test_a_crash_of_a_lone_job_counts_an_attempt_and_the_last_one_fails_it(
     catalog: Catalog, map_id: UUID
 ) -> None:
     (job_id,) = queue(catalog, map_id)
@@ -250,7 +250,7 @@ def test_what_fell_alone_has_used_an_attempt_and_fails_with_the_last(
     assert take(catalog) == []
 
 
-def test_a_model_change_that_fell_rests_as_running_without_a_lease(
+def test_a_crashed_model_change_stays_running_without_a_lease(
     catalog: Catalog, map_id: UUID
 ) -> None:
     (job_id,) = queue(catalog, map_id, kind=JobKind.FIT, stage="cluster")
@@ -263,7 +263,7 @@ def test_a_model_change_that_fell_rests_as_running_without_a_lease(
     assert ids(take(catalog)) == [job_id]  # and goes on
 
 
-def test_a_model_change_that_fell_too_often_abandons_its_generation(
+def test_a_model_change_that_crashed_too_often_abandons_its_generation(
     catalog: Catalog, map_id: UUID
 ) -> None:
     with catalog.write() as session:

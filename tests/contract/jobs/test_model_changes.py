@@ -9,9 +9,9 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job
-from shared.catalog.session import Catalog
 from shared.errors import Conflict
 from shared.jobs import (
     JobKind,

@@ -8,8 +8,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, JobKind, JobState
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable, Unprocessable
 from shared.jobs import reclaim_expired_leases

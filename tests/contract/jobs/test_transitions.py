@@ -6,9 +6,9 @@ from uuid import UUID
 
 import pytest
 
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, WaitingFor, get_job
-from shared.catalog.session import Catalog
 from shared.errors import Conflict
 from shared.jobs import (
     Job,

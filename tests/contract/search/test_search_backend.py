@@ -10,8 +10,8 @@ from uuid import UUID
 import numpy as np
 import pytest
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import PhotoRole
-from shared.catalog.session import Catalog
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import Box, Circle
@@ -259,7 +259,7 @@ class SearchPortContract:
             assert found(**filters) == {second[2]}
         assert found() == {*first, *second}
 
-    def test_labelled_queries_are_never_answered_and_can_be_asked_with(
+    def test_labelled_queries_are_never_returned_and_can_be_searched_with(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         photo_ids = places.add(unit_rows(1, 12))
@@ -381,7 +381,7 @@ class SearchPortContract:
             port().search(places.request(reference))
         assert caught.value.code == "chunk_unreadable"
 
-    def test_descriptor_that_is_no_longer_kept_is_gone(
+    def test_descriptor_that_is_no_longer_stored_is_gone(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         places.add(unit_rows(1, 3))

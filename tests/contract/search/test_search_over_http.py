@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore

@@ -20,8 +20,8 @@ from hypothesis.stateful import (
 )
 
 from services.search.worker import SearchWorker
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, manifest_key

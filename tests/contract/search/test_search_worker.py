@@ -12,8 +12,8 @@ from services.search import executor, gpu
 from services.search import worker as worker_module
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.search_api.protocol import SearchBackend
@@ -142,7 +142,7 @@ class TestSearchWorker(SearchPortContract):
 
 @whatever_the_catalog
 class TestSearchWorkerByCodes(TestSearchWorker):
-    """The same promises where rows are told apart by their codes first."""
+    """The same promises where sign codes select the rows first."""
 
     certificate = "statistical"
 
@@ -153,7 +153,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
 
 @whatever_the_catalog
 class TestSearchWorkerByInt8(TestSearchWorker):
-    """The same promises where rows of middle length are told apart by their int8 codes."""
+    """The same promises where int8 codes select the rows."""
 
     certificate = "bound"
 

@@ -1,4 +1,4 @@
-"""A store without room, or asked too much: said as such, and nothing of the object is left."""
+"""A full or overloaded store: the error says so, and nothing of the object is left."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import StorageFull, Unavailable
 from shared.jobs import InProcessWakeups, Job
@@ -149,7 +149,7 @@ class FullFile:
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EDQUOT], ids=["disk", "quota"])
-def test_a_full_disk_is_said_and_leaves_no_object(store: FolderStore, reason: int) -> None:
+def test_a_full_disk_is_reported_and_leaves_no_object(store: FolderStore, reason: int) -> None:
     writer = store.writer("originals/a")
     writer.write(b"some")
     writer._file.close()

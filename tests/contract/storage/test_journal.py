@@ -11,10 +11,10 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, select, update
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.journal import outbox, segments

@@ -186,7 +186,7 @@ class ObjectStoreContract:
             store.delete(key)
         assert keys_of(store) == ["a/b/c"]
 
-    def test_key_that_continues_another_one_is_refused_or_kept_beside_it(
+    def test_key_that_continues_another_one_is_rejected_or_stored_beside_it(
         self, store: ObjectStore
     ) -> None:
         store.put("a/b", b"there before")
@@ -298,7 +298,7 @@ class ObjectStoreContract:
             "x" * 200,
         ],
     )
-    def test_odd_but_legal_keys_are_kept_as_they_are(self, store: ObjectStore, key: str) -> None:
+    def test_odd_but_legal_keys_are_stored_unchanged(self, store: ObjectStore, key: str) -> None:
         store.put(key, b"odd")
         assert store.get(key) == b"odd"
         assert keys_of(store) == [key]

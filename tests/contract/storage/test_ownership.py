@@ -12,6 +12,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.installation import (
     Installation,
     adopt_store,
@@ -21,7 +22,6 @@ from shared.catalog.installation import (
 )
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id

@@ -106,7 +106,7 @@ def test_a_copy_stays_what_it_is(store: S3Store) -> None:
     assert store.get("originals/a") == b"first"
 
 
-def test_what_the_sender_said_of_the_bytes_is_not_copied(store: S3Store) -> None:
+def test_the_metadata_of_the_sender_is_not_copied(store: S3Store) -> None:
     put_here = presign(store)
     fields = {"Content-Type": "text/html", "Content-Encoding": "gzip"}
     assert put(put_here.url, DATA, {**put_here.headers, **fields}) == 200

@@ -174,11 +174,11 @@ def test_seeking_fetches_from_there_and_not_all(
     bucket: Bucket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     S3Store(bucket).put("a", bytes(1_000_000))
-    asked: list[int] = []
+    offsets: list[int] = []
     get_object = bucket.client.get_object
 
     def noted(*arguments: Any, **options: Any) -> Any:
-        asked.append(options["offset"])
+        offsets.append(options["offset"])
         return get_object(*arguments, **options)
 
     monkeypatch.setattr(bucket.client, "get_object", noted)
@@ -186,14 +186,14 @@ def test_seeking_fetches_from_there_and_not_all(
         file.read(100)
         file.seek(50)
         file.read(100)
-        assert asked == [0], "what is in the buffer is not asked for again"
+        assert offsets == [0], "what is in the buffer is not requested again"
         file.seek(-10, os.SEEK_END)
         file.seek(600_000)
-        assert asked == [0], "nothing is fetched before it is read"
+        assert offsets == [0], "nothing is fetched before it is read"
         file.read(10)
         file.seek(2_000_000)
         assert file.read() == b""
-    assert asked == [0, 600_000]
+    assert offsets == [0, 600_000]
 
 
 def test_object_that_is_replaced_while_it_is_read_is_never_mixed(bucket: Bucket) -> None:
@@ -244,9 +244,9 @@ def test_bucket_that_someone_else_has_made_gets_the_rule_and_keeps_its_own(
     theirs = [dataclasses.replace(rule, rule_id="theirs") for rule in rules.rules]
     bucket.client.set_bucket_lifecycle(bucket.name, LifecycleConfig(theirs))
     create_bucket(bucket)
-    kept = bucket.client.get_bucket_lifecycle(bucket.name)
-    assert kept is not None
-    assert [rule.rule_id for rule in kept.rules] == ["theirs"]
+    lifecycle = bucket.client.get_bucket_lifecycle(bucket.name)
+    assert lifecycle is not None
+    assert [rule.rule_id for rule in lifecycle.rules] == ["theirs"]
 
 
 def test_command_makes_the_bucket_and_is_content_with_one(
@@ -255,10 +255,10 @@ def test_command_makes_the_bucket_and_is_content_with_one(
     name = f"{bucket.name}-cli"
     for variable, value in s3.variables(name).items():
         monkeypatch.setenv(variable.upper(), str(value))
-    said = [CliRunner().invoke(storage.app, ["create-bucket"]) for _ in range(2)]
-    assert [result.exit_code for result in said] == [0, 0]
-    assert "was created" in said[0].stdout
-    assert "already exists" in said[1].stdout
+    results = [CliRunner().invoke(storage.app, ["create-bucket"]) for _ in range(2)]
+    assert [result.exit_code for result in results] == [0, 0]
+    assert "was created" in results[0].stdout
+    assert "already exists" in results[1].stdout
     S3Store(s3.bucket(name)).check()
 
 

@@ -243,9 +243,7 @@ def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
         ("tags", "spring"),
     ],
 )
-def test_what_is_said_of_a_model_has_to_be_sayable(
-    service: Service, field: str, value: str
-) -> None:
+def test_metadata_of_a_model_is_validated(service: Service, field: str, value: str) -> None:
     fields = {"name": "walks", field: value}
     name = fields.pop("name")
     field_refused(send(service, b"whatever", name, **fields), field)

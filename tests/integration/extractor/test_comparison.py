@@ -16,8 +16,8 @@ from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_ended_generations, collect_queries
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, reclaim_expired_leases
@@ -87,7 +87,7 @@ def test_first_photos_are_ordered_by_their_rerank_scores_and_the_others_follow(
     assert searches(service) == 2, "one for each question, however often its answer is fetched"
 
 
-def test_best_of_more_reranked_photos_than_are_wanted_are_answered(service: Service) -> None:
+def test_best_k_of_the_reranked_photos_are_returned(service: Service) -> None:
     query = service.indexed(*range(7))[0]
     all_six = compared(service, query, top_k=6, rerank=6)
     best = compared(service, query, top_k=2, rerank=6)

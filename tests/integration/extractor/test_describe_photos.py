@@ -26,6 +26,7 @@ from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind, JobState
 from shared.storage.chunks import decode_rows, manifest_key
@@ -311,6 +312,39 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     query = vlads.ask(photo_bytes(9))
     vlads.drain()
     assert vlads.job(query).state == JobState.SUCCEEDED
+
+
+def test_a_vocabulary_of_too_few_photos_is_replaced_once_there_are_enough(
+    vlads: Workplace,
+) -> None:
+    vlads.upload(*range(4))
+    vlads.fit(clusters=4)
+    assert standing(vlads) == "provisional"
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
+    assert fit_jobs(vlads) == 1, "another fit on the same photos would be no better"
+
+    vlads.upload(*range(4, MIN_PHOTOS_TO_FIT))
+    vlads.drain()
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, MIN_PHOTOS_TO_FIT + 1)
+    assert fit_jobs(vlads) == 1
+    for _ in range(2):
+        auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
+    with vlads.catalog.read() as session:
+        newest = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).all()[-1]
+    assert vlads.finish(newest.id).state == JobState.SUCCEEDED
+    assert standing(vlads) == "own"
+    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
+    assert fit_jobs(vlads) == 2, "a vocabulary of enough photos stays"
+
+
+def standing(workplace: Workplace) -> str:
+    return workplace.vocabulary(workplace.active().vocabulary_id).standing
+
+
+def fit_jobs(workplace: Workplace) -> int:
+    with workplace.catalog.read() as session:
+        jobs = select(func.count()).select_from(Job).where(Job.kind == JobKind.FIT)
+        return session.scalar(jobs) or 0
 
 
 def test_no_vocabulary_is_fitted_by_itself_after_a_fit_was_cancelled(vlads: Workplace) -> None:

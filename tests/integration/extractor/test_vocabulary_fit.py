@@ -72,7 +72,7 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
-    assert (vocabulary.origin, vocabulary.standing) == ("fitted", "own")
+    assert (vocabulary.origin, vocabulary.standing) == ("fitted", "provisional")
     centres = decode_centres(fitted.store.get(vocabulary.object_key))
     assert vocabulary.sha256 == centres.sha256 == new.spec["vocabulary_sha256"]
     rows = fitted.rows()

@@ -15,10 +15,10 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway import admission as room_module
 from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
 from services.gateway.authentication import Caller
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Priority
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ids import new_id
@@ -99,6 +99,10 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
     assert upload(service, 2, "city").status_code == 202
     queue_full(upload(service, 3))
     queue_full(upload(service, 3, "city"))
+    health = service("GET", "/health").json()
+    assert health["status"] == health["parts"]["uploads"]["status"] == "degraded"
+    assert "2 jobs are waiting, the limit is 2" in health["parts"]["uploads"]["detail"]
+    assert service("GET", "/../../readyz").status_code == 200
     for call in ("/vocabularies", "/evaluations"):
         queue_full(service("POST", call))
     for number in range(3):
@@ -148,7 +152,9 @@ def test_a_refused_call_keeps_its_key_for_the_next_try(make_service: Make) -> No
     assert (answer.status_code, "idempotent-replayed" in answer.headers) == (202, False)
 
 
-def test_what_waits_for_something_else_or_was_not_asked_for_is_no_queue(catalog: Catalog) -> None:
+def test_jobs_that_wait_for_something_else_or_run_in_the_background_are_no_queue(
+    catalog: Catalog,
+) -> None:
     with catalog.write() as session:
         one, other = add_map(session, "one").id, add_map(session, "other").id
         add_job(session, one)

@@ -26,7 +26,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -13,6 +14,7 @@ from starlette.datastructures import Headers
 from services.gateway.authentication import ApiKeyAuthenticator
 from shared.catalog.api_keys import ApiKey
 from shared.catalog.photos import Photo
+from shared.ids import new_id
 from shared.security.api_keys import hash_api_key
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
@@ -125,3 +127,81 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
 def test_a_key_that_can_not_be_made_is_refused(door: Door, params: dict[str, Any]) -> None:
     problem(door(ADMIN, "POST", "/keys", json=params), 422, "invalid_field")
     assert door(ADMIN, "GET", "/keys").json() == []
+
+
+# --- keys for some maps ----------------------------------------------------------------------
+
+ALL_MAPS_CALLS = {
+    "GET /api/v1/health",
+    "GET /api/v1/models",
+    "GET /api/v1/models/{name}",
+    "GET /metrics",
+    "POST /api/v1/maps",
+}
+"""Calls about no map or all maps; a key for some maps has no admin scope."""
+
+
+def calls(door: Door) -> list[tuple[str, str]]:
+    """Method and path template of each call that needs a key."""
+    found = [
+        (method.upper(), path)
+        for path, methods in door.app.openapi()["paths"].items()
+        for method in methods
+        if path.startswith(("/api/", "/metrics"))
+    ]
+    assert len(found) > 40
+    return found
+
+
+def refusal(door: Door, key: str, method: str, path: str, maps: list[str]) -> str | None:
+    """The code of a 403, for a call that selects these maps; `name` in paths is the map b."""
+    filled = re.sub(r"\{(\w+)\}", lambda m: "b" if m[1] == "name" else str(new_id()), path)
+    answer = door.call(key, method, filled, params={"map": maps})
+    return answer.json()["code"] if answer.status_code == 403 else None
+
+
+@pytest.fixture
+def limited(door: Door) -> str:
+    """A key for the map a, beside which there is a map b."""
+    for name in ("a", "b"):
+        assert door(ADMIN, "POST", "/maps", json={"name": name}).status_code == 201
+    key: str = door.key("read", "write", maps=["a"])["key"]
+    return key
+
+
+@pytest.mark.parametrize("maps", [["b"], [], ["a", "b"], ["b", "a"]], ids=str)
+def test_every_call_is_closed_to_a_key_for_another_map(
+    door: Door, limited: str, maps: list[str]
+) -> None:
+    open_calls = [
+        f"{method} {path}"
+        for method, path in calls(door)
+        if refusal(door, limited, method, path, maps) not in ("map_not_allowed", "scope_missing")
+    ]
+    assert open_calls == ["GET /api/v1/maps"], "which lists the maps of the key"
+    assert [m["name"] for m in door(limited, "GET", "/maps", params={"map": maps}).json()] == ["a"]
+
+
+def test_calls_of_its_map_are_open_to_a_key_and_those_of_all_maps_are_not(
+    door: Door, limited: str
+) -> None:
+    closed = {
+        f"{method} {path}"
+        for method, path in calls(door)
+        if "/maps/" not in path and refusal(door, limited, method, path, ["a"]) == "map_not_allowed"
+    }
+    assert closed == ALL_MAPS_CALLS
+    assert door(limited, "GET", "/maps/a").status_code == 200
+    assert door(limited, "GET", "/maps/b", params={"map": "a"}).status_code == 403
+    photo = {"files": {"file": ("photo.jpg", photo_bytes(1))}, "params": {"map": "a"}}
+    assert door(limited, "POST", "/upload", **photo).status_code == 202
+
+
+def test_a_key_for_some_maps_is_listed_with_them_and_can_not_be_an_admin(door: Door) -> None:
+    assert door.key("read", maps=["b", "a", "b"])["maps"] == ["a", "b"]
+    assert door.key("read")["maps"] is None
+    params = {"name": "x", "scopes": ["admin"], "maps": ["a"]}
+    body = problem(door(ADMIN, "POST", "/keys", json=params), 422, "invalid_field")
+    assert "admin" in body["detail"]
+    params = {"name": "x", "scopes": ["read"], "maps": []}
+    problem(door(ADMIN, "POST", "/keys", json=params), 422, "invalid_field")

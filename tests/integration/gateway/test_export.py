@@ -34,7 +34,9 @@ def exported(service: Service) -> tuple[NDArray[np.float32], list[dict[str, str]
 
 
 def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
-    service.indexed(1, 2, latitude=45.5, longitude=7.25, place="hall, north")
+    service.indexed(
+        1, 2, latitude=45.5, longitude=7.25, place="hall, north", relative_path="Day 2/1.jpg"
+    )
     [gone] = service.indexed(3)
     service.indexed(4)
     service.json("DELETE", f"/uploads/{gone}")
@@ -52,6 +54,7 @@ def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
         assert np.array_equal(row, stored[UUID(line["image_id"])])
     assert [line["place"] for line in table] == ["hall, north", "hall, north", ""]
     assert [line["latitude"] for line in table] == ["45.5", "45.5", ""]
+    assert [line["relative_path"] for line in table] == ["Day 2/1.jpg", "Day 2/1.jpg", ""]
     assert gone not in {line["image_id"] for line in table}
 
 

@@ -14,10 +14,10 @@ from sqlalchemy import func, select, update
 from services.extractor.worker import ExtractorWorker
 from services.gateway import idempotency as once
 from services.gateway.routes import model_changes
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.imaging.photo_header import read_photo_header
@@ -238,7 +238,7 @@ def test_a_failure_of_ours_is_not_kept(
     assert (count(catalog, Photo), originals(store)) == (1, 1)
 
 
-def test_a_call_under_way_is_told_to_come_again(service: Service, store: FolderStore) -> None:
+def test_a_repeated_call_in_progress_gets_retry_after(service: Service, store: FolderStore) -> None:
     """The first one stands between its claim and its commit until the second was refused."""
     reached, go_on = threading.Event(), threading.Event()
     reader = read_photo_header
@@ -292,7 +292,7 @@ def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_o
     same(second[0], call_evaluation(service, headers=keyed()))
 
 
-def test_a_gateway_that_died_blocks_its_key_no_longer_than_its_lease(
+def test_a_gateway_that_crashed_blocks_its_key_no_longer_than_its_lease(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a killed process leaves: a claimed key, and nothing after it."""

@@ -11,8 +11,8 @@ from sqlalchemy.exc import OperationalError
 
 from services.gateway import dependencies as job_watch
 from services.gateway.dependencies import Change, JobNotifier, WatchedState
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobState
 from tests.support.catalog_rows import add_job, add_map, set_columns
@@ -154,7 +154,7 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
     asyncio.run(scenario())
 
 
-def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_is_up(
+def test_waiting_for_a_change_ends_with_an_outage_of_the_catalog_and_with_the_timeout(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:

@@ -99,7 +99,7 @@ def test_a_fit_of_queries_alone_says_that_there_is_nothing_to_learn_from(
     assert job.error["code"] == "no_photos"
 
 
-def test_a_role_is_said_at_upload_and_changed_later(service: Service) -> None:
+def test_a_role_is_set_at_upload_and_changed_later(service: Service) -> None:
     stays, turns = service.indexed(1, 2, latitude=1, longitude=2)
     (asking,) = service.indexed(3, role="query", place="hall")
     photo = service.json("GET", f"/uploads/{asking}")

@@ -24,16 +24,16 @@ from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
-from shared.catalog.base import Base, db_now_plus
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import Base, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation
 from shared.catalog.maps import Map, cache_map_statistics
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.processes import RegisteredSearchWorker
-from shared.catalog.session import Catalog
 from shared.catalog.tables import SchemaCompatibility
 from shared.config.settings import Settings
 from shared.ingest.store_photo import store_photo

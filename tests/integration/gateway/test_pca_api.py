@@ -62,7 +62,7 @@ def test_a_map_is_reduced_says_so_and_goes_back(vlad: Service) -> None:
     assert (reduced["dimension"], reduced["pca_from"]) == (4, 32)
     assert reduced["vocabulary_id"] == whole["vocabulary_id"]
     about = get(vlad, "/maps/vlad")
-    assert (about["dimension"], about["pca_from"], about["vocabulary"]) == (4, 32, "own")
+    assert (about["dimension"], about["pca_from"], about["vocabulary"]) == (4, 32, "provisional")
 
     refused = post(vlad, "/generations", {"pca": 3})
     body = problem(refused, 409, "already_reduced")

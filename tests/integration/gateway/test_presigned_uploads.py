@@ -18,9 +18,9 @@ from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_presigned_uploads
 from services.steward.tasks.orphans import collect_orphans
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.imaging.photo_header import read_photo_header
 from shared.storage import FolderStore
@@ -249,7 +249,7 @@ def test_what_is_no_photo_is_refused_and_leaves_no_original(
     assert (photos(catalog), keys(store, "originals/")) == (0, set())
 
 
-def test_nothing_sent_yet_is_said(service: Service) -> None:
+def test_an_upload_without_bytes_is_reported(service: Service) -> None:
     upload = presign(service)
     problem(complete(service, upload), 409, "upload_incomplete")
     assert put(upload) == 200

@@ -7,7 +7,7 @@ from uuid import UUID
 
 import pytest
 
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door

@@ -16,8 +16,8 @@ from sqlalchemy import func, select
 from services.gateway import rate_limits as quotas_module
 from services.gateway.routes import uploads as upload_module
 from services.steward.batches.worker import BatchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.ingest import store_photo as photo_quota
 from shared.ingest import validation as incoming_module

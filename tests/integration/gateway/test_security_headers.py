@@ -11,8 +11,8 @@ from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
@@ -102,7 +102,7 @@ def test_refusals_at_the_door_have_the_headers_too(door: Door) -> None:
     checked(refused.headers)
 
 
-def test_https_alone_is_asked_for_where_it_is_set(
+def test_hsts_is_sent_where_it_is_set(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     strict = settings.model_copy(update={"hsts_seconds": 31_536_000})

@@ -20,10 +20,10 @@ from shared.backup.create import create_backup
 from shared.backup.folder import BackupFolder, backup_tables, open_backup
 from shared.backup.restore import RestoreResult, restore_backup
 from shared.catalog.chunks import Chunk
+from shared.catalog.database.session import Catalog
 from shared.catalog.installation import get_or_create_installation
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured
 from shared.integrity.verify import verify_store

@@ -14,11 +14,12 @@ from redis import Redis
 from sqlalchemy import func, select
 
 from services.steward.tasks.maintenance import resend_wakeups
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.jobs import Job, JobState
+from shared.jobs import Job, JobState, celery_wakeups
 from shared.jobs.celery_wakeups import (
+    BROKER_TIMEOUT_SECONDS,
     DRAIN_TASK,
     MAX_PENDING_WAKEUPS,
     CeleryWakeups,
@@ -103,6 +104,17 @@ def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
         return bool(waiting(own_redis)[WakeupQueue.BULK])
 
     until(arrived)
+
+
+def test_closing_in_the_middle_of_a_burst_takes_no_time(
+    wakeups: CeleryWakeups, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(celery_wakeups, "DEBOUNCE_SECONDS", 0.5)
+    wakeups.send()
+    time.sleep(0.2)
+    begun = time.monotonic()
+    wakeups.close()
+    assert time.monotonic() - begun < BROKER_TIMEOUT_SECONDS
 
 
 def test_services_without_redis_say_what_to_set() -> None:

@@ -20,9 +20,9 @@ from services.cli.operations.deployment_checks import (
     check_search,
     check_steward,
 )
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.processes import RegisteredProcess, list_processes, process_heartbeat
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.errors import Misconfigured, PlacewiseError, Unavailable

@@ -9,8 +9,8 @@ from sqlalchemy import delete, update
 
 from benchmarks.chaos.run import InvariantViolations, check_invariants
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.jobs import JobState
 from shared.storage import FolderStore
 from shared.storage.chunks import manifest_key

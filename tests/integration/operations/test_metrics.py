@@ -22,8 +22,8 @@ from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import JobKind, WaitingFor
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups, JobState

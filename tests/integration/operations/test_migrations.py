@@ -5,18 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 from uuid import UUID
 
 import pytest
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import MetaData, Table, func, select, text
+from sqlalchemy import MetaData, Table, func, make_url, select, text
 
-from shared.catalog import schema
-from shared.catalog.base import db_now
+from shared.catalog.database import schema
+from shared.catalog.database.base import db_now
+from shared.catalog.database.schema import check_schema, migrate, wait_for_schema
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.catalog.photos import Photo
-from shared.catalog.schema import check_schema, migrate, wait_for_schema
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
 from tests.support.catalog_rows import made_up_photo
@@ -160,4 +161,30 @@ def test_catalog_that_is_away_is_waited_for(catalog: Catalog) -> None:
     with pytest.raises(Unavailable) as caught:
         wait_for_schema(nowhere, 0.1)
     assert caught.value.code == "catalog_unavailable"
+    assert "database none at 127.0.0.1:1" in caught.value.detail
+    assert "refused" in caught.value.detail
+    assert "This may pass" in caught.value.detail
     nowhere.close()
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"database": "nowhere"}, 'database "nowhere" does not exist'),
+        ({"username": "nobody_knows"}, "nobody_knows"),
+    ],
+)
+def test_a_connection_that_can_never_work_is_not_waited_for(
+    postgres: PostgresServer, changed: dict[str, Any], reason: str
+) -> None:
+    url = make_url(postgres.new_database()).set(**changed)
+    wrong = Catalog(url.render_as_string(hide_password=False))
+    started = time.monotonic()
+    with pytest.raises(Unavailable) as caught:
+        wait_for_schema(wrong, 500)
+    assert time.monotonic() - started < 100
+    assert caught.value.code == "catalog_unavailable"
+    assert reason in caught.value.detail
+    assert f"database {url.database} at {url.host}" in caught.value.detail
+    assert "will not pass by itself" in caught.value.detail
+    wrong.close()

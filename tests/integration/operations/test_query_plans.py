@@ -2,30 +2,55 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+from sqlalchemy.engine import make_url
 
 from benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
 from benchmarks.catalog.explain import Explainer
-from benchmarks.catalog.fill import fill_catalog
-from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
+from benchmarks.catalog.fill import SyntheticCatalog, fill_catalog
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.
 PHOTOS = 60_000
 
+Filled = tuple[Catalog, SyntheticCatalog]
 
-def test_no_statement_reads_a_whole_map(
-    postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
-) -> None:
-    catalog = Catalog(
-        postgres.new_database(migrated_postgres), PoolConfig(), TransactionTimeouts(250, 250)
-    )
-    try:
-        filled = fill_catalog(catalog, PHOTOS)
-        explainer = Explainer(catalog, small=True)
-        calls = list(run_all_calls(catalog, filled, explainer, tmp_path))
-    finally:
-        catalog.close()
+
+@pytest.fixture(scope="module")
+def filled_template(
+    postgres: PostgresServer, migrated_postgres: str
+) -> tuple[str, SyntheticCatalog]:
+    """The URL and the contents of a filled database to copy."""
+    url = postgres.new_database(migrated_postgres)
+    with contextlib.closing(_open(url)) as catalog:
+        return url, fill_catalog(catalog, PHOTOS)
+
+
+@pytest.fixture
+def filled(
+    postgres: PostgresServer, filled_template: tuple[str, SyntheticCatalog]
+) -> Iterator[Filled]:
+    """A filled catalog, which the test may change."""
+    url, contents = filled_template
+    template = make_url(url).database
+    assert template is not None
+    with contextlib.closing(_open(postgres.new_database(template))) as catalog:
+        yield catalog, contents
+
+
+def _open(url: str) -> Catalog:
+    return Catalog(url, PoolConfig(), TransactionTimeouts(250, 250))
+
+
+def test_no_statement_reads_a_whole_map(filled: Filled, tmp_path: Path) -> None:
+    catalog, contents = filled
+    explainer = Explainer(catalog, small=True)
+    calls = list(run_all_calls(catalog, contents, explainer, tmp_path))
     assert {e.call for e in explainer.plans} >= set(calls) - {
         "steward: fit maps that wait",
         "steward: evaluate changed maps",
@@ -40,19 +65,12 @@ def test_no_statement_reads_a_whole_map(
     assert not faulty, "\n".join(sorted(faulty))
 
 
-def test_missing_index_is_noticed(
-    postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
-) -> None:
-    catalog = Catalog(
-        postgres.new_database(migrated_postgres), PoolConfig(), TransactionTimeouts(250, 250)
+def test_missing_index_is_noticed(filled: Filled, tmp_path: Path) -> None:
+    catalog, contents = filled
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql("DROP INDEX ix_photos_tags")
+    explainer = Explainer(catalog, small=True)
+    assert any(
+        any("tags" in e.call and e.faults() for e in explainer.plans)
+        for _ in run_all_calls(catalog, contents, explainer, tmp_path)
     )
-    try:
-        filled = fill_catalog(catalog, PHOTOS)
-        with catalog.engine.begin() as connection:
-            connection.exec_driver_sql("DROP INDEX ix_photos_tags")
-        explainer = Explainer(catalog, small=True)
-        for _ in run_all_calls(catalog, filled, explainer, tmp_path):
-            pass
-    finally:
-        catalog.close()
-    assert any("tags" in e.call and e.faults() for e in explainer.plans)

@@ -16,14 +16,14 @@ from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_deleted_photos
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans
-from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import Base
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation, get_or_create_installation
 from shared.catalog.jobs import Job
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.catalog.tables import SchemaCompatibility
 from shared.config.settings import Settings
 from shared.errors import Conflict, StorageFull
@@ -93,7 +93,7 @@ def two_maps(service: Service) -> dict[str, str]:
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
 
-def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
+def test_every_photo_is_searchable_again_with_its_metadata(
     service: Service,
     store: FolderStore,
     settings: Settings,

@@ -8,8 +8,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, func, select
 
-from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import Base
 from shared.catalog.photos import Photo
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups

@@ -19,9 +19,9 @@ from services.gateway.dependencies import GatewayContext
 from services.search import service as search_service
 from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.jobs import InProcessWakeups
@@ -162,7 +162,7 @@ def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[Search
     return requests
 
 
-def test_every_shard_answers_at_least_the_version_that_is_asked_for(
+def test_every_shard_answers_at_least_the_requested_version(
     places: SmallMap, tier_of: OpenTier
 ) -> None:
     tier = tier_of(1, 2, 1)

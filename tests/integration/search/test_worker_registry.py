@@ -19,12 +19,12 @@ from services.steward.tasks import generation_repair as generation_repair_module
 from services.steward.tasks import model_changes as search_workers
 from services.steward.tasks.generation_repair import repair_generations
 from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS, remove_dead_search_workers
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database.base import db_now, db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.processes import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.jobs import JobState

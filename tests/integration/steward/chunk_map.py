@@ -10,8 +10,8 @@ from uuid import UUID
 from sqlalchemy import select, update
 
 from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
-from shared.catalog.session import Catalog
 from shared.storage import FolderStore
 from shared.storage.keys import (
     TRASH,

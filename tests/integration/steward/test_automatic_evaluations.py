@@ -8,12 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
-from shared.catalog.base import db_now
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.session import Catalog
 from shared.jobs import JobKind, JobState
 from shared.jobs.transitions import cancel_job, fail_job
 from shared.storage import FolderStore
@@ -66,7 +66,7 @@ def test_a_map_is_evaluated_by_itself_once_per_change(town: Town) -> None:
     assert not automatic(town), "too few again"
 
 
-def test_queries_that_can_not_be_asked_do_not_count_as_a_change(town: Town) -> None:
+def test_queries_that_can_not_be_searched_do_not_count_as_a_change(town: Town) -> None:
     """They would be one for ever: no evaluation asks with them."""
     town.publish([(n, at(n)) for n in range(LEAST)])
     assert automatic(town)

@@ -13,7 +13,7 @@ from services.steward.batches import worker as worker_module
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_job_files
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from shared.storage.keys import ARCHIVES
 from tests.integration.in_process_api import Service
@@ -122,7 +122,7 @@ def test_other_jobs_have_no_items(batches: Batches) -> None:
     problem(batches.service("GET", f"/jobs/{UUID(int=1)}/items"), 404, "job_not_found")
 
 
-def test_the_same_bytes_of_which_something_else_is_said_are_refused(batches: Batches) -> None:
+def test_the_same_bytes_with_other_metadata_are_rejected(batches: Batches) -> None:
     batches.service.indexed(1, place="hall")
     manifest = lines({"filename": "1.jpg", "place": "yard"})
     job_id = batches.start(*files(1), manifest=manifest)

@@ -11,8 +11,8 @@ import pytest
 from services.extractor.worker import ExtractorWorker
 from services.gateway.routes.batches import validate_prefix
 from services.steward.tasks.garbage_collection import collect_job_files
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unprocessable
 from shared.jobs import JobKind
@@ -139,6 +139,7 @@ def test_an_archive_comes_in_with_its_table_and_goes(
         ["a", "b"],
     )
     assert (one.filename, one.latitude) == ("1.jpg", None)
+    assert (one.relative_path, two.relative_path) == ("city/1.jpg", "city/in/2.jpg")
     assert named.latitude == 45.0691
     assert batches.store.get(two.object_key) == photo_bytes(2)
     assert [item["line"] for item in batches.items(job_id)] == [None, 2, None]
@@ -237,7 +238,7 @@ def test_a_body_that_is_no_batch_is_refused_and_leaves_nothing(
     assert batches.keys() == set()
 
 
-def test_limits_of_a_batch_are_said_and_leave_nothing(
+def test_limits_of_a_batch_are_reported_and_leave_nothing(
     catalog: Catalog,
     store: FolderStore,
     settings: Settings,

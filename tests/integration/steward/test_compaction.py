@@ -15,8 +15,8 @@ from services.steward.tasks.compaction import merge_slot, merge_small_chunks
 from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
 )
-from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
 from shared.storage.chunks import read_chunk, write_chunk

@@ -12,7 +12,8 @@ import sqlalchemy as sql
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
+from shared.catalog.maps import Map
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
 from tests.integration.town import Town, Watched
@@ -173,3 +174,77 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> Non
     result = read_job(town.catalog, job_id).result
     assert result is not None
     assert result["leave_one_out"] == before
+
+
+def _label(kind: str, place: int) -> str | None:
+    """The label of a place, of a kind that an evaluation must not stumble over."""
+    floor = place % 4
+    labels: dict[str, tuple[str | None, ...]] = {
+        "empty levels": (f"tower//room {place}", f"/tower/ /room {place}", "//", "tower/"),
+        "mixed depths": ("tower", f"tower/{floor}", f"tower/{floor}/{place}/shelf/left", None),
+        "one level": (f"room {place}",),
+    }
+    return labels[kind][place % len(labels[kind])]
+
+
+def _publish_pairs(town: Town, places: int, **columns: Any) -> None:
+    """Two photos of each place side by side; `columns` compute their values from the place."""
+    town.publish(
+        [
+            (
+                place * 360 / places + view * 90 / places,
+                {key: value(place) for key, value in columns.items()},
+            )
+            for place in range(places)
+            for view in range(2)
+        ]
+    )
+
+
+def _use_paths(town: Town) -> None:
+    with town.catalog.write() as session:
+        session.get_one(Map, town.map_id).place_labels_are_paths = True
+
+
+@pytest.mark.parametrize(
+    ("kind", "max_levels"), [("empty levels", 2), ("mixed depths", 5), ("one level", 1)]
+)
+def test_labels_with_empty_levels_mixed_depths_or_one_level_are_evaluated(
+    town: Town, kind: str, max_levels: int
+) -> None:
+    _use_paths(town)
+    _publish_pairs(town, 40, place=lambda place: _label(kind, place))
+    places = town.figures()["places"]
+    assert places["source"] == "own_photos"
+    assert 1 <= len(places["levels"]) <= max_levels
+    assert places["levels"][0]["samples"] > 0
+    for answers in places["answers"]:
+        assert 0 <= answers["answered_at_finest_level"]["mean"] <= answers["answered"]["mean"] <= 1
+
+
+def test_thousands_of_labels_are_evaluated(town: Town) -> None:
+    _use_paths(town)
+    _publish_pairs(town, 1500, place=lambda place: f"city/{place % 30}/{place}")
+    places = town.figures(sample=40)["places"]
+    assert (places["source"], len(places["levels"])) == ("own_photos", 3)
+    assert places["levels"][0]["samples"] == 40
+
+
+@pytest.mark.parametrize("labels_are_paths", [False, True])
+def test_labels_that_disagree_with_the_coordinates_are_evaluated(
+    town: Town, labels_are_paths: bool
+) -> None:
+    if labels_are_paths:
+        _use_paths(town)
+    _publish_pairs(
+        town,
+        40,
+        place=lambda place: f"tower/{place % 4}/{place}",
+        latitude=lambda place: float(place * 7 % 40),
+        longitude=lambda _: 7.0,
+    )
+    town.publish([(1, at(39, place="tower/0/0"))])  # the label of one place, the spot of another
+    places = town.figures()["places"]
+    assert places["source"] == "own_photos"
+    assert len(places["levels"]) == (3 if labels_are_paths else 4)
+    assert places["levels"][-1]["accuracy"] > 0.5

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from services.steward import evaluation_worker as asked_module
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import Search, get_map
-from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.jobs import JobState, reclaim_expired_leases
 from shared.jobs.transitions import cancel_job, retry_job

@@ -16,8 +16,8 @@ from services.steward.tasks.garbage_collection import (
     collect_queries,
     collect_superseded_chunks,
 )
-from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, get_photo
 from shared.ids import new_id

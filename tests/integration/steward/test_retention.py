@@ -11,9 +11,9 @@ from sqlalchemy import select, update
 
 from services.steward.tasks import maintenance as retention_module
 from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Search, get_map
-from shared.catalog.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job

@@ -16,11 +16,11 @@ from services.steward.tasks.garbage_collection import (
     collect_garbage,
 )
 from services.steward.tasks.maintenance import resend_wakeups
-from shared.catalog.base import db_now_plus
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
 from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
 from shared.catalog.photos import Photo, PresignedUpload
-from shared.catalog.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.storage import FolderStore

@@ -1,4 +1,4 @@
-"""Webhooks: told what happened, signed, again until it was heard, and led nowhere else."""
+"""Webhooks: signed deliveries, retries, and no delivery to internal addresses."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from services.steward.webhooks import (
     WebhookDispatcher,
     retry_delay_seconds,
 )
-from shared.catalog.base import db_now
-from shared.catalog.session import Catalog
+from shared.catalog.database.base import db_now
+from shared.catalog.database.session import Catalog
 from shared.catalog.webhooks import Delivery, EventKind, Webhook, enqueue_event
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobState
@@ -58,7 +58,7 @@ def receiver() -> Iterator[Receiver]:
         yield made
 
 
-class Told:
+class WebhookSetup:
     """A service with a webhook at the receiver."""
 
     def __init__(
@@ -115,121 +115,123 @@ class Told:
 
 
 @pytest.fixture
-def told(
+def hooks(
     door: Door, settings: Settings, receiver: Receiver, make_worker: Callable[[], ExtractorWorker]
-) -> Told:
-    return Told(door, settings, receiver, make_worker)
+) -> WebhookSetup:
+    return WebhookSetup(door, settings, receiver, make_worker)
 
 
 @pytest.fixture
-def localhost_tls(told: Told, tmp_path: Path) -> ssl.SSLContext:
-    return told.trust(tmp_path, "localhost")
+def localhost_tls(hooks: WebhookSetup, tmp_path: Path) -> ssl.SSLContext:
+    return hooks.trust(tmp_path, "localhost")
 
 
-def test_a_described_photo_is_told_of_and_signed(told: Told) -> None:
-    uploaded = told.photo()
-    assert told.send() == 1
-    (message,) = told.receiver.messages
+def test_a_described_photo_is_delivered_and_signed(hooks: WebhookSetup) -> None:
+    uploaded = hooks.photo()
+    assert hooks.send() == 1
+    (message,) = hooks.receiver.messages
     assert message.path == "/hook?a=1"
-    assert message.is_signed_with(told.webhook["secret"])
+    assert message.is_signed_with(hooks.webhook["secret"])
     body = message.json()
     assert body["type"] == "job.succeeded"
     assert body["data"]["job_id"] == uploaded["job_id"]
     assert body["data"]["file_id"] == uploaded["file_id"]
     assert (body["data"]["kind"], body["data"]["map"]) == ("index", "default")
-    (delivery,) = told.log()
+    (delivery,) = hooks.log()
     assert (delivery["state"], delivery["attempts"], delivery["last_status"]) == (
         "delivered",
         1,
         204,
     )
     assert message.headers["webhook-id"] == f"msg_{delivery['event_id']}"
-    assert told.send() == 0, "once it was heard, it is not told again"
+    assert hooks.send() == 0, "a successful delivery is not repeated"
 
 
-def test_only_events_that_are_wanted_are_told_and_each_webhook_is_told_alone(told: Told) -> None:
-    other, switches = told.add("job.succeeded"), told.add("generation.switched")
-    told.photo()
-    assert told.send() == 2
-    ids = {message.headers["webhook-id"] for message in told.receiver.messages}
+def test_only_subscribed_events_are_delivered_and_to_each_webhook_alone(
+    hooks: WebhookSetup,
+) -> None:
+    other, switches = hooks.add("job.succeeded"), hooks.add("generation.switched")
+    hooks.photo()
+    assert hooks.send() == 2
+    ids = {message.headers["webhook-id"] for message in hooks.receiver.messages}
     assert len(ids) == 1, "one event"
     signed = [
-        [message.is_signed_with(hook["secret"]) for hook in (told.webhook, other)]
-        for message in told.receiver.messages
+        [message.is_signed_with(hook["secret"]) for hook in (hooks.webhook, other)]
+        for message in hooks.receiver.messages
     ]
     assert sorted(signed) == [[False, True], [True, False]]
-    assert told.log(switches) == []
+    assert hooks.log(switches) == []
 
 
-def test_what_was_not_heard_is_told_again_later_under_the_same_id(told: Told) -> None:
-    told.photo()
-    told.receiver.status = 500
-    assert told.send() == 1
-    (waits,) = told.log()
+def test_failed_deliveries_are_retried_later_under_the_same_id(hooks: WebhookSetup) -> None:
+    hooks.photo()
+    hooks.receiver.status = 500
+    assert hooks.send() == 1
+    (waits,) = hooks.log()
     assert (waits["state"], waits["last_status"]) == ("pending", 500)
     assert waits["next_attempt_at"] is not None
-    assert told.send() == 0, "not at once"
-    told.come_due()
-    told.receiver.status = 200
-    assert told.send() == 1
-    assert [entry["state"] for entry in told.log()] == ["delivered"]
-    first, second = told.receiver.messages
+    assert hooks.send() == 0, "not at once"
+    hooks.come_due()
+    hooks.receiver.status = 200
+    assert hooks.send() == 1
+    assert [entry["state"] for entry in hooks.log()] == ["delivered"]
+    first, second = hooks.receiver.messages
     assert first.headers["webhook-id"] == second.headers["webhook-id"]
     assert first.body == second.body
 
 
-def test_pauses_grow_for_three_days_and_then_it_is_given_up(told: Told) -> None:
-    told.photo()
-    told.receiver.status = 503
+def test_pauses_grow_for_three_days_and_then_it_is_given_up(hooks: WebhookSetup) -> None:
+    hooks.photo()
+    hooks.receiver.status = 503
     for _ in range(len(RETRY_DELAYS_SECONDS)):
-        assert told.send() == 1
-        assert told.log()[0]["state"] == "pending"
-        told.come_due()
-    assert told.send() == 1
-    assert told.log()[0]["state"] == "failed"
-    told.come_due()
-    assert told.send() == 0
+        assert hooks.send() == 1
+        assert hooks.log()[0]["state"] == "pending"
+        hooks.come_due()
+    assert hooks.send() == 1
+    assert hooks.log()[0]["state"] == "failed"
+    hooks.come_due()
+    assert hooks.send() == 0
     pauses = [retry_delay_seconds(attempts) for attempts in range(1, len(RETRY_DELAYS_SECONDS) + 1)]
     assert pauses == sorted(pauses, key=lambda pause: pause or 0)
     assert 2 * 86_400 < sum(pause or 0 for pause in pauses) < 5 * 86_400
 
 
-def test_a_try_whose_steward_died_is_made_again(told: Told) -> None:
-    told.photo()
-    _, claimed = told.sender._claim_due(UUID(told.webhook["id"]))  # and then it dies
+def test_an_attempt_whose_steward_crashed_is_repeated(hooks: WebhookSetup) -> None:
+    hooks.photo()
+    _, claimed = hooks.sender._claim_due(UUID(hooks.webhook["id"]))  # and then it dies
     assert len(claimed) == 1
-    assert told.send() == 0, "another steward leaves it alone for a while"
-    told.come_due()
-    assert told.send() == 1
-    assert told.log()[0]["attempts"] == 2
+    assert hooks.send() == 0, "another steward leaves it alone for a while"
+    hooks.come_due()
+    assert hooks.send() == 1
+    assert hooks.log()[0]["attempts"] == 2
 
 
-def test_a_redirect_is_not_followed(told: Told) -> None:
+def test_a_redirect_is_not_followed(hooks: WebhookSetup) -> None:
     with receiving() as inside:
-        told.receiver.status = 302
-        told.receiver.headers = {"Location": inside.url}
-        told.photo()
-        told.send()
+        hooks.receiver.status = 302
+        hooks.receiver.headers = {"Location": inside.url}
+        hooks.photo()
+        hooks.send()
         assert inside.messages == []
-    (delivery,) = told.log()
+    (delivery,) = hooks.log()
     assert delivery["last_status"] == 302
     assert "redirects are not followed" in delivery["last_error"]
 
 
 def test_a_name_that_has_become_private_since_is_not_called(
-    told: Told, monkeypatch: pytest.MonkeyPatch
+    hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As DNS rebinding does it: public when the webhook was made, loopback when it is called.
-    told.photo()
+    hooks.photo()
     strict = WebhookDispatcher(
-        told.door.catalog, Settings().model_copy(update={"webhook_private_addresses": False})
+        hooks.door.catalog, Settings().model_copy(update={"webhook_private_addresses": False})
     )
     monkeypatch.setattr(
-        send_module, "parse_webhook_url", lambda url, allow_private: _target_of(told.receiver.url)
+        send_module, "parse_webhook_url", lambda url, allow_private: _target_of(hooks.receiver.url)
     )
-    assert told.send(strict) == 1
-    assert told.receiver.messages == []
-    (delivery,) = told.log()
+    assert hooks.send(strict) == 1
+    assert hooks.receiver.messages == []
+    (delivery,) = hooks.log()
     assert delivery["state"] == "failed"
     assert "not a public address" in delivery["last_error"]
 
@@ -239,9 +241,9 @@ def _target_of(url: str) -> WebhookTarget:
 
 
 def test_the_connection_goes_to_the_address_that_was_checked(
-    told: Told, monkeypatch: pytest.MonkeyPatch
+    hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told.photo()
+    hooks.photo()
     looked_up: list[str] = []
     real = socket.getaddrinfo
 
@@ -250,25 +252,25 @@ def test_the_connection_goes_to_the_address_that_was_checked(
         return real(host, *args, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", watched)
-    named = told.receiver.url.replace("127.0.0.1", "localhost")
-    with told.door.catalog.write() as session:
+    named = hooks.receiver.url.replace("127.0.0.1", "localhost")
+    with hooks.door.catalog.write() as session:
         session.execute(update(Webhook).values(url=named))
-    told.send()
-    assert len(told.receiver.messages) == 1
-    assert told.receiver.messages[0].headers["host"].startswith("localhost:")
+    hooks.send()
+    assert len(hooks.receiver.messages) == 1
+    assert hooks.receiver.messages[0].headers["host"].startswith("localhost:")
     assert looked_up.count("localhost") == 1, "once to check it; never again"
 
 
 @pytest.mark.parametrize("hangs", ["handshake", "head", "body"])
 def test_a_receiver_that_hangs_is_not_waited_for(
-    told: Told, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch, hangs: str
+    hooks: WebhookSetup, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch, hangs: str
 ) -> None:
     monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 60.0 if hangs == "body" else 0.5)
-    with hanging_receiver(localhost_tls, hangs) as told.receiver.url:
-        webhook = told.add("batch.finished")
-        told.announce(EventKind.BATCH_FINISHED)
-        assert told.send() == 1
-    (delivery,) = told.log(webhook)
+    with hanging_receiver(localhost_tls, hangs) as hooks.receiver.url:
+        webhook = hooks.add("batch.finished")
+        hooks.announce(EventKind.BATCH_FINISHED)
+        assert hooks.send() == 1
+    (delivery,) = hooks.log(webhook)
     if hangs == "body":  # of which nothing is read
         assert (delivery["state"], delivery["last_status"]) == ("delivered", 200)
     else:
@@ -277,7 +279,7 @@ def test_a_receiver_that_hangs_is_not_waited_for(
 
 
 def test_receivers_that_hang_delay_neither_other_webhooks_nor_the_stop(
-    told: Told, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+    hooks: WebhookSetup, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # An attempt has no end of its own here: whoever waited for one would never come back.
     monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 3600.0)
@@ -291,51 +293,53 @@ def test_receivers_that_hang_delay_neither_other_webhooks_nor_the_stop(
         return real("localhost" if host == "slow.example" else host, *args, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", slow)
-    good = told.receiver.url
+    good = hooks.receiver.url
     stop = threading.Event()
     with (
         hanging_receiver(localhost_tls, "handshake") as no_handshake,
         hanging_receiver(localhost_tls, "head") as no_head,
     ):
         stuck = []
-        for told.receiver.url in (no_handshake, no_head, "https://slow.example/"):
-            stuck.append(told.add("batch.finished"))
+        for hooks.receiver.url in (no_handshake, no_head, "https://slow.example/"):
+            stuck.append(hooks.add("batch.finished"))
         for _ in range(MAX_IN_FLIGHT + 1):
-            told.announce(EventKind.BATCH_FINISHED)
-        running = threading.Thread(target=told.sender.run, args=[stop])
+            hooks.announce(EventKind.BATCH_FINISHED)
+        running = threading.Thread(target=hooks.sender.run, args=[stop])
         running.start()
         try:
             assert looked_up.wait(60)
-            told.receiver.url = good
-            late = told.add("generation.switched")
-            told.announce(EventKind.GENERATION_SWITCHED)
+            hooks.receiver.url = good
+            late = hooks.add("generation.switched")
+            hooks.announce(EventKind.GENERATION_SWITCHED)
             for _ in range(600):
-                if told.log(late)[0]["state"] == "delivered":
+                if hooks.log(late)[0]["state"] == "delivered":
                     break
                 time.sleep(0.1)
-            assert told.log(late)[0]["state"] == "delivered"
+            assert hooks.log(late)[0]["state"] == "delivered"
         finally:
             stop.set()
             running.join(60)
             answered.set()
         assert not running.is_alive()
     for webhook in stuck:
-        deliveries = told.log(webhook)
+        deliveries = hooks.log(webhook)
         assert {delivery["state"] for delivery in deliveries} == {"pending"}, "due again later"
         tried = sum(delivery["attempts"] for delivery in deliveries)
         assert tried == MAX_IN_FLIGHT, "not all of them at the same time"
 
 
 @pytest.mark.parametrize("name", ["localhost", "elsewhere.example"])
-def test_over_https_only_the_named_host_is_told(told: Told, tmp_path: Path, name: str) -> None:
-    server = told.trust(tmp_path, name)
-    told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
+def test_over_https_only_the_named_host_gets_deliveries(
+    hooks: WebhookSetup, tmp_path: Path, name: str
+) -> None:
+    server = hooks.trust(tmp_path, name)
+    hooks.door(ADMIN, "DELETE", f"/webhooks/{hooks.webhook['id']}")
     with receiving(server) as secured:
-        told.receiver = secured
-        webhook = told.add("job.succeeded")
-        told.photo()
-        assert told.send() == 1
-        (delivery,) = told.log(webhook)
+        hooks.receiver = secured
+        webhook = hooks.add("job.succeeded")
+        hooks.photo()
+        assert hooks.send() == 1
+        (delivery,) = hooks.log(webhook)
         if name == "localhost":
             assert delivery["state"] == "delivered"
             assert secured.messages[0].is_signed_with(webhook["secret"])
@@ -344,47 +348,47 @@ def test_over_https_only_the_named_host_is_told(told: Told, tmp_path: Path, name
             assert "certificate verify failed" in delivery["last_error"].lower()
 
 
-def test_a_switched_generation_is_told_of_and_its_photos_are_not(
-    told: Told, vlads: Workplace
+def test_a_switched_generation_is_delivered_and_its_photos_are_not(
+    hooks: WebhookSetup, vlads: Workplace
 ) -> None:
     vlads.upload(*range(PHOTOS))
     assert vlads.fit().state == JobState.SUCCEEDED
-    told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
-    told.add("generation.switched", "job.succeeded")
+    hooks.door(ADMIN, "DELETE", f"/webhooks/{hooks.webhook['id']}")
+    hooks.add("generation.switched", "job.succeeded")
     before = vlads.active().id
     assert vlads.fit().state == JobState.SUCCEEDED
-    while told.send():
+    while hooks.send():
         pass
-    body = {message.json()["type"]: message.json()["data"] for message in told.receiver.messages}
-    assert len(told.receiver.messages) == 2, "one fit, one switch, and no reindex job"
+    body = {message.json()["type"]: message.json()["data"] for message in hooks.receiver.messages}
+    assert len(hooks.receiver.messages) == 2, "one fit, one switch, and no reindex job"
     assert body["job.succeeded"]["kind"] == "fit"
     assert body["generation.switched"]["generation_id"] == str(vlads.active().id)
     assert body["generation.switched"]["replaced_generation_id"] == str(before)
 
 
-def test_a_deleted_webhook_is_told_nothing_more(told: Told) -> None:
-    told.photo()
-    deleted = told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
+def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
+    hooks.photo()
+    deleted = hooks.door(ADMIN, "DELETE", f"/webhooks/{hooks.webhook['id']}")
     assert deleted.status_code == 200
-    assert told.send() == 0
-    assert told.receiver.messages == []
+    assert hooks.send() == 0
+    assert hooks.receiver.messages == []
     problem(
-        told.door(ADMIN, "GET", f"/webhooks/{told.webhook['id']}/deliveries"),
+        hooks.door(ADMIN, "GET", f"/webhooks/{hooks.webhook['id']}/deliveries"),
         404,
         "webhook_not_found",
     )
 
 
 def test_its_secret_is_shown_once_and_never_logged(
-    told: Told, caplog: pytest.LogCaptureFixture
+    hooks: WebhookSetup, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.DEBUG):
-        secret = told.webhook["secret"]
-        listed = told.door(ADMIN, "GET", "/webhooks")
-        assert [webhook["id"] for webhook in listed.json()] == [told.webhook["id"]]
+        secret = hooks.webhook["secret"]
+        listed = hooks.door(ADMIN, "GET", "/webhooks")
+        assert [webhook["id"] for webhook in listed.json()] == [hooks.webhook["id"]]
         assert secret not in listed.text
-        told.photo()
-        told.send()
+        hooks.photo()
+        hooks.send()
     assert secret not in caplog.text
 
 
@@ -408,29 +412,31 @@ def test_a_webhook_to_a_machine_of_our_own_is_refused(
     assert door(ADMIN, "GET", "/webhooks").json() == []
 
 
-def test_a_failed_job_and_a_finished_batch_are_told_of(told: Told, settings: Settings) -> None:
-    batches = told.add("batch.finished")
+def test_a_failed_job_and_a_finished_batch_are_delivered(
+    hooks: WebhookSetup, settings: Settings
+) -> None:
+    batches = hooks.add("batch.finished")
     archive = zip_of({"1.jpg": photo_bytes(1)})
-    started = told.door(
+    started = hooks.door(
         ADMIN, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)}
     ).json()
-    store = told.door.store
-    worker = BatchWorker(told.door.catalog, store, InProcessWakeups(), settings, "steward")
+    store = hooks.door.store
+    worker = BatchWorker(hooks.door.catalog, store, InProcessWakeups(), settings, "steward")
     worker.run_next(threading.Event())
-    told._make_worker().drain(threading.Event())
-    with told.door.catalog.write() as session:
+    hooks._make_worker().drain(threading.Event())
+    with hooks.door.catalog.write() as session:
         session.execute(update(Job).values(run_after=None))
     worker.run_next(threading.Event())
-    (delivery,) = told.log(batches)
+    (delivery,) = hooks.log(batches)
     assert delivery["event"] == "batch.finished"
-    while told.send():
+    while hooks.send():
         pass
-    kinds = [(m.json()["type"], m.json()["data"]["kind"]) for m in told.receiver.messages]
+    kinds = [(m.json()["type"], m.json()["data"]["kind"]) for m in hooks.receiver.messages]
     assert sorted(kinds) == [
         ("batch.finished", "batch"),
         ("job.succeeded", "batch"),
         ("job.succeeded", "index"),
     ]
-    finished = next(m.json() for m in told.receiver.messages if m.json()["type"][0] == "b")
+    finished = next(m.json() for m in hooks.receiver.messages if m.json()["type"][0] == "b")
     assert finished["data"]["job_id"] == started["job_id"]
     assert finished["data"]["result"]["succeeded"] == 1

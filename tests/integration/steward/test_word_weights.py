@@ -19,9 +19,9 @@ from services.steward.tasks import auto_evaluation as auto_evaluate
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import get_map
-from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.config.settings import Settings
 from shared.ids import new_id
@@ -175,7 +175,7 @@ def test_weights_that_raise_nothing_are_not_kept(city: City) -> None:
     assert record.held_out is not None
 
 
-def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
+def test_too_few_pairs_are_no_error_and_are_reported_in_numbers(city: City) -> None:
     city.publish(rows_of_places(8, 3, reported=True), street(8))
     record = city.learn()
     assert (record.outcome, record.weights) == (Outcome.NOT_ENOUGH_PAIRS, ())

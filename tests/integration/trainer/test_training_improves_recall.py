@@ -32,6 +32,7 @@ def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
             "run_name": "run",
             "accelerator": "cpu",
             "faiss_gpu": False,
+            "backbone_arch": "resnet18",
             "pretrained": False,
             "layers_to_freeze": -1,
             "layers_to_crop": (3,),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Iterator
@@ -164,11 +165,44 @@ def test_a_run_that_an_earlier_release_began_goes_on(
     assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(resumed["last"]))
 
 
-def test_a_finished_run_learns_longer(whole: tuple[Path, Json], tmp_path: Path) -> None:
+def test_a_finished_run_learns_longer_and_continues_its_csv_file(
+    whole: tuple[Path, Json], tmp_path: Path
+) -> None:
     folder, _ = whole
     copy = Path(shutil.copytree(folder, tmp_path / "run"))
-    report = run.resume(copy, {"max_epochs": 3, "logger": "none"}, NullDisplay(), StopRequest())
+    changes = {"max_epochs": 3, "logger": "csv", "experiment_phase": "train"}
+    report = run.resume(copy, changes, NullDisplay(), StopRequest())
     assert [epoch["number"] for epoch in report["epochs"]] == [0, 1, 2]
+    (file,) = (copy / "csv").rglob("metrics.csv")
+    with file.open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    assert [int(row["step"]) for row in rows if row["loss"]] == list(range(1, 10))
+    validated = [row["step"] for row in rows if not row["loss"]]
+    assert validated == ["3", "6", "9"]
+
+
+def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
+    places: Path, tmp_path: Path
+) -> None:
+    report = train(
+        run_arguments(places, tmp_path, experiment_phase="all", save_val_predictions=True)
+    )
+    (name,) = report["predictions"]
+    folder = tmp_path / "run"
+    files = [folder / f"predictions_{name}.npy"]
+    files += [folder / f"predictions/epoch{n:02d}/predictions_{name}.npy" for n in (0, 1)]
+    recalls = [report["test"][name]["recall"]]
+    recalls += [
+        {k: epoch["figures"][f"{name}/R{k}"] for k in ("1", "5", "10", "20")}
+        for epoch in report["epochs"]
+    ]
+    for file, recall in zip(files, recalls, strict=True):
+        command = ["evaluate", "--predictions", str(file), "--data", str(places), "--set", name]
+        answer = CliRunner().invoke(build_app(["evaluate"]), [*command, "--json"])
+        assert answer.exit_code == 0, answer.output
+        evaluated = json.loads(answer.stdout)
+        assert evaluated["recall"] == {k: recall[k] for k in evaluated["recall"]}
+    assert f"--data {places} --set {name}" in report["next"][0]
 
 
 def test_a_resumed_run_can_not_become_another(
@@ -176,8 +210,11 @@ def test_a_resumed_run_can_not_become_another(
 ) -> None:
     folder, _ = whole
     copy = Path(shutil.copytree(folder, tmp_path / "run"))
-    with pytest.raises(Conflict, match="batch_size"):
-        run.resume(copy, {"batch_size": 3}, NullDisplay(), StopRequest())
+    changed = {"batch_size": 3, "lr": 0.5, "miner_margin": 0.3, "augmentation": "none"}
+    with pytest.raises(Conflict, match="batch_size") as caught:
+        run.resume(copy, changed, NullDisplay(), StopRequest())
+    for change in ("lr (0.001 -> 0.5)", "miner_margin (0.1 -> 0.3)", "augmentation (randaugment"):
+        assert change in caught.value.detail
     more = write_tiny_places(tmp_path / "more", places=7)
     with pytest.raises(Conflict, match="are not those that the run"):
         run.resume(copy, {"data_root": str(more)}, NullDisplay(), StopRequest())
@@ -229,6 +266,7 @@ def test_a_checkpoint_alone_is_tested(
     del said["image_size"]  # the checkpoint knows it
     report = train(said)
     assert report["test"] == trained["test"]
+    assert all(Path(file).is_file() for file in report["predictions"].values())
     native = train({**said, "test_image_size": "native", "run_name": "native"})
     assert native["test"].keys() == trained["test"].keys()
     with pytest.raises(InvalidRequest, match="--model_path"):
@@ -252,8 +290,7 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
         ({"miner_name": "BestMiner"}, "unknown_miner", "BatchHardMiner"),
         ({"monitor": "other/R1"}, "unknown_metric", "known: "),
         ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
-        ({"faiss_gpu": True}, "faiss_gpu_missing", "--faiss_gpu False"),
-        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "nowhere"),
+        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "(--weights)"),
     ],
 )
 def test_what_is_not_there_is_named_with_what_is_known(
@@ -286,7 +323,8 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
     out = tmp_path / "grid"
     command = ["grid", str(file), "--out", str(out)]
     dry = CliRunner().invoke(build_app(["grid"]), [*command, "--dry-run", "--json"])
-    assert dry.exit_code == 0, dry.output
+    assert dry.exit_code == 1, dry.output
+    assert "wrong can't start: bad_agg_config" in dry.stderr
     assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
         ("AVG", "waiting"),
         ("GeM", "waiting"),

@@ -214,8 +214,8 @@ def test_a_wrong_answer_of_ours_is_a_missed_figure(
 ) -> None:
     right = PlacewiseSearch.search
 
-    def last_two_change_places(self: PlacewiseSearch, asked: BenchmarkQuery) -> Ranking:
-        found = list(right(self, asked))
+    def last_two_change_places(self: PlacewiseSearch, query: BenchmarkQuery) -> Ranking:
+        found = list(right(self, query))
         return [*found[:-2], *reversed(found[-2:])]
 
     monkeypatch.setattr(PlacewiseSearch, "search", last_two_change_places)

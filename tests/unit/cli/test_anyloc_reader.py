@@ -16,24 +16,24 @@ from services.cli.ingest.anyloc_reader import (
     read_anyloc_rows,
 )
 from shared.errors import InvalidRequest
-from tests.support.anyloc import AnylocHouse
+from tests.support.anyloc import AnylocInstallation
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> Iterator[AnylocHouse]:
-    made = AnylocHouse(tmp_path / "anyloc-similarity-service")
+def anyloc(tmp_path: Path) -> Iterator[AnylocInstallation]:
+    made = AnylocInstallation(tmp_path / "anyloc-similarity-service")
     yield made
     made.close()
 
 
-def one_row(house: AnylocHouse, **columns: Any) -> AnylocRow:
-    house.add("a.jpg", b"photo", **columns)
-    [row] = read_anyloc_rows(house.database)
+def one_row(anyloc: AnylocInstallation, **columns: Any) -> AnylocRow:
+    anyloc.add("a.jpg", b"photo", **columns)
+    [row] = read_anyloc_rows(anyloc.database)
     return row
 
 
-def read(house: AnylocHouse, **options: Any) -> AnylocFolder:
-    return read_anyloc_folder(house.root, options.get("database"), options.get("uploads"))
+def read(anyloc: AnylocInstallation, **options: Any) -> AnylocFolder:
+    return read_anyloc_folder(anyloc.root, options.get("database"), options.get("uploads"))
 
 
 def state_of(folder: Path) -> dict[Path, tuple[bytes, int]]:
@@ -47,8 +47,10 @@ def state_of(folder: Path) -> dict[Path, tuple[bytes, int]]:
 # --- rows ------------------------------------------------------------------------------------
 
 
-def test_a_row_keeps_its_name_its_time_in_utc_its_tags_and_its_metadata(house: AnylocHouse) -> None:
-    row = one_row(house, tags="night, rain", metadata_json='{"upload_ip": "unknown"}')
+def test_a_row_keeps_its_name_its_time_in_utc_its_tags_and_its_metadata(
+    anyloc: AnylocInstallation,
+) -> None:
+    row = one_row(anyloc, tags="night, rain", metadata_json='{"upload_ip": "unknown"}')
     assert row == AnylocRow(
         image_path="/app/app/uploads/a.jpg",
         name="original-a.jpg",
@@ -78,9 +80,9 @@ def test_a_row_keeps_its_name_its_time_in_utc_its_tags_and_its_metadata(house: A
     ],
 )
 def test_tags_are_a_json_list_or_separated_by_commas(
-    house: AnylocHouse, text: object, tags: list[str]
+    anyloc: AnylocInstallation, text: object, tags: list[str]
 ) -> None:
-    assert one_row(house, tags=text).tags == tags
+    assert one_row(anyloc, tags=text).tags == tags
 
 
 @pytest.mark.parametrize(
@@ -93,60 +95,64 @@ def test_tags_are_a_json_list_or_separated_by_commas(
     ],
 )
 def test_times_become_utc_and_what_is_none_stays_as_it_is(
-    house: AnylocHouse, text: str, time: str
+    anyloc: AnylocInstallation, text: str, time: str
 ) -> None:
-    assert one_row(house, upload_time=text).metadata["anyloc_upload_time"] == time
+    assert one_row(anyloc, upload_time=text).metadata["anyloc_upload_time"] == time
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", '"word"', "{broken", '{"a": NaN}', "[" * 100_000])
-def test_metadata_that_is_no_json_object_is_kept_as_text(house: AnylocHouse, text: str) -> None:
-    assert one_row(house, metadata_json=text).metadata["anyloc_metadata"] == text
+def test_metadata_that_is_no_json_object_is_kept_as_text(
+    anyloc: AnylocInstallation, text: str
+) -> None:
+    assert one_row(anyloc, metadata_json=text).metadata["anyloc_metadata"] == text
 
 
-def test_odd_values_cost_no_row(house: AnylocHouse) -> None:
-    house.connection.execute("ALTER TABLE images ADD COLUMN later_addition TEXT")
-    house.add("1.jpg", b"1", original_filename=None, upload_time=None, metadata_json=None)
-    house.add("2.jpg", b"2", original_filename=b"blob.jpg", tags=b"\xff\xfe")
-    house.add("3.jpg", b"3", original_filename="nul\0.jpg", image_id=None)
-    house.connection.execute("UPDATE images SET tags = CAST(x'c328' AS TEXT) WHERE tags IS NULL")
-    names = [row.name for row in read_anyloc_rows(house.database)]
+def test_odd_values_cost_no_row(anyloc: AnylocInstallation) -> None:
+    anyloc.connection.execute("ALTER TABLE images ADD COLUMN later_addition TEXT")
+    anyloc.add("1.jpg", b"1", original_filename=None, upload_time=None, metadata_json=None)
+    anyloc.add("2.jpg", b"2", original_filename=b"blob.jpg", tags=b"\xff\xfe")
+    anyloc.add("3.jpg", b"3", original_filename="nul\0.jpg", image_id=None)
+    anyloc.connection.execute("UPDATE images SET tags = CAST(x'c328' AS TEXT) WHERE tags IS NULL")
+    names = [row.name for row in read_anyloc_rows(anyloc.database)]
     assert names == ["", "blob.jpg", "nul.jpg"]
-    assert "" not in read_anyloc_rows(house.database)[2].metadata
-    assert [photo.name for photo in read(house).photos] == ["1.jpg", "blob.jpg", "nul.jpg"]
+    assert "" not in read_anyloc_rows(anyloc.database)[2].metadata
+    assert [photo.name for photo in read(anyloc).photos] == ["1.jpg", "blob.jpg", "nul.jpg"]
 
 
-def test_rows_in_the_write_ahead_log_are_read_and_nothing_is_written(house: AnylocHouse) -> None:
-    house.add("a.jpg", b"photo")
-    assert (house.models / "similarity.db-wal").stat().st_size > 0
-    before = state_of(house.root)
-    assert len(read_anyloc_rows(house.database)) == 1
-    assert state_of(house.root) == before
+def test_rows_in_the_write_ahead_log_are_read_and_nothing_is_written(
+    anyloc: AnylocInstallation,
+) -> None:
+    anyloc.add("a.jpg", b"photo")
+    assert (anyloc.models / "similarity.db-wal").stat().st_size > 0
+    before = state_of(anyloc.root)
+    assert len(read_anyloc_rows(anyloc.database)) == 1
+    assert state_of(anyloc.root) == before
 
 
-def test_a_folder_that_can_only_be_read_is_enough(house: AnylocHouse) -> None:
-    house.add("a.jpg", b"photo")
-    house.close()
-    house.models.chmod(0o500)
+def test_a_folder_that_can_only_be_read_is_enough(anyloc: AnylocInstallation) -> None:
+    anyloc.add("a.jpg", b"photo")
+    anyloc.close()
+    anyloc.models.chmod(0o500)
     try:
-        before = state_of(house.root)
-        assert len(read_anyloc_rows(house.database)) == 1
-        assert state_of(house.root) == before
+        before = state_of(anyloc.root)
+        assert len(read_anyloc_rows(anyloc.database)) == 1
+        assert state_of(anyloc.root) == before
     finally:
-        house.models.chmod(0o700)
+        anyloc.models.chmod(0o700)
 
 
 @pytest.mark.parametrize("broken", ["text", "empty", "cut off"])
-def test_a_database_that_can_not_be_read_is_named(house: AnylocHouse, broken: str) -> None:
+def test_a_database_that_can_not_be_read_is_named(anyloc: AnylocInstallation, broken: str) -> None:
     for number in range(200):
-        house.add(f"{number}.jpg", None, tags="x" * 500)
-    house.close()
-    whole = house.database.read_bytes()
+        anyloc.add(f"{number}.jpg", None, tags="x" * 500)
+    anyloc.close()
+    whole = anyloc.database.read_bytes()
     damaged = {"text": b"This is no database." * 100, "empty": b"", "cut off": whole[:40_000]}
-    house.database.write_bytes(damaged[broken])
+    anyloc.database.write_bytes(damaged[broken])
     with pytest.raises(InvalidRequest) as caught:
-        read_anyloc_rows(house.database)
+        read_anyloc_rows(anyloc.database)
     assert caught.value.code == "bad_anyloc_database"
-    assert str(house.database) in caught.value.detail
+    assert str(anyloc.database) in caught.value.detail
 
 
 # --- photos ----------------------------------------------------------------------------------
@@ -161,54 +167,56 @@ def test_a_database_that_can_not_be_read_is_named(house: AnylocHouse, broken: st
         r"C:\service\backend\app\uploads\a.jpg",
     ],
 )
-def test_paths_of_other_machines_lead_to_the_file(house: AnylocHouse, image_path: str) -> None:
-    house.add("a.jpg", b"photo", image_path=image_path)
-    [photo] = read(house).photos
-    assert photo.path == house.uploads / "a.jpg"
+def test_paths_of_other_machines_lead_to_the_file(
+    anyloc: AnylocInstallation, image_path: str
+) -> None:
+    anyloc.add("a.jpg", b"photo", image_path=image_path)
+    [photo] = read(anyloc).photos
+    assert photo.path == anyloc.uploads / "a.jpg"
     assert photo.name == "original-a.jpg"
 
 
 @pytest.mark.parametrize("app", ["", "app", "backend", "backend/app", "volumes/app/app"])
 def test_the_folder_may_lie_anywhere_below(tmp_path: Path, app: str) -> None:
-    house = AnylocHouse(tmp_path / "service", app)
-    house.add("a.jpg", b"photo")
-    found = read(house)
-    house.close()
-    assert (found.database, len(found.photos)) == (house.database, 1)
-    assert found.vocabularies == [house.models / "vocabulary" / "c_centers.pt"]
+    anyloc = AnylocInstallation(tmp_path / "service", app)
+    anyloc.add("a.jpg", b"photo")
+    found = read(anyloc)
+    anyloc.close()
+    assert (found.database, len(found.photos)) == (anyloc.database, 1)
+    assert found.vocabularies == [anyloc.models / "vocabulary" / "c_centers.pt"]
 
 
-def test_files_of_one_name_are_told_apart_by_their_folders(house: AnylocHouse) -> None:
-    (house.uploads / "old").mkdir()
-    (house.uploads / "old" / "a.jpg").write_bytes(b"another photo")
-    house.add("a.jpg", b"photo")
-    house.add("old/a.jpg", None)
-    assert [photo.path for photo in read(house).photos] == [
-        house.uploads / "a.jpg",
-        house.uploads / "old" / "a.jpg",
+def test_files_of_one_name_are_told_apart_by_their_folders(anyloc: AnylocInstallation) -> None:
+    (anyloc.uploads / "old").mkdir()
+    (anyloc.uploads / "old" / "a.jpg").write_bytes(b"another photo")
+    anyloc.add("a.jpg", b"photo")
+    anyloc.add("old/a.jpg", None)
+    assert [photo.path for photo in read(anyloc).photos] == [
+        anyloc.uploads / "a.jpg",
+        anyloc.uploads / "old" / "a.jpg",
     ]
 
 
 def test_rows_without_a_file_are_missing_and_files_without_a_row_are_taken(
-    house: AnylocHouse,
+    anyloc: AnylocInstallation,
 ) -> None:
-    house.add("gone.jpg", None)
-    house.add("there.jpg", b"photo")
-    (house.uploads / "unknown.PNG").write_bytes(b"another photo")
-    (house.uploads / "notes.txt").write_text("no photo")
-    found = read(house)
+    anyloc.add("gone.jpg", None)
+    anyloc.add("there.jpg", b"photo")
+    (anyloc.uploads / "unknown.PNG").write_bytes(b"another photo")
+    (anyloc.uploads / "notes.txt").write_text("no photo")
+    found = read(anyloc)
     assert [item["filename"] for item in found.missing] == ["original-gone.jpg"]
     assert [photo.name for photo in found.photos] == ["original-there.jpg", "unknown.PNG"]
     assert (found.rows, found.unlisted) == (2, 1)
     assert found.photos[1].fields == {}
 
 
-def test_the_same_bytes_are_one_photo_that_remembers_the_others(house: AnylocHouse) -> None:
-    house.add("a.jpg", b"the same", tags="night")
-    house.add("b.jpg", b"the same", tags="rain,night")
-    house.add("c.jpg", b"not same", tags="rain")
-    (house.uploads / "d.jpg").write_bytes(b"the same")
-    found = read(house)
+def test_the_same_bytes_are_one_photo_that_remembers_the_others(anyloc: AnylocInstallation) -> None:
+    anyloc.add("a.jpg", b"the same", tags="night")
+    anyloc.add("b.jpg", b"the same", tags="rain,night")
+    anyloc.add("c.jpg", b"not same", tags="rain")
+    (anyloc.uploads / "d.jpg").write_bytes(b"the same")
+    found = read(anyloc)
     assert [photo.name for photo in found.photos] == ["original-a.jpg", "original-c.jpg"]
     assert [item["filename"] for item in found.duplicates] == ["original-b.jpg", "d.jpg"]
     assert "original-a.jpg" in found.duplicates[0]["reason"]
@@ -218,24 +226,26 @@ def test_the_same_bytes_are_one_photo_that_remembers_the_others(house: AnylocHou
     assert others[0]["anyloc_image_id"] == "id-of-b.jpg"
 
 
-def test_a_database_and_photos_elsewhere_can_be_named(house: AnylocHouse, tmp_path: Path) -> None:
-    house.add("a.jpg", b"photo")
+def test_a_database_and_photos_elsewhere_can_be_named(
+    anyloc: AnylocInstallation, tmp_path: Path
+) -> None:
+    anyloc.add("a.jpg", b"photo")
     elsewhere = tmp_path / "photos of the service"
-    house.uploads.rename(elsewhere)
+    anyloc.uploads.rename(elsewhere)
     with pytest.raises(InvalidRequest) as caught:
-        read(house)
+        read(anyloc)
     assert caught.value.code == "no_anyloc_uploads"
-    assert [photo.path for photo in read(house, uploads=elsewhere).photos] == [elsewhere / "a.jpg"]
+    assert [photo.path for photo in read(anyloc, uploads=elsewhere).photos] == [elsewhere / "a.jpg"]
 
-    (house.root / "backup").mkdir()
-    copy = house.root / "backup" / "similarity.db"
-    copy.write_bytes(house.database.read_bytes())
+    (anyloc.root / "backup").mkdir()
+    copy = anyloc.root / "backup" / "similarity.db"
+    copy.write_bytes(anyloc.database.read_bytes())
     with pytest.raises(InvalidRequest) as caught:
-        read(house, uploads=elsewhere)
+        read(anyloc, uploads=elsewhere)
     assert caught.value.code == "several_anyloc_databases"
     assert str(copy) in caught.value.detail
-    named = read(house, uploads=elsewhere, database=house.database)
-    assert named.database == house.database
+    named = read(anyloc, uploads=elsewhere, database=anyloc.database)
+    assert named.database == anyloc.database
 
 
 def test_a_folder_without_a_database_is_refused(tmp_path: Path) -> None:

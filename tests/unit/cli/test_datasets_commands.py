@@ -21,7 +21,7 @@ def called(*arguments: object, code: int = 0) -> str:
     return result.output
 
 
-def asked(*arguments: object, code: int = 0) -> Any:
+def run_datasets(*arguments: object, code: int = 0) -> Any:
     """The answer as a program gets it."""
     result = CliRunner().invoke(app, [*(str(argument) for argument in arguments), "--json"])
     assert result.exit_code == code, result.output
@@ -43,7 +43,7 @@ def whole_set(base: Path) -> None:
 
 def test_check_tells_what_is_there(tmp_path: Path) -> None:
     whole_set(tmp_path)
-    reported = asked("check", tmp_path, "--decode")
+    reported = run_datasets("check", tmp_path, "--decode")
     assert reported["layouts"] == ["gsv_xs", "database and queries folders"]
     assert reported["training"]["cities"] == {
         "osl": {"places": 1, "photos": 3},
@@ -64,8 +64,8 @@ def test_check_names_photos_that_do_not_decode_with_their_count(tmp_path: Path) 
     broken = sorted((tmp_path / "database").iterdir())[:2]
     broken[0].write_bytes(broken[0].read_bytes()[:-40])
     broken[1].write_bytes(b"no photo")
-    assert asked("check", tmp_path)["problems"] == []
-    (problem,) = asked("check", tmp_path, "--decode", code=1)["problems"]
+    assert run_datasets("check", tmp_path)["problems"] == []
+    (problem,) = run_datasets("check", tmp_path, "--decode", code=1)["problems"]
     assert (problem["code"], problem["count"]) == ("undecodable_photo", 2)
     assert all(
         str(path) in reported for path, reported in zip(broken, problem["examples"], strict=True)
@@ -75,7 +75,7 @@ def test_check_names_photos_that_do_not_decode_with_their_count(tmp_path: Path) 
 def test_check_names_photos_that_are_listed_and_not_there(tmp_path: Path) -> None:
     rows = [(f"{number}.jpg", "hall") for number in range(7)]
     write_csv(tmp_path / "train.csv", ("path", "place"), rows)
-    (problem,) = asked("check", tmp_path, code=1)["problems"]
+    (problem,) = run_datasets("check", tmp_path, code=1)["problems"]
     assert (problem["code"], problem["count"]) == ("missing_photo", 7)
     assert problem["examples"] == [str(tmp_path / f"{number}.jpg") for number in range(5)]
     assert "and 2 more" in called("check", tmp_path, code=1)
@@ -85,7 +85,7 @@ def test_check_names_a_ground_truth_that_differs_from_the_positions(tmp_path: Pa
     save_names(tmp_path / "my_dbImages.npy", street(tmp_path, "db", [0, 100]))
     save_names(tmp_path / "my_qImages.npy", street(tmp_path, "q", [0, 100]))
     save_lists(tmp_path / "my_gt.npy", [[0], [0]])
-    (problem,) = asked("check", tmp_path, code=1)["problems"]
+    (problem,) = run_datasets("check", tmp_path, code=1)["problems"]
     assert (problem["code"], problem["count"]) == ("ground_truth_differs", 1)
 
 
@@ -93,20 +93,20 @@ def test_check_names_what_stands_twice(tmp_path: Path) -> None:
     photos = street(tmp_path, "db", [0, 100])
     save_names(tmp_path / "my_dbImages.npy", [*photos, photos[0]])
     save_names(tmp_path / "my_qImages.npy", photos[:1])
-    codes = [problem["code"] for problem in asked("check", tmp_path, code=1)["problems"]]
+    codes = [problem["code"] for problem in run_datasets("check", tmp_path, code=1)["problems"]]
     assert codes == ["listed_twice", "query_in_database"]
 
 
 def test_check_goes_on_where_one_set_can_not_be_opened(tmp_path: Path) -> None:
     whole_set(tmp_path)
     save_names(tmp_path / "lost_dbImages.npy", ["a.jpg"])
-    reported = asked("check", tmp_path, code=1)
+    reported = run_datasets("check", tmp_path, code=1)
     assert [one["name"] for one in reported["evaluation"]] == [tmp_path.name.replace("_", "")]
     assert [problem["code"] for problem in reported["problems"]] == ["bad_list"]
 
 
 def test_check_of_a_folder_of_nothing_says_so(tmp_path: Path) -> None:
-    assert asked("check", tmp_path, code=1)["code"] == "no_data_set"
+    assert run_datasets("check", tmp_path, code=1)["code"] == "no_data_set"
 
 
 @pytest.mark.parametrize("kind", ["npy", "txt", "csv"])
@@ -124,7 +124,7 @@ def test_ground_truth_is_written_for_lists_of_every_kind(tmp_path: Path, kind: s
             case _:
                 write_csv(lists[role], ("path",), [(name,) for name in names])
     out = tmp_path / "gt.npy"
-    reported = asked(
+    reported = run_datasets(
         "ground-truth", "--database", lists["database"], "--queries", lists["queries"],
         "--radius", 25, "--out", out,
     )  # fmt: skip
@@ -137,14 +137,17 @@ def test_ground_truth_by_another_rule_and_what_it_refuses(tmp_path: Path) -> Non
     table = write_csv(tmp_path / "l.csv", ("path", "frame"), [("a", 1), ("b", 3), ("c", 9)])
     lists = ("ground-truth", "--database", table, "--queries", table, "--out")
     out = tmp_path / "gt.npy"
-    asked(*lists, out, "--rule", "frames 2")
+    run_datasets(*lists, out, "--rule", "frames 2")
     assert np.load(out, allow_pickle=True).tolist() == [[0, 1], [0, 1], [2]]
-    assert asked(*lists, out, code=1)["code"] == "no_positions"
-    assert asked(*lists, out, "--rule", "frames 2", "--radius", 3, code=1)["code"] == "which_rule"
-    assert asked(*lists, tmp_path / "gt.txt", code=1)["code"] == "bad_out"
-    assert asked(*lists, out, "--radius", "inf", code=1)["code"] == "unknown_rule"
+    assert run_datasets(*lists, out, code=1)["code"] == "no_positions"
+    assert (
+        run_datasets(*lists, out, "--rule", "frames 2", "--radius", 3, code=1)["code"]
+        == "which_rule"
+    )
+    assert run_datasets(*lists, tmp_path / "gt.txt", code=1)["code"] == "bad_out"
+    assert run_datasets(*lists, out, "--radius", "inf", code=1)["code"] == "unknown_rule"
     missing = tmp_path / "nowhere" / "gt.npy"
-    assert asked(*lists, missing, "--rule", "frames 2", code=1)["code"] == "out_unwritable"
+    assert run_datasets(*lists, missing, "--rule", "frames 2", code=1)["code"] == "out_unwritable"
 
 
 def test_audit_lists_confident_answers_just_outside_the_rule(tmp_path: Path) -> None:
@@ -153,11 +156,11 @@ def test_audit_lists_confident_answers_just_outside_the_rule(tmp_path: Path) -> 
     np.save(tmp_path / "p.npy", np.array([[1], [2]]))
     np.save(tmp_path / "s.npy", np.array([[0.9], [0.8]]))
     options = ("audit", tmp_path, "--predictions", tmp_path / "p.npy")
-    (suspect,) = asked(*options, "--scores", tmp_path / "s.npy")["suspects"]
+    (suspect,) = run_datasets(*options, "--scores", tmp_path / "s.npy")["suspects"]
     assert (suspect["query"], suspect["metres"], suspect["database"]) == (0, 60.0, 1)
     assert suspect["score"] == pytest.approx(0.9)
     assert "1 of 2 queries" in called(*options)
     np.save(tmp_path / "p.npy", np.array([[1], [3]]))
-    assert asked(*options, code=1)["code"] == "predictions_out_of_range"
+    assert run_datasets(*options, code=1)["code"] == "predictions_out_of_range"
     np.save(tmp_path / "p.npy", np.array([0.5]))
-    assert asked(*options, code=1)["code"] == "bad_predictions"
+    assert run_datasets(*options, code=1)["code"] == "bad_predictions"

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from services.cli.operations import doctor as extractor_checks
-from services.cli.operations.doctor import check_device, check_extractor, check_memory
+from services.cli.operations import installation_checks as extractor_checks
+from services.cli.operations.installation_checks import check_device, check_extractor, check_memory
 from shared.config import settings as machine
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.descriptors.backbones import dinov2

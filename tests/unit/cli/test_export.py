@@ -83,7 +83,7 @@ def test_pairs_are_those_of_the_labelled_queries_best_match_first(
     text, report = pairs_of(client)
     assert text == "q.jpg b.jpg\nq.jpg a.jpg\n"
     assert report == {"asked": 1, "pairs": 2, "passed_over": 0}
-    assert "top_k=2" in server.asked[1][1]
+    assert "top_k=2" in server.requests[1][1]
 
 
 def test_a_map_without_queries_pairs_its_own_photos_and_passes_over_what_waits(
@@ -107,6 +107,14 @@ def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused(
     assert caught.value.code == "ambiguous_names"
 
 
+def test_pairs_name_photos_of_one_name_by_their_paths(server: FakeServer, client: Client) -> None:
+    first = photo("1.jpg", relative_path="day-1/1.jpg")
+    second = photo("1.jpg", relative_path="day-2/1.jpg")
+    will_list(server, first, photo("2.jpg", "query", relative_path=None))
+    server.will_answer(200, {**SIMILAR, "similar_images": [{**second, "similarity_score": 0.5}]})
+    assert pairs_of(client, PairNames.PATH)[0] == "2.jpg day-2/1.jpg\n"
+
+
 def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     server: FakeServer, client: Client
 ) -> None:
@@ -124,6 +132,7 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     one, query, estimate = found["features"]
     assert one["geometry"] == {"type": "Point", "coordinates": [7.25, 45.5]}
     assert one["properties"]["tags"] == ["é"]
+    assert one["properties"]["relative_path"] == "Day 2/street.jpg"
     assert query["geometry"] is None
     assert estimate["properties"]["query"] == query["id"]
     assert estimate["geometry"]["coordinates"] == [7.25, 45.5]
@@ -173,7 +182,7 @@ def test_descriptors_of_the_active_generation_can_be_mapped_into_memory(
     mapped = np.load(out / "descriptors.npy", mmap_mode="r")
     assert np.array_equal(mapped, rows)
     assert sorted(path.name for path in out.iterdir()) == sorted(files)
-    assert server.asked[1][1] == f"/api/v1/generations/{GENERATION_ID}/descriptors"
+    assert server.requests[1][1] == f"/api/v1/generations/{GENERATION_ID}/descriptors"
 
 
 def test_a_refused_export_leaves_no_file(
@@ -185,10 +194,10 @@ def test_a_refused_export_leaves_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_generation_that_is_no_id_is_refused_before_anything_is_asked(
+def test_a_generation_that_is_no_id_is_refused_before_any_request(
     server: FakeServer, client: Client, tmp_path: Path
 ) -> None:
     with pytest.raises(InvalidRequest) as caught:
         export_descriptors(client, tmp_path, "../maps", Progress(disable=True))
     assert caught.value.code == "bad_id"
-    assert server.asked == []
+    assert server.requests == []

@@ -5,10 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
 
-from services.cli.ingest.geotags import find_photos
+from services.cli.ingest.geotags import (
+    LocalPhoto,
+    count_other_files,
+    find_local_sources,
+    find_photos,
+    has_coordinates,
+)
 from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest
+from tests.support.photos import photo_bytes
 
 # The Mole Antonelliana in Turin, zone 32T.
 EAST, NORTH = "396544.00", "4991543.00"
@@ -98,6 +107,44 @@ def test_photos_are_found_below_the_folder_in_the_order_of_their_paths(tmp_path:
         photo.path.relative_to(tmp_path).as_posix() for photo in find_photos(tmp_path, None, None)
     ]
     assert found == ["a/b/c.webp", "a/z.png", "b.JPG", "c.tiff"]
+
+
+def test_a_photo_keeps_its_path_below_the_folder(tmp_path: Path) -> None:
+    make(tmp_path, "Day 2/IMG_2078.jpg")
+    [photo] = find_photos(tmp_path, None, None)
+    assert photo.relative_path == "Day 2/IMG_2078.jpg"
+    [alone] = find_photos(tmp_path / "Day 2" / "IMG_2078.jpg", None, None)
+    assert (alone.path, alone.relative_path) == (photo.path, "IMG_2078.jpg")
+
+
+def test_photos_folders_and_patterns_can_be_combined(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg", "trip/b.jpg", "trip/notes.txt", "x/1.JPG", "x/2.jpg", "x/3.txt")
+    sources = [str(tmp_path / name) for name in ("a.jpg", "trip", "x/*.*[gG]")]
+    found = find_local_sources(sources)
+    assert found == [tmp_path / name for name in ("a.jpg", "trip", "x/1.JPG", "x/2.jpg")]
+    assert [count_other_files(path) for path in found] == [0, 1, 0, 0]
+    assert find_local_sources([str(tmp_path / "trip" / "notes.txt")]) is None
+    assert find_local_sources(["s3://bucket/imports"]) is None
+    with pytest.raises(InvalidRequest, match="pattern"):
+        find_local_sources([str(tmp_path / "*.png")])
+
+
+def test_coordinates_are_in_the_fields_or_in_the_exif(tmp_path: Path) -> None:
+    plain, tagged = tmp_path / "plain.jpg", tmp_path / "tagged.jpg"
+    plain.write_bytes(photo_bytes(1))
+    exif = Image.Exif()
+    exif.get_ifd(IFD.GPSInfo).update(
+        {
+            GPS.GPSLatitudeRef: "N",
+            GPS.GPSLatitude: (45.0, 30.0, 0.0),
+            GPS.GPSLongitudeRef: "E",
+            GPS.GPSLongitude: (7.0, 15.0, 0.0),
+        }
+    )
+    tagged.write_bytes(photo_bytes(2, exif=exif))
+    assert not has_coordinates(LocalPhoto(plain, {}))
+    assert has_coordinates(LocalPhoto(plain, {"latitude": "45.5", "longitude": "7"}))
+    assert has_coordinates(LocalPhoto(tagged, {}))
 
 
 def test_hidden_files_are_ignored(tmp_path: Path) -> None:

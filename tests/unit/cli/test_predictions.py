@@ -177,6 +177,8 @@ def test_runs_are_compared_query_by_query_where_their_ground_truth_is_the_same(
     ("arguments", "code"),
     [
         (["--predictions", "{0}"], "no_ground_truth"),
+        (["--predictions", "{0}", "--data", ".", "--database", "{1}"], "options_contradict"),
+        (["--predictions", "{0}", "--data", ".", "--extractor", "x"], "options_contradict"),
         (
             ["--predictions", "{0}", "--ground-truth", "{1}", "--rule", "radius"],
             "options_contradict",

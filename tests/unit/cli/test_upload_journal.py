@@ -90,7 +90,7 @@ def test_a_file_that_is_no_journal_is_refused_and_left_alone(path: Path) -> None
 
 
 def uploads(server: FakeServer) -> int:
-    return sum(asked[1].startswith("/api/v1/upload") for asked in server.asked)
+    return sum(request[1].startswith("/api/v1/upload") for request in server.requests)
 
 
 def test_a_run_that_was_broken_off_sends_only_the_rest(
@@ -114,6 +114,22 @@ def test_a_run_that_was_broken_off_sends_only_the_rest(
     assert [line.get("file_id") for line in lines] == [None, "file", PHOTO_ID]
 
 
+def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(
+    server: FakeServer, photo: LocalPhoto
+) -> None:
+    server.will_answer(200, STATS)
+    server.will_answer(202, UPLOADED)
+    for _ in ("before a fit", "and after"):
+        server.will_answer(200, {**JOB, "state": "queued", "waiting_for": "vocabulary"})
+        server.will_answer(200, STATS)
+    with Client(server.url) as client:
+        report = upload_photos(client, [photo], False, Progress(disable=True))
+    assert report["failed"] == []
+    polls = [path for _, path, _ in server.requests if path.startswith("/api/v1/jobs/")]
+    assert len(polls) == 2
+    assert all("wait=0" in path for path in polls), polls
+
+
 def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:
     (tmp_path / "1.jpg").write_bytes(b"one")
     return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
@@ -122,7 +138,8 @@ def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:
 def test_a_list_names_photos_beside_it_with_what_is_said_of_them(tmp_path: Path) -> None:
     data = manifest(tmp_path, {"filename": "1.jpg", "tags": ["a", "b"], "role": "query"})
     [found] = read_photo_manifest(tmp_path / "list.jsonl", data)
-    assert found == LocalPhoto(tmp_path / "1.jpg", {"tags": "a,b", "role": "query"})
+    fields = {"tags": "a,b", "role": "query"}
+    assert found == LocalPhoto(tmp_path / "1.jpg", fields, relative_path="1.jpg")
 
 
 def test_a_list_that_names_a_missing_photo_is_refused_by_its_line(tmp_path: Path) -> None:

@@ -36,13 +36,13 @@ from tests.support.api_responses import JOB, PHOTO_ID, SIMILAR, STARTED, STATS, 
 
 
 class FakeServer(HTTPServer):
-    """Answers what the test says and remembers what it was asked."""
+    """Answers what the test says and records the requests."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.answers: list[tuple[int, bytes, dict[str, str]]] = []
         self.headers: list[Message] = []
-        self.asked: list[tuple[str, str, bytes]] = []
+        self.requests: list[tuple[str, str, bytes]] = []
 
     @property
     def url(self) -> str:
@@ -58,7 +58,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def answer(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        self.server.asked.append((self.command, self.path, body))
+        self.server.requests.append((self.command, self.path, body))
         self.server.headers.append(self.headers)
         status, data, headers = self.server.answers.pop(0)
         self.send_response(status)
@@ -148,14 +148,14 @@ def test_server_that_is_not_there_is_unavailable_and_named() -> None:
     assert url in caught.value.detail
 
 
-def test_upload_sends_the_file_and_only_the_fields_that_are_said(
+def test_upload_sends_the_file_and_only_the_fields_that_are_given(
     server: FakeServer, client: Client, tmp_path: Path
 ) -> None:
     photo = tmp_path / "street.jpg"
     photo.write_bytes(b"the photo's bytes")
     server.will_answer(202, UPLOADED)
     assert client.upload(photo, latitude=45.5, place=None).file_id == UUID(PHOTO_ID)
-    method, path, body = server.asked[0]
+    method, path, body = server.requests[0]
     assert (method, path) == ("POST", "/api/v1/upload")
     assert b'filename="street.jpg"' in body
     assert b"the photo's bytes" in body
@@ -169,7 +169,7 @@ def test_upload_may_be_called_otherwise_than_its_file(
     (tmp_path / "5f0e.jpg").write_bytes(b"bytes")
     server.will_answer(202, UPLOADED)
     client.upload(tmp_path / "5f0e.jpg", filename="Piazza Castello.jpg")
-    assert b'filename="Piazza Castello.jpg"' in server.asked[0][2]
+    assert b'filename="Piazza Castello.jpg"' in server.requests[0][2]
 
 
 def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:
@@ -186,7 +186,7 @@ def test_file_that_cannot_be_read_is_an_error_before_anything_is_sent(
     with pytest.raises(InvalidRequest) as caught:
         client.upload(tmp_path / "missing.jpg")
     assert caught.value.code == "unreadable_file"
-    assert server.asked == []
+    assert server.requests == []
 
 
 def test_map_is_named_in_every_call(server: FakeServer) -> None:
@@ -195,9 +195,9 @@ def test_map_is_named_in_every_call(server: FakeServer) -> None:
     with Client(server.url + "/", map_name="lab") as client:
         client.stats()
         assert list(client.photos(filename="a b")) == []
-    assert server.asked[0][1] == "/api/v1/database/stats?map=lab"
-    assert "map=lab" in server.asked[1][1]
-    assert "filename=a" in server.asked[1][1]
+    assert server.requests[0][1] == "/api/v1/database/stats?map=lab"
+    assert "map=lab" in server.requests[1][1]
+    assert "filename=a" in server.requests[1][1]
 
 
 def test_waiting_polls_until_the_job_has_ended(server: FakeServer, client: Client) -> None:
@@ -219,7 +219,7 @@ def test_query_that_takes_longer_is_fetched_when_its_job_has_ended(
     server.will_answer(200, SIMILAR)
     assert client.similar(photo, wait_seconds=7).as_json() == SIMILAR
     assert server.headers[0]["Prefer"] == "wait=7"
-    assert [asked[1].split("?")[0] for asked in server.asked][1:] == [
+    assert [request[1].split("?")[0] for request in server.requests][1:] == [
         "/api/v1/jobs/abc",
         "/api/v1/queries/abc/similar",
     ]
@@ -268,7 +268,7 @@ def test_a_repeated_upload_sends_the_same_key_and_all_its_bytes_again(
     server.will_answer(202, UPLOADED)
     with Client(server.url, patience_seconds=60) as client:
         assert client.upload(photo).as_json() == UPLOADED
-    assert [photo.read_bytes() in body for _, _, body in server.asked] == [True] * 4
+    assert [photo.read_bytes() in body for _, _, body in server.requests] == [True] * 4
     keys = [headers.get("Idempotency-Key") for headers in server.headers]
     assert keys[0] is not None
     assert len(set(keys)) == 1
@@ -298,7 +298,7 @@ def test_a_client_without_patience_repeats_nothing_and_sends_no_key(
         refuse(server, error)
         with pytest.raises(type(error)):
             client.upload(photo)
-    assert len(server.asked) == 2
+    assert len(server.requests) == 2
     assert [headers.get("Idempotency-Key") for headers in server.headers] == [None, None]
     assert slept == []
 
@@ -348,7 +348,7 @@ def test_what_waiting_does_not_cure_is_not_repeated(
         server.will_answer(500, b"broken")
     with Client(server.url, patience_seconds=60) as client, pytest.raises(PlacewiseError):
         client.stats()
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
     assert slept == []
 
 
@@ -370,7 +370,7 @@ def test_a_direct_upload_announces_sends_and_completes(
     server.will_answer(202, UPLOADED)
     with Client(server.url, map_name="lab", key="secret", patience_seconds=60) as client:
         assert client.upload_direct(photo, latitude=45.5, place=None).as_json() == UPLOADED
-    announced, *sent, completed = server.asked
+    announced, *sent, completed = server.requests
     assert announced[1] == "/api/v1/uploads/presign?map=lab"
     assert json.loads(announced[2]) == {
         "filename": "street.jpg",

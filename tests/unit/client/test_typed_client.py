@@ -121,7 +121,7 @@ def test_raw_is_deprecated_and_returns_the_json_of_the_api(server: FakeServer) -
     assert asyncio.run(call_async()) == [STARTED, [PHOTO, PHOTO]]
 
 
-def test_every_post_has_a_key_without_being_asked(server: FakeServer) -> None:
+def test_every_post_has_a_key_without_an_argument(server: FakeServer) -> None:
     for _ in range(2):
         server.will_answer(202, STARTED)
     with placewise.connect(server.url) as places:
@@ -138,10 +138,10 @@ def test_photos_are_fetched_page_after_page_as_they_are_reached(server: FakeServ
     with placewise.connect(server.url, map="lab") as places:
         found = places.photos(place="atrium")
         next(found)
-        assert len(server.asked) == 1
+        assert len(server.requests) == 1
         assert len(list(found)) == 2
-    assert "cursor=more" in server.asked[1][1]
-    assert all("map=lab" in path and "place=atrium" in path for _, path, _ in server.asked)
+    assert "cursor=more" in server.requests[1][1]
+    assert all("map=lab" in path and "place=atrium" in path for _, path, _ in server.requests)
 
 
 def test_waiting_raises_what_the_job_has_failed_of(server: FakeServer) -> None:
@@ -171,7 +171,7 @@ def test_watching_a_job_shows_each_state_and_does_not_raise_its_failure(
     with placewise.connect(server.url) as places:
         seen = list(places.watch(answers.Started(**STARTED), poll_seconds=2))
     assert [job.state for job in seen] == ["running", "queued", "cancelled"]
-    assert "wait=2" in server.asked[0][1]
+    assert "wait=2" in server.requests[0][1]
     assert waits == [1.0]
     with pytest.raises(placewise.Unprocessable) as caught:
         seen[-1].raise_for_failure()
@@ -185,7 +185,7 @@ def test_keys_are_created_with_the_limits_that_are_given(server: FakeServer) -> 
     server.will_answer(201, {**key, **times, "revoked_at": None, "key": "pw_1secret"})
     with placewise.connect(server.url) as places:
         created = places.create_key("me", ["read"], days=None, requests_per_minute=60)
-    assert json.loads(server.asked[0][2]) == {
+    assert json.loads(server.requests[0][2]) == {
         "name": "me",
         "scopes": ["read"],
         "requests_per_minute": 60,
@@ -202,7 +202,7 @@ def test_a_model_is_sent_with_its_name_and_the_progress_is_reported(
     sent: list[int] = []
     with placewise.connect(server.url) as places:
         places.add_model(checkpoint, "lab", licence="MIT", on_sent=sent.append)
-    method, path, body = server.asked[0]
+    method, path, body = server.requests[0]
     assert (method, path) == ("POST", "/api/v1/models")
     assert b'name="licence"' in body
     assert b'name="note"' not in body
@@ -239,7 +239,7 @@ def test_asynchronous_client_uploads_waits_and_lists(server: FakeServer, tmp_pat
             return [photo async for photo in places.photos()]
 
     assert [photo.latitude for photo in asyncio.run(use())] == [45.5]
-    assert path.read_bytes() in server.asked[0][2]
+    assert path.read_bytes() in server.requests[0][2]
     assert {headers.get("Authorization") for headers in server.headers} == {"Bearer secret"}
 
 
@@ -261,8 +261,8 @@ def test_asynchronous_client_sends_a_direct_upload_in_pieces(
     with pytest.raises(placewise.NotFound) as caught:
         asyncio.run(use())
     assert caught.value.code == "upload_not_found"
-    assert server.asked[1] == ("PUT", "/bucket/1", path.read_bytes())
-    assert json.loads(server.asked[0][2])["file_size"] == 700_000
+    assert server.requests[1] == ("PUT", "/bucket/1", path.read_bytes())
+    assert json.loads(server.requests[0][2])["file_size"] == 700_000
 
 
 def test_package_says_that_it_is_typed() -> None:

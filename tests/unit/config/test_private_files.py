@@ -15,8 +15,8 @@ import pytest
 from services.cli.operations.store_checks import permissions_check
 from services.search.chunk_loader import MappedFileCache
 from shared.backup.folder import BackedUpObject, BackupFolder, dump_rows
-from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.private_files import create_private_file, make_private_folder
 from shared.config.settings import Settings

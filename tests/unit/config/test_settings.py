@@ -64,6 +64,14 @@ def test_catalog_is_sqlite_below_the_home_unless_a_database_is_named(
     assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
 
 
+@pytest.mark.parametrize("scheme", ["postgres", "postgresql", "postgresql+psycopg"])
+def test_urls_of_postgresql_may_have_its_usual_schemes(
+    monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    monkeypatch.setenv("DATABASE_URL", f"{scheme}://me:secret@db/places")
+    assert Settings().catalog_url() == "postgresql+psycopg://me:secret@db/places"
+
+
 def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://me:hunter2@db/places")
     settings = Settings()
@@ -95,10 +103,50 @@ def test_values_out_of_range_are_refused_by_name(
         Settings()
 
 
+@pytest.mark.parametrize(
+    ("written", "size_bytes"),
+    [("10MB", 10_000_000), ("2 GiB", 2 * 2**30), ("1.5kB", 1500), ("123", 123), (" 123 ", 123)],
+)
+def test_sizes_may_have_a_unit(
+    monkeypatch: pytest.MonkeyPatch, written: str, size_bytes: int
+) -> None:
+    monkeypatch.setenv("MAX_FILE_SIZE", written)
+    assert Settings().max_file_size == size_bytes
+
+
+def test_camera_photos_are_accepted_by_default() -> None:
+    settings = Settings()
+    assert (settings.max_file_size, settings.max_image_pixels) == (100_000_000, 200_000_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("PORT", "abc", "PORT=abc: expected a whole number (listening port; 0 picks a free port)"),
+        ("PORT", "70000", "PORT=70000: expected a value less than or equal to 65535"),
+        ("MAX_FILE_SIZE", "big", "MAX_FILE_SIZE=big: expected a size such as 100MB"),
+        ("MAX_FILE_SIZE", "-1", "MAX_FILE_SIZE=-1: expected a value greater than 0"),
+        ("MAX_FILE_SIZE", "10 parsecs", "MAX_FILE_SIZE=10 parsecs: expected a size such as"),
+        ("DEBUG", "perhaps", "DEBUG=perhaps: expected true or false"),
+        ("LEASE_SECONDS", "soon", "LEASE_SECONDS=soon: expected a number"),
+        ("DEVICE", "tpu", "DEVICE=tpu: expected 'auto'"),
+        ("DATABASE_URL", "mysql://me:s3cret@db/x", "DATABASE_URL: the scheme 'mysql' is not known"),
+        ("DATABASE_URL", "s3cret", "DATABASE_URL: it has no scheme; expected postgresql://"),
+        ("ADMIN_KEY", "s3cret", "ADMIN_KEY: a key has at least 16 printable"),
+    ],
+)
+def test_a_bad_setting_is_named_with_its_value_and_what_is_expected(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
+    detail = refusal(monkeypatch, **{name: value})
+    assert detail.startswith(message)
+    assert "s3cret" not in detail
+
+
 S3 = {"S3_ENDPOINT": "s3:8333", "S3_ACCESS_KEY": "placewise", "S3_SECRET_KEY": "a secret"}
 
 
-def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
+def test_s3_uses_https_with_a_bucket_of_its_own_by_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert Settings().s3_endpoint is None
@@ -111,7 +159,7 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"S3_ACCESS_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
         ({"S3_SECRET_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
@@ -126,9 +174,9 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
     ],
 )
 def test_settings_of_s3_that_can_not_work_are_refused(
-    monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], said: str
+    monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **{**S3, **changed})
+    assert message in refusal(monkeypatch, **{**S3, **changed})
 
 
 @pytest.mark.parametrize("endpoint", ["s3.example.com", "10.0.0.5:8333", "[::1]:9000", "minio"])
@@ -220,10 +268,10 @@ def test_extractor_of_new_maps_has_its_canonical_name(
 def test_an_unknown_extractor_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, extractor: str
 ) -> None:
-    said = refusal(monkeypatch, EXTRACTOR=extractor)
-    assert said.startswith(f"EXTRACTOR={extractor}: ")
+    message = refusal(monkeypatch, EXTRACTOR=extractor)
+    assert message.startswith(f"EXTRACTOR={extractor}: ")
     for known in ("efficientnet-lite0-vlad", "anyloc-vits14", "anyloc-vitg14"):
-        assert known in said
+        assert known in message
 
 
 @pytest.mark.usefixtures("production")
@@ -235,9 +283,9 @@ def test_extractors_for_tests_are_refused_where_they_are_not_allowed(
 
 @pytest.mark.usefixtures("production")
 def test_options_of_an_extractor_are_checked_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
-    assert "layer=12" in said
-    assert "0 to 11" in said
+    message = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
+    assert "layer=12" in message
+    assert "0 to 11" in message
 
 
 @pytest.mark.usefixtures("production")
@@ -245,9 +293,9 @@ def test_options_of_an_extractor_are_checked_at_the_start(monkeypatch: pytest.Mo
 def test_an_unknown_dino_model_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    said = refusal(monkeypatch, DINO_MODEL=model)
-    assert said.startswith(f"DINO_MODEL={model} is unknown")
-    assert "dinov2_vits14, dinov2_vitb14, dinov2_vitl14, dinov2_vitg14" in said
+    message = refusal(monkeypatch, DINO_MODEL=model)
+    assert message.startswith(f"DINO_MODEL={model} is unknown")
+    assert "dinov2_vits14, dinov2_vitb14, dinov2_vitl14, dinov2_vitg14" in message
 
 
 @pytest.mark.usefixtures("production")
@@ -255,13 +303,13 @@ def test_an_unknown_dino_model_is_refused_with_the_known_ones(
 def test_what_says_how_dino_is_used_is_refused_without_it(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    said = refusal(monkeypatch, **{name: PREDECESSORS[name]})
-    assert said.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
+    message = refusal(monkeypatch, **{name: PREDECESSORS[name]})
+    assert message.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
 
 
 @pytest.mark.usefixtures("production")
 @pytest.mark.parametrize(
-    ("variables", "said"),
+    ("variables", "message"),
     [
         (
             {"EXTRACTOR": "efficientnet-lite0-vlad", "DINO_MODEL": "dinov2_vitg14"},
@@ -289,15 +337,15 @@ def test_what_says_how_dino_is_used_is_refused_without_it(
             ),
         ),
         ({**PREDECESSORS, "DESC_LAYER": "-1"}, "DESC_LAYER=-1 with DINO_MODEL=dinov2_vitg14"),
-        ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER: Input should be a valid integer"),
+        ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER=last: expected a whole number"),
         ({**PREDECESSORS, "DESC_FACET": "values"}, "query, key, value, token"),
         ({**PREDECESSORS, "VLAD_CLUSTERS": "0"}, "VLAD_CLUSTERS=0 with DINO_MODEL=dinov2_vitg14"),
     ],
 )
 def test_contradictions_are_refused_with_both_values(
-    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], said: str
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **variables)
+    assert message in refusal(monkeypatch, **variables)
 
 
 def test_settings_in_force_do_not_change(settings: Settings) -> None:
@@ -338,7 +386,7 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "said"),
+    ("variable", "value", "message"),
     [
         ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
         ("TORCHHUB_ALLOWED", f"{HUB},anyloc-vitb14", "after the repository comes the entry"),
@@ -351,6 +399,6 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
     ],
 )
 def test_code_that_is_not_pinned_is_refused_at_the_start(
-    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, message: str
 ) -> None:
-    assert said in refusal(monkeypatch, **{variable: value})
+    assert message in refusal(monkeypatch, **{variable: value})

@@ -28,7 +28,7 @@ def test_what_is_no_shard_is_refused(text: str) -> None:
         Shard.parse(text)
 
 
-def test_a_missing_shard_is_told_from_a_missing_object() -> None:
+def test_a_missing_shard_differs_from_a_missing_object() -> None:
     assert is_shard_name(Shard(1, 3).name)
     assert not is_shard_name("chunks/a/b.npy")
 

@@ -50,7 +50,19 @@ def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Pa
     assert code_of(missing) == "set_missing"
 
 
-def test_data_sets_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def test_query_sets_of_sf_xl_share_a_database(tmp_path: Path) -> None:
+    pair(tmp_path / "SF_XL" / "test", [0, 25], [0])
+    (tmp_path / "SF_XL/test/queries").rename(tmp_path / "SF_XL/test/queries_v1")
+    second_queries = [utm_name(480_000 + metres, 4_880_000) for metres in (25, 500)]
+    write_photos(tmp_path / "SF_XL/test/queries_v2", second_queries)
+    assert evaluation_set_names(tmp_path / "SF_XL") == ("sfxl_test_v1", "sfxl_test_v2")
+    assert rows(open_evaluation_set(tmp_path / "SF_XL", "sfxl_test_v1")) == [[0, 1]]
+    second = open_evaluation_set(tmp_path / "SF_XL", "sfxl_test_v2")
+    assert rows(second) == [[0, 1], []]
+    assert second.queries[0].name.startswith("test/queries_v2/")
+
+
+def test_data_sets_of_one_name_are_distinguished(tmp_path: Path) -> None:
     pair(tmp_path / "my-city", [0], [0])
     pair(tmp_path / "my_city", [0, 1], [0])
     assert evaluation_set_names(tmp_path) == ("mycity", "mycity_2")
@@ -135,7 +147,7 @@ def test_photos_without_position_or_place_are_an_error_that_says_what_helps(
     assert code_of(caught) == "no_positions"
 
 
-def test_rule_that_is_asked_for_is_the_rule(tmp_path: Path) -> None:
+def test_the_given_rule_is_used(tmp_path: Path) -> None:
     pair(tmp_path, [0, 30, 100], [0])
     assert rows(open_evaluation_set(tmp_path, rule="radius 100")) == [[0, 1, 2]]
     with pytest.raises(InvalidRequest) as caught:

@@ -56,10 +56,15 @@ spots = st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 2000)), min_size
 @given(spots, spots, st.sampled_from([0.0, 0.1, 5.0, 25.0, 60.0, 500.0]))
 @settings(deadline=None)
 def test_positives_are_those_of_the_full_matrix(
-    asked: list[tuple[int, int]], there: list[tuple[int, int]], within_m: float
+    query_positions: list[tuple[int, int]],
+    database_positions: list[tuple[int, int]],
+    within_m: float,
 ) -> None:
-    queries = np.array(asked, np.float64).reshape(-1, 2) / 10 + (480_000.0, 4_880_000.0)
-    database = np.array(there, np.float64).reshape(-1, 2) / 10 + (480_000.0, 4_880_000.0)
+    queries = np.array(query_positions, np.float64).reshape(-1, 2) / 10 + (480_000.0, 4_880_000.0)
+    database = np.array(database_positions, np.float64).reshape(-1, 2) / 10 + (
+        480_000.0,
+        4_880_000.0,
+    )
     found = positives_within(queries, database, within_m)
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, within_m)
 
@@ -182,7 +187,7 @@ def test_heading_rule_wants_near_photos_that_look_the_same_way() -> None:
         positives("heading", [at(0, 0)], database)
 
 
-def test_frames_rule_counts_frames_and_keeps_to_a_sequence_when_told() -> None:
+def test_frames_rule_counts_frames_and_can_stay_within_a_sequence() -> None:
     frames = [(3, "b"), (7, "a"), (5, "a"), (8, "a"), (4, "b")]
     database = [shot(frame=frame, sequence=sequence) for frame, sequence in frames]
     query = shot(frame=5, sequence="a")
@@ -198,12 +203,17 @@ def test_frames_rule_counts_frames_and_keeps_to_a_sequence_when_told() -> None:
 )
 @settings(deadline=None)
 def test_frames_are_those_of_the_full_matrix(
-    asked: list[int], there: list[int], apart: int
+    query_positions: list[int], database_positions: list[int], apart: int
 ) -> None:
     found = positives(
-        f"frames {apart}", [shot(frame=f) for f in asked], [shot(frame=f) for f in there]
+        f"frames {apart}",
+        [shot(frame=f) for f in query_positions],
+        [shot(frame=f) for f in database_positions],
     )
-    expected = [[i for i, f in enumerate(there) if abs(f - query) <= apart] for query in asked]
+    expected = [
+        [i for i, f in enumerate(database_positions) if abs(f - query) <= apart]
+        for query in query_positions
+    ]
     assert found == expected
 
 

@@ -33,7 +33,7 @@ def evaluation(
 DATABASE = [at(metres, f"d{metres}") for metres in (0, 30, 100, 101, 1000)]
 
 
-def asked(
+def suspects_of(
     ranked: list[int], scores: list[float] | None = None, **options: float
 ) -> list[tuple[int, str]]:
     """All queries stand at 0 m; the suspects' queries and first matches."""
@@ -44,14 +44,14 @@ def asked(
 
 
 def test_wrong_first_match_up_to_four_times_the_radius_is_a_suspect() -> None:
-    assert asked([0, 1, 2, 3, 4]) == [(1, "d30"), (2, "d100")]
+    assert suspects_of([0, 1, 2, 3, 4]) == [(1, "d30"), (2, "d100")]
 
 
 def test_only_matches_as_confident_as_the_median_right_one_count_most_confident_first() -> None:
     ranked, scores = [0, 0, 0, 1, 1, 1], [0.9, 0.7, 0.5, 0.8, 0.69, 0.95]
-    assert asked(ranked, scores) == [(5, "d30"), (3, "d30")]
-    assert asked(ranked, scores, min_score=0.9) == [(5, "d30")]
-    assert asked([1, 1], [0.1, 0.2]) == [(1, "d30"), (0, "d30")]  # none is right: all count
+    assert suspects_of(ranked, scores) == [(5, "d30"), (3, "d30")]
+    assert suspects_of(ranked, scores, min_score=0.9) == [(5, "d30")]
+    assert suspects_of([1, 1], [0.1, 0.2]) == [(1, "d30"), (0, "d30")]  # none is right: all count
 
 
 def test_match_in_place_that_looks_another_way_is_a_suspect() -> None:

@@ -45,7 +45,7 @@ def test_gsv_xs_is_the_same_with_a_table_and_by_names_alone(tmp_path: Path, tabl
     assert (opened.layout, opened.cities, opened.photo_count) == ("gsv_xs", ("bangkok", "osl"), 9)
 
 
-def test_cities_are_numbered_in_the_order_asked_and_only_their_tables_are_read(
+def test_cities_are_numbered_in_the_given_order_and_only_their_tables_are_read(
     tmp_path: Path,
 ) -> None:
     for city in ("osl", "bangkok", "trt"):

@@ -143,7 +143,7 @@ def test_nothing_runs_after_the_facet_is_known(
     assert ran[width, width] == (whole_blocks if facet == "token" else whole_blocks + 1)
 
 
-def test_weights_that_are_not_used_are_not_kept(files: dict[str, Path]) -> None:
+def test_unused_weights_are_not_loaded(files: dict[str, Path]) -> None:
     def kept(facet: str) -> int:
         tensors: list[torch.Tensor] = [*load(files["plain"], PLAIN, 1, facet)._vit.parameters()]
         assert all(tensor.device == CPU for tensor in tensors)

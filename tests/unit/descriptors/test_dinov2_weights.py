@@ -81,7 +81,9 @@ def test_the_same_weights_are_the_same_network_in_every_naming_and_format(
         assert backbone.card["source"] == "DINO_WEIGHTS"
 
 
-def test_format_is_told_by_the_content_as_files_of_a_cache_have_no_suffix(tmp_path: Path) -> None:
+def test_format_is_detected_from_the_content_as_files_of_a_cache_have_no_suffix(
+    tmp_path: Path,
+) -> None:
     timms_file = save(timms(random_weights(PLAIN)), tmp_path / "model.safetensors")
     blob = timms_file.rename(tmp_path / "3fa9c2")
     link = tmp_path / "model.safetensors"

@@ -130,14 +130,14 @@ def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegi
 def test_models_are_warmed_up_on_a_gpu_when_they_are_loaded(
     models: ModelRegistry, monkeypatch: pytest.MonkeyPatch, device: torch.device, warmed: list[int]
 ) -> None:
-    asked: list[int] = []
+    batch_sizes: list[int] = []
 
     class Loaded(Extractor):
         def __init__(self, config: Any, _device: torch.device, **options: Any) -> None:
             super().__init__(config, CPU, **options)
 
         def warm_up(self, photos: int) -> None:
-            asked.append(photos)
+            batch_sizes.append(photos)
 
     monkeypatch.setattr(model_registry, "Extractor", Loaded)
     monkeypatch.setattr(models, "_device", device)
@@ -146,7 +146,7 @@ def test_models_are_warmed_up_on_a_gpu_when_they_are_loaded(
     )
     models.extractor("test-tiny-avg")
     models.extractor("test-tiny-avg")
-    assert asked == warmed
+    assert batch_sizes == warmed
 
 
 @pytest.mark.parametrize(("device", "most"), [(CPU, 2), (CUDA, 1)])

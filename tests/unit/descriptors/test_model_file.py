@@ -1,4 +1,4 @@
-"""The file in which an added model is kept: all that describes a photo, and nothing else."""
+"""The file of an added model: everything that describes a photo, and nothing else."""
 
 from __future__ import annotations
 

@@ -66,8 +66,10 @@ def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
     assert choose_precision("auto", convolutions, CUDA) == "float32"
     assert choose_precision("auto", theirs, CUDA) == "float32"
     for config in (dino, convolutions, theirs):
-        for asked in PRECISIONS:
-            assert {choose_precision(asked, config, device) for device in (CPU, CUDA)} == {asked}
+        for precision in PRECISIONS:
+            assert {choose_precision(precision, config, device) for device in (CPU, CUDA)} == {
+                precision
+            }
 
 
 def test_spec_tells_precisions_apart_and_single_means_what_it_meant() -> None:
@@ -128,7 +130,7 @@ def test_single_precision_is_not_rounded_to_tf32(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_patch_whose_length_overflows_is_told_apart_from_one_without_structure(
+def test_patch_whose_length_overflows_differs_from_one_without_structure(
     dtype: torch.dtype,
 ) -> None:
     patches = torch.tensor([[3.0, 4.0], [0.0, 0.0], [3e38, 3e38], [float("inf"), 0.0]], dtype=dtype)

@@ -26,7 +26,7 @@ def pixels_of(made: Extractor, numbers: range) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_descriptors_are_unit_rows_of_the_width_that_is_asked_for(width: int) -> None:
+def test_descriptors_are_unit_rows_of_the_requested_width(width: int) -> None:
     made = extractor(f"width={width}")
     rows = made.describe(pixels_of(made, range(4)), None)
     assert rows.shape == (4, width)
@@ -35,7 +35,7 @@ def test_descriptors_are_unit_rows_of_the_width_that_is_asked_for(width: int) ->
 
 
 @pytest.mark.parametrize("width", WIDTHS[1:])
-def test_photos_are_told_apart(width: int) -> None:
+def test_different_photos_have_different_descriptors(width: int) -> None:
     made = extractor(f"width={width}")
     rows = made.describe(pixels_of(made, range(50)), None)
     between = rows @ rows.T - np.eye(len(rows))

@@ -184,7 +184,7 @@ def test_two_repositories_with_modules_of_one_name_do_not_meet(
         ("README.md", "MIT License", "none found"),
     ],
 )
-def test_licence_of_the_code_is_read_or_said_to_be_missing(
+def test_licence_of_the_code_is_read_or_reported_as_missing(
     tmp_path: Path, name: str, text: str, shown: str
 ) -> None:
     folder = write_hub(tmp_path / "bare", licence=None)

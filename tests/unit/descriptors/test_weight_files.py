@@ -41,7 +41,7 @@ def begun(target: Path) -> Path:
 
 
 def break_off(server: FilesServer, target: Path, after: int = 2_000_000) -> int:
-    """The download ends in an error, as with a network that is gone; bytes that were kept."""
+    """The download ends in an error, as with a network that is gone; the bytes that were stored."""
     server.break_after = [after]
     server.refuse = []
     with pytest.raises(httpx2.HTTPError):
@@ -105,9 +105,7 @@ def test_a_server_without_ranges_sends_all_of_it_again(server: FilesServer, targ
     assert [part for _, part in server.requests] == [None, None]
 
 
-def test_a_download_that_was_complete_is_not_asked_for_again(
-    server: FilesServer, target: Path
-) -> None:
+def test_a_complete_download_is_not_requested_again(server: FilesServer, target: Path) -> None:
     break_off(server, target)
     server.refuse = []
     begun(target).write_bytes(CONTENT)
@@ -125,7 +123,7 @@ def test_more_than_there_is_is_thrown_away(server: FilesServer, target: Path) ->
 
 
 @pytest.mark.parametrize("expected", ["0" * 64, "0123abcd"])
-def test_a_file_with_another_hash_is_refused_and_not_kept(
+def test_a_file_with_another_hash_is_rejected_and_deleted(
     server: FilesServer, target: Path, expected: str
 ) -> None:
     with pytest.raises(Misconfigured, match="is not the expected file") as caught:
@@ -139,19 +137,19 @@ def test_the_beginning_of_a_hash_is_enough(server: FilesServer, target: Path) ->
     assert target.read_bytes() == CONTENT
 
 
-def test_what_is_not_there_is_asked_for_once(server: FilesServer, target: Path) -> None:
+def test_a_missing_file_is_requested_once(server: FilesServer, target: Path) -> None:
     with pytest.raises(httpx2.HTTPStatusError, match="404"):
         download_file(f"{server.url}/others", target)
     assert len(server.requests) == 1
 
 
-def test_a_busy_server_is_asked_again(server: FilesServer, target: Path) -> None:
+def test_a_request_to_a_busy_server_is_retried(server: FilesServer, target: Path) -> None:
     server.refuse = [503, 429]
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
 
 
-def test_a_file_that_is_there_is_not_asked_for(server: FilesServer, target: Path) -> None:
+def test_an_existing_file_is_not_requested(server: FilesServer, target: Path) -> None:
     target.parent.mkdir()
     target.write_bytes(b"here")
     download_file(f"{server.url}/weights", target, sha256=HASH)

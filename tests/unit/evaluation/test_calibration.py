@@ -32,7 +32,7 @@ YES, NO = True, False
 # --- figures ---------------------------------------------------------------------------------
 
 
-def test_the_calibration_error_of_one_bin_is_the_gap_between_said_and_true() -> None:
+def test_the_calibration_error_of_one_bin_is_the_gap_between_stated_and_true() -> None:
     assert expected_calibration_error([0.9] * 4, [YES, YES, YES, NO]) == pytest.approx(0.15)
     assert expected_calibration_error([0.25] * 4, [YES, NO, NO, NO]) == pytest.approx(0)
     assert expected_calibration_error([1.0], [NO]) == 1

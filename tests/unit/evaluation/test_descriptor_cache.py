@@ -1,4 +1,4 @@
-"""Descriptors kept from run to run: by bytes and specification, bounded, safe to kill."""
+"""The descriptor cache: keyed by content and specification, bounded, safe to kill."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_rows_come_in_the_photos_order_whatever_was_there_already(
     photos: list[Path], tmp_path: Path
 ) -> None:
     inner = Fake()
-    describe = CachedDescriber(inner, tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
+    describe = CachedDescriber(inner, tmp_path / "cache", {"a": 1}, max_bytes=MUCH)
     all_rows(describe, photos[5:30:3])
     rows = all_rows(describe, photos)
     assert rows[:, 0].tolist() == [n + 1 for n in range(40)]
@@ -61,7 +61,7 @@ def test_rows_come_in_the_photos_order_whatever_was_there_already(
 
 def test_photo_with_other_bytes_is_described_again(photos: list[Path], tmp_path: Path) -> None:
     inner = Fake()
-    describe = CachedDescriber(inner, tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
+    describe = CachedDescriber(inner, tmp_path / "cache", {"a": 1}, max_bytes=MUCH)
     all_rows(describe, photos[:2])
     photos[1].write_bytes(bytes(99))
     (tmp_path / "moved.jpg").write_bytes(bytes(1))
@@ -74,43 +74,43 @@ def test_another_specification_has_rows_of_its_own(photos: list[Path], tmp_path:
     for dimension in (4, 7):
         inner = Fake(dimension)
         spec = {"dimension": dimension}
-        describe = CachedDescriber(inner, tmp_path / "kept", spec, max_bytes=MUCH)
+        describe = CachedDescriber(inner, tmp_path / "cache", spec, max_bytes=MUCH)
         assert all_rows(describe, photos[:3]).shape == (3, dimension)
 
 
 def test_interrupted_run_goes_on_where_it_was(photos: list[Path], tmp_path: Path) -> None:
     inner = Fake()
-    rows = CachedDescriber(inner, tmp_path / "kept", {"a": 1}, max_bytes=MUCH)(photos)
+    rows = CachedDescriber(inner, tmp_path / "cache", {"a": 1}, max_bytes=MUCH)(photos)
     next(rows)
     next(rows)
     rows.close()  # type: ignore[attr-defined]
     again = Fake()
-    describe = CachedDescriber(again, tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
+    describe = CachedDescriber(again, tmp_path / "cache", {"a": 1}, max_bytes=MUCH)
     assert all_rows(describe, photos)[:, 0].tolist() == [n + 1 for n in range(40)]
-    assert len(again.described) == 8, "of 40, one batch of 32 was kept"
+    assert len(again.described) == 8, "of 40, one batch of 32 was stored"
 
 
 def test_rows_that_were_refused_are_not_kept(photos: list[Path], tmp_path: Path) -> None:
     """Whoever takes a batch may end the run over it, before it is stored."""
-    rows = CachedDescriber(Fake(), tmp_path / "kept", {"a": 1}, max_bytes=MUCH)(photos[:3])
+    rows = CachedDescriber(Fake(), tmp_path / "cache", {"a": 1}, max_bytes=MUCH)(photos[:3])
     next(rows)
     with pytest.raises(Unprocessable):
         rows.throw(Unprocessable("features_not_finite", ""))  # type: ignore[attr-defined]
     again = Fake()
-    all_rows(CachedDescriber(again, tmp_path / "kept", {"a": 1}, max_bytes=MUCH), photos[:3])
+    all_rows(CachedDescriber(again, tmp_path / "cache", {"a": 1}, max_bytes=MUCH), photos[:3])
     assert len(again.described) == 3
 
 
 def test_time_a_photo_is_remembered(photos: list[Path], tmp_path: Path) -> None:
-    made = CachedDescriber(Fake(), tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
+    made = CachedDescriber(Fake(), tmp_path / "cache", {"a": 1}, max_bytes=MUCH)
     assert made.milliseconds_a_photo() is None
     all_rows(made, photos[:6])
-    later = CachedDescriber(Fake(), tmp_path / "kept", {"a": 1}, max_bytes=MUCH)
+    later = CachedDescriber(Fake(), tmp_path / "cache", {"a": 1}, max_bytes=MUCH)
     assert later.milliseconds_a_photo() == pytest.approx(10)
 
 
 def test_what_was_used_longest_ago_makes_room(photos: list[Path], tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
+    folder = tmp_path / "cache"
 
     def fill(name: str, max_bytes: int) -> Fake:
         inner = Fake(dimension=20_000)  # 80 kB a row
@@ -128,6 +128,6 @@ def test_what_was_used_longest_ago_makes_room(photos: list[Path], tmp_path: Path
 def test_cache_without_room_still_describes(photos: list[Path], tmp_path: Path) -> None:
     for _ in range(2):
         inner = Fake()
-        describe = CachedDescriber(inner, tmp_path / "kept", {"a": 1}, max_bytes=0)
+        describe = CachedDescriber(inner, tmp_path / "cache", {"a": 1}, max_bytes=0)
         assert all_rows(describe, photos)[:, 0].tolist() == [n + 1 for n in range(40)]
         assert len(inner.described) == 40

@@ -65,7 +65,7 @@ def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
     assert found.indices.tolist() == full_product(queries, database, 5).tolist()
 
 
-def test_progress_ends_where_it_said_it_would() -> None:
+def test_progress_ends_at_the_announced_total() -> None:
     reported: list[tuple[int, int]] = []
     rows = unit_rows(10, 4, 7)
     exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: reported.append(heard))
@@ -75,6 +75,6 @@ def test_progress_ends_where_it_said_it_would() -> None:
 
 def test_gpu_that_faiss_does_not_have_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faiss, "get_num_gpus", lambda: 0)
-    with pytest.raises(Misconfigured, match="--faiss_gpu False") as refused:
+    with pytest.raises(Misconfigured, match="Omit --faiss-gpu") as refused:
         exact_knn(unit_rows(2, 4, 8), unit_rows(2, 4, 9), 1, faiss_gpu=True)
     assert refused.value.code == "faiss_gpu_missing"

@@ -8,18 +8,22 @@ import pytest
 from shared.evaluation.calibration import Calibration
 from shared.evaluation.place_evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.place_figures import evaluate_places
-from shared.evaluation.place_levels import CandidateLevel, LevelScheme, candidate_levels
-from shared.evaluation.place_probability import (
-    CERTAINTIES,
-    MIN_LABELLED_QUERIES,
-    PlaceModel,
-    PlaceSample,
-    Thresholds,
-    error_radius_m,
-    fit_place_model,
-    shipped_prior,
+from shared.evaluation.place_fit import MIN_LABELLED_QUERIES, PlaceSample, fit_place_model
+from shared.evaluation.place_levels import (
+    FEATURES,
+    CandidateLevel,
+    LevelScheme,
+    candidate_levels,
+    shared_neighbours,
 )
+from shared.evaluation.place_probability import PlaceModel, error_radius_m, shipped_prior
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.place_thresholds import (
+    CERTAINTIES,
+    HeldOutEstimate,
+    Thresholds,
+    choose_thresholds,
+)
 from shared.place_paths import is_within_level, label_levels
 
 PATHS = LevelScheme(labels_are_paths=True, radii_m=(25.0, 100.0))
@@ -162,14 +166,69 @@ def test_the_error_radius_lies_between_the_levels_that_enclose_its_share() -> No
     assert error_radius_m([CandidateLevel(place="a")], [0.99], 0.68) is None
 
 
-def test_an_answer_is_the_finest_level_over_its_threshold_and_under_the_limit() -> None:
-    at_95 = Thresholds(not_in_map=0.2, levels=(0.9, None))
+def test_an_answer_is_the_finest_level_over_the_threshold_with_enough_odds() -> None:
+    at_95 = Thresholds(probability=0.9, finest_odds=5.0)
     model = PlaceModel(thresholds=(at_95,) * len(CERTAINTIES))
     assert model.answer([0.91, 0.96], 0.1, 0.95) == 0
     assert model.answer([0.91, 0.96], 0.3, 0.95) == 1  # probably not in the map
-    assert model.answer([0.5, 0.96], 0.1, 0.95) == 1
-    assert model.answer([0.5, 0.94], 0.1, 0.95) is None  # no threshold: the certainty is one
+    assert model.answer([0.5, 0.91], 0.1, 0.95) == 1
+    assert model.answer([0.5, 0.89], 0.1, 0.95) is None
     assert model.answer([0.91, 0.96], 0.1, 1.0) is None  # beyond the stored certainties
+    assert PlaceModel().answer([0.94, 0.96], 0.1, 0.95) == 1  # no threshold: the certainty is one
+
+
+def test_the_threshold_is_the_lowest_with_the_certainty_as_share_of_right_answers() -> None:
+    """Answers of both levels count together: the sure ones make up for those near the threshold."""
+    sure = [held_out([0.99, 0.99], [True, True]) for _ in range(90)]
+    unsure = [held_out([0.1, 0.86 + n / 1000], [False, n % 2 == 0]) for n in range(20)]
+    found = choose_thresholds([*sure, *unsure], [], 0.95).probability
+    assert found is not None
+    assert 0.86 < found < 0.95
+    answered = [s for s in unsure if s.probabilities[1] >= found]
+    wrong = sum(not s.is_right[1] for s in answered)
+    assert (wrong + 1) / (len(sure) + len(answered) + 1) <= 0.05
+    assert choose_thresholds(unsure, [], 0.95).probability is None
+    assert choose_thresholds([], [], 0.95) == Thresholds()
+
+
+def test_at_most_one_impostor_in_twenty_gets_an_answer_at_the_finest_level() -> None:
+    rng = np.random.default_rng(0)
+    right = [held_out([0.97], [True]) for _ in range(200)]
+    draw = rng.uniform(0.001, 0.02, 400).tolist()
+    impostors = [held_out([0.97], [False], value) for value in draw]
+    thresholds = choose_thresholds(right, impostors[:200], 0.95)
+    answers = [thresholds.answer([0.97], s.not_in_map, 0.95) for s in impostors[200:]]
+    assert 0 < sum(answer == 0 for answer in answers) <= 0.1 * len(answers)
+    assert choose_thresholds(right, impostors[:18], 0.95).finest_odds is None  # too few
+
+
+def held_out(
+    probabilities: list[float], right: list[bool | None], not_in_map: float = 0.0
+) -> HeldOutEstimate:
+    return HeldOutEstimate(probabilities, not_in_map, right, None, 1.0)
+
+
+def test_shared_neighbours_are_those_that_the_query_and_its_best_photo_find_first() -> None:
+    ranked = [RankedPhoto(0.9 - n / 100, label("a"), n) for n in range(20)]
+    others = [RankedPhoto(0.9 - n / 100, label("a"), 100 + n) for n in range(20)]
+    assert shared_neighbours(ranked, ranked[1:]) == [1.0, 1.0, 1.0]
+    assert shared_neighbours(ranked, others) == [1 / 5, 1 / 10, 1 / 20]  # the best photo itself
+    assert shared_neighbours(ranked, ranked[:0:-1]) == [1 / 5, 1 / 10, 1.0]
+    unknown = ranking((0.9, label("a")), (0.8, label("b")))
+    assert shared_neighbours(unknown, unknown) == [0.0, 0.0, 0.0]
+
+
+def test_a_ranking_like_that_of_its_best_photo_is_more_probable() -> None:
+    """As for the samples of a map, in which shared neighbours tell right from wrong."""
+    position = FEATURES.index("shared_neighbours_10")
+    samples = own_samples()
+    for sample in samples:
+        assert len(sample.levels[0].features) == len(FEATURES)
+        assert 0 < sample.levels[0].features[position] <= 1
+    own = [s for s in samples if s.left_out is None]
+    alike = [s.levels[0].features[position] for s in own if s.is_right[0]]
+    unlike = [s.levels[0].features[position] for s in own if not s.is_right[0]]
+    assert np.mean(alike) > np.mean(unlike)
 
 
 def test_a_model_of_other_levels_is_not_used() -> None:
@@ -255,12 +314,14 @@ def test_labelled_queries_refine_the_model() -> None:
     assert too_few.model == before
 
 
-def test_a_calibration_of_an_earlier_release_has_no_probabilities() -> None:
+def test_a_calibration_of_an_earlier_release_has_no_probabilities_or_those_of_the_prior() -> None:
     stored = {
         "radius_m": 25.0, "support_threshold": 0.1, "impostors": 30, "labelled_queries": 0,
         "confidence": None,
     }  # fmt: skip
     assert Calibration.model_validate(stored).places is None
     model = fit_place_model(own_samples(), [], PATHS, 0.5).model
-    calibration = Calibration.model_validate({**stored, "places": model.model_dump(mode="json")})
-    assert calibration.places == model
+    places = model.model_dump(mode="json")
+    assert Calibration.model_validate({**stored, "places": places}).places == model
+    earlier = {**places, "version": 1, "thresholds": [{"not_in_map": 0.1, "levels": [0.9, None]}]}
+    assert Calibration.model_validate({**stored, "places": earlier}).places == PlaceModel()

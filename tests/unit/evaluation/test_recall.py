@@ -22,7 +22,7 @@ def test_positive_lies_within_25_metres_the_25th_included() -> None:
     assert second.tolist() == []
 
 
-def test_positives_are_the_same_however_many_queries_are_asked_at_once() -> None:
+def test_positives_are_the_same_for_any_number_of_queries_at_once() -> None:
     queries = np.random.default_rng(0).uniform(0, 300, (700, 2))
     database = np.random.default_rng(1).uniform(0, 300, (90, 2))
     together = positives_within(queries, database)

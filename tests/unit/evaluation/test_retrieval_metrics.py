@@ -46,7 +46,7 @@ def shot(east: float | None = None, **fields: Any) -> DatasetPhoto:
     return DatasetPhoto(path=Path("photo.jpg"), name="photo.jpg", **given)
 
 
-def test_recall_is_told_with_and_without_queries_that_have_no_positive() -> None:
+def test_recall_is_reported_with_and_without_queries_that_have_no_positive() -> None:
     found = compute_recalls(RANKED, POSITIVES, (1, 3))
     assert found.recall_all == {1: 1 / 4, 3: 2 / 4}
     assert found.recall_findable == {1: 1 / 3, 3: 2 / 3}
@@ -117,7 +117,7 @@ def test_queries_cluster_by_sequence_then_place_then_square() -> None:
     assert cluster_queries(lost).kind == "queries"
 
 
-def test_squares_are_told_apart_by_degrees_as_by_metres() -> None:
+def test_squares_by_degrees_equal_squares_by_metres() -> None:
     degrees = [shot(None, latitude=60.0, longitude=10 + n * 0.01) for n in range(MIN_CLUSTERS)]
     assert cluster_queries(degrees).count == MIN_CLUSTERS
     beside = [*degrees, shot(None, latitude=60.0, longitude=10.0)]

@@ -77,7 +77,7 @@ def test_a_spoilt_file_is_fetched_again(bucket: Bucket, folder: Path) -> None:
     assert bucket.fetched == 2
 
 
-def test_what_is_not_what_was_stored_is_refused_and_not_kept(bucket: Bucket, folder: Path) -> None:
+def test_a_file_with_a_wrong_hash_is_rejected_and_deleted(bucket: Bucket, folder: Path) -> None:
     key, sha256 = put(bucket, b"weights")
     bucket.put(key, b"others")
     with pytest.raises(Unavailable) as caught:

@@ -19,7 +19,7 @@ from services.gateway.authentication import (
     LocalhostAuthenticator,
     parse_bearer,
 )
-from shared.catalog.session import Catalog
+from shared.catalog.database.session import Catalog
 from shared.config.embedded_home import announce_server, find_running_server
 from shared.config.private_files import write_private
 from shared.config.settings import Settings

@@ -47,7 +47,7 @@ END = f"--{BOUNDARY}--\r\n".encode()
 
 
 class Body:
-    """What a client sends, piece by piece; knows how much of it was asked for."""
+    """What a client sends, piece by piece; counts the bytes that were read."""
 
     def __init__(self, pieces: Iterable[bytes], *, cut_off: bool = False) -> None:
         self._pieces = list(pieces)
@@ -119,7 +119,7 @@ def test_file_of_any_size_is_stored_and_opened_whole(
     assert received.sha256 == hashlib.sha256(data).hexdigest()
     with received.open(store) as opened:
         assert opened.read() == data
-    assert (received.content is None) == (beyond >= 0), "no more of it is kept in memory"
+    assert (received.content is None) == (beyond >= 0), "only the beginning stays in memory"
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 1000, 10**9])
@@ -185,7 +185,10 @@ def test_file_over_the_limit_is_refused_without_reading_the_rest(store: FolderSt
 def test_limit_is_inclusive(store: FolderStore) -> None:
     assert receive(store, file() + END, max_bytes=len(PHOTO)).size_bytes == len(PHOTO)
     store.delete(KEY)
-    assert refused(store, file() + END, max_bytes=len(PHOTO) - 1).code == "file_too_large"
+    error = refused(store, file() + END, max_bytes=len(PHOTO) - 1)
+    assert error.code == "file_too_large"
+    assert f"larger than {(len(PHOTO) - 1) / 1e6:g} MB" in error.detail
+    assert "MAX_FILE_SIZE in the environment of the server, or in the file .env" in error.detail
 
 
 def test_declared_length_over_the_limit_is_refused_before_anything_is_read(
@@ -341,7 +344,7 @@ def test_what_was_there_under_the_key_survives_a_refused_body(store: FolderStore
         ("TIFF", "image/tiff"),
     ],
 )
-def test_media_type_is_told_by_the_content(media: str, expected: str) -> None:
+def test_media_type_is_detected_from_the_content(media: str, expected: str) -> None:
     assert check_photo_signature(photo_bytes(1, media)[:16]) == expected
 
 

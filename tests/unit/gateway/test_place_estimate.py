@@ -274,7 +274,7 @@ def test_labelled_queries_give_a_confidence() -> None:
     assert reported.confidence == pytest.approx(learnt.probability(PlaceEvidence(0.3, 0.5)))
 
 
-def test_nothing_found_and_nothing_known_are_told_apart() -> None:
+def test_nothing_found_differs_from_nothing_known() -> None:
     assert answer(None).reason == "No photo of the map matches the filter."
     assert (
         "neither coordinates nor a place"

@@ -1,4 +1,4 @@
-"""Which weights a search is asked with, and what its answer says of them."""
+"""Ranking weights of a search request, and how the response reports them."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_an_extractor_without_the_decoder_says_what_to_install(no_decoder: None)
     with pytest.raises(Unprocessable) as caught:
         decode_photo(PHOTO, SQUARE, PIXELS)
     assert caught.value.code == "no_heic_decoder"
-    assert "placewise[heic]" in caught.value.detail
+    assert "uv pip install '.[heic]'" in caught.value.detail
 
 
 def test_an_avif_that_calls_itself_mif1_is_refused() -> None:

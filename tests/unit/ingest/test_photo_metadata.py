@@ -12,6 +12,7 @@ from shared.ingest.photo_metadata import (
     MAX_TEXT_CHARACTERS,
     PhotoFields,
     check_metadata,
+    parse_relative_path,
     read_form_fields,
 )
 
@@ -39,6 +40,7 @@ def test_every_field_is_read() -> None:
             "place": "corridor 3",
             "tags": "night, indoor ,night,,",
             "metadata": '{"camera": {"f": 1.8}, "n": null}',
+            "relative_path": "Day 2/IMG_2078.jpg",
         }
     )
     assert found == PhotoFields(
@@ -49,10 +51,33 @@ def test_every_field_is_read() -> None:
         place="corridor 3",
         tags=["night", "indoor"],
         metadata={"camera": {"f": 1.8}, "n": None},
+        relative_path="Day 2/IMG_2078.jpg",
     )
 
 
-def test_what_is_empty_or_left_out_is_not_said() -> None:
+@pytest.mark.parametrize(
+    ("sent", "stored"),
+    [
+        ("Day 2/IMG_2078.jpg", "Day 2/IMG_2078.jpg"),
+        (r"C:\Users\me\Day 2\1.jpg", "Users/me/Day 2/1.jpg"),
+        ("./../../etc//passwd", "etc/passwd"),
+        ("/srv/1.jpg", "srv/1.jpg"),
+        ("a\x00b/1\n.jpg", "ab/1.jpg"),
+        ("../.", None),
+    ],
+)
+def test_a_relative_path_is_a_label_below_its_folder(sent: str, stored: str | None) -> None:
+    assert parse_relative_path(sent) == stored
+
+
+def test_of_a_long_path_the_end_is_kept() -> None:
+    path = parse_relative_path("deep/" * 300 + "1.jpg")
+    assert path is not None
+    assert len(path) == 1000
+    assert path.endswith("/deep/1.jpg")
+
+
+def test_empty_and_missing_fields_are_left_out() -> None:
     assert read_form_fields({}) == PhotoFields()
     assert read_form_fields({"latitude": "", "place": "  ", "tags": "", "metadata": ""}) == (
         PhotoFields()

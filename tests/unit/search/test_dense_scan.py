@@ -143,7 +143,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_near_duplicates_at_7168_dimensions_are_told_apart(seed: int) -> None:
+def test_near_duplicates_at_7168_dimensions_are_distinguished(seed: int) -> None:
     """Far below what float32 sums can tell: many rows, all within 1e-6 of each other."""
     rng = np.random.default_rng(seed)
     place = unit_rows(seed, 1, 7168)[0]
@@ -217,7 +217,7 @@ def test_min_score_is_inclusive() -> None:
     assert hits_of(chunks, rows[0], 9, min_score=-1.0) == everything
 
 
-def test_fewer_rows_than_asked_are_all_answered() -> None:
+def test_fewer_rows_than_k_are_all_returned() -> None:
     rows = unit_rows(9, 3, 4)
     assert len(hits_of([chunk_of(rows, [0, 1, 2])], rows[0], 100)) == 3
 

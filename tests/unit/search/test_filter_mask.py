@@ -58,7 +58,7 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
 @pytest.mark.parametrize(
     ("photo_filter", "passing"),
     [
-        pytest.param(PhotoFilter(), "west east pole nowhere", id="nothing wanted"),
+        pytest.param(PhotoFilter(), "west east pole nowhere", id="no filter"),
         pytest.param(PhotoFilter(ids=()), "", id="no ids"),
         pytest.param(PhotoFilter(ids=(IDS[1], IDS[1], IDS[39])), "east", id="ids"),
         pytest.param(
@@ -133,7 +133,7 @@ def test_changed_columns_leave_those_before_them_alone() -> None:
     assert before.with_changes({IDS[7]: facts_of(IDS[7])}) is before
 
 
-def test_all_tags_are_wanted_and_their_case_matters() -> None:
+def test_all_tags_are_required_and_case_sensitive() -> None:
     photos = [
         facts_of(IDS[0], tags=("wet", "night", "old")),
         facts_of(IDS[1], tags=("night",)),

@@ -154,7 +154,7 @@ def out_of_memory(*_: object, **__: object) -> Any:
     raise torch.OutOfMemoryError("CUDA out of memory")
 
 
-def test_device_out_of_memory_when_asked_leaves_the_query_to_the_cpu(
+def test_device_out_of_memory_in_a_query_leaves_it_to_the_cpu(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = places(6, 90, DIMENSION)
@@ -180,7 +180,7 @@ def test_device_out_of_memory_when_asked_leaves_the_query_to_the_cpu(
     assert status.resident_bytes >= 90 * DIMENSION * 2
 
 
-def test_device_out_of_memory_when_loading_is_told_and_tried_again_later(
+def test_device_out_of_memory_when_loading_is_reported_and_retried_later(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     snapshot = snapshot_of(places(6, 90, DIMENSION), by="int8")
@@ -216,7 +216,7 @@ def test_device_that_adds_up_carelessly_is_found_out(monkeypatch: pytest.MonkeyP
         device_with().self_test()
 
 
-def test_device_failures_are_told_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_failures_differ_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), by="int8"))
     assert snapshot.gpu_snapshot is not None
     monkeypatch.setattr(gpu, "_score_all_rows", out_of_memory)

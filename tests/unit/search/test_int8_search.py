@@ -102,7 +102,7 @@ def test_dense_mode_compares_every_row() -> None:
     assert hits_of(found) == brute_force(rows, rows[0], 9, everything)
 
 
-def test_what_is_left_to_chance_is_not_asked_where_nothing_may_be() -> None:
+def test_statistical_search_is_not_used_where_no_error_is_allowed() -> None:
     """Sign codes alone answer `auto`, never `deterministic`."""
     rows = places(5, 400)
     everything = np.ones(400, bool)

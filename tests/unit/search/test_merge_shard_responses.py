@@ -90,7 +90,7 @@ def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:
     assert ranked(merged) == [(1, 0.9), (2, 0.8), (3, 0.6)]
 
 
-def test_the_sums_the_least_version_and_all_that_is_missing_are_told() -> None:
+def test_sums_least_version_and_missing_chunks_are_merged() -> None:
     merged = merge_responses(
         [
             answer(snapshot_version=9, rows_scanned=3, rows_reranked=1, missing=("chunks/a",)),
@@ -144,7 +144,7 @@ def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
         assert merged.certified_k == len(truth)
 
 
-def test_largest_error_of_an_estimate_is_told_and_none_where_nothing_was_estimated() -> None:
+def test_largest_error_of_an_estimate_is_merged_and_none_without_estimates() -> None:
     assert merge_responses([answer(), answer()], 1).max_z is None
     assert merge_responses([answer(max_z=1.5), answer(), answer(max_z=3.0)], 1).max_z == 3.0
 

@@ -97,9 +97,9 @@ def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:
     cosines = queries.astype(np.float64) @ rows.T.astype(np.float64)
     apart = np.abs(cosines) < 0.9
     turned, searched = turn.rotate(rows), turn.rotate(queries)
-    signs, asked_signs = np.sign(turned), np.sign(searched)
+    signs, query_signs = np.sign(turned), np.sign(searched)
     for bits in (4096, 16_384, ANYLOC):
-        same = (asked_signs[:, :bits] @ signs[:, :bits].T) / bits  # 1 - 2 h / m
+        same = (query_signs[:, :bits] @ signs[:, :bits].T) / bits  # 1 - 2 h / m
         errors = (np.cos(math.pi * (1 - same) / 2) - cosines)[apart]
         deviation = hamming_deviation(bits, ANYLOC)
         assert 0.95 < errors.std() / deviation < 1.05, bits

@@ -1,4 +1,4 @@
-"""Which workers are asked: by what they say they hold, and by how they answer."""
+"""Selection of search workers by their reported state and by their responses."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_shard_of_which_no_worker_was_ever_seen_is_known_by_the_others(
     assert workers.statuses()[1] == [Shard(1, 3), Shard(2, 3)]
 
 
-def test_who_refuses_the_connection_is_asked_last_and_who_is_silent_not_at_all(
+def test_a_worker_that_refuses_connections_is_tried_last_and_a_silent_one_never(
     fake: FakeWorkers,
 ) -> None:
     fake.answers = {name: holding("0/1", version=1) for name in ("http://a", "http://b")}

@@ -88,11 +88,11 @@ def test_each_member_is_found_again_by_its_place_alone(
     ],
     ids=["zip", "empty zip", "tar", "gnu tar", "gzip", "text", "nothing", "zeros", "xz"],
 )
-def test_an_archive_is_told_by_its_content(archive: bytes, found: ArchiveFormat | None) -> None:
+def test_an_archive_is_detected_by_its_content(archive: bytes, found: ArchiveFormat | None) -> None:
     assert detect_archive_format(archive[:512]) == found
 
 
-def test_what_is_gone_or_no_archive_is_said_to_be_that(store: FolderStore) -> None:
+def test_a_missing_archive_and_a_file_of_another_format_are_errors(store: FolderStore) -> None:
     with pytest.raises(Gone) as caught:
         open_archive(store, "archives/nothing", LIMITS)
     assert caught.value.code == "archive_gone"

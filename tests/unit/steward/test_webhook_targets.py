@@ -92,7 +92,7 @@ def test_a_name_with_one_private_address_is_refused_whole(monkeypatch: pytest.Mo
         )
 
 
-def test_a_name_without_an_address_is_told_apart_from_a_forbidden_one() -> None:
+def test_a_name_without_an_address_differs_from_a_forbidden_one() -> None:
     with pytest.raises(PlacewiseError) as caught:
         resolve_webhook_target(
             WebhookTarget("https", "no-such-name.invalid", 443, "/"), allow_private=False

@@ -194,7 +194,7 @@ class CountingStore(FolderStore):
                 return True
 
             def read(self, size: int = -1) -> bytes:
-                data = opened.read(min(size, 700))  # less than was asked, as a network may give
+                data = opened.read(min(size, 700))  # less than requested, as from a network
                 store.bytes_read += len(data)
                 return data
 

@@ -29,14 +29,16 @@ def positions(shots: list[PlannedPhoto]) -> np.ndarray[tuple[int, int], np.dtype
     return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
 
 
-def test_each_place_has_its_views_and_the_queries_are_as_many_as_asked(plan: CityPlan) -> None:
+def test_each_place_has_its_views_and_there_are_as_many_queries_as_requested(
+    plan: CityPlan,
+) -> None:
     views = Counter(shot.place for shot in of_role(plan, "database"))
     assert set(views) == set(range(150))
     assert set(views.values()) == {4}
     assert len(of_role(plan, "query")) == 120
 
 
-def test_out_of_map_queries_are_the_share_that_was_asked_for(plan: CityPlan) -> None:
+def test_out_of_map_queries_are_the_requested_share(plan: CityPlan) -> None:
     kinds = Counter(shot.kind for shot in of_role(plan, "query"))
     assert kinds == {"in_map": 88, "other_way": 8, "out_of_map": 24}
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import typer
+from rich.table import Table
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
@@ -19,7 +20,9 @@ from services.trainer.arguments import (
     load_yaml,
     save_yaml,
 )
+from services.trainer.resolve import list_changed_meanings
 from shared.errors import InvalidRequest, NotFound
+from tests.support.training_runs import PUBLISHED_COMMAND
 
 PREDECESSORS: dict[str, Any] = {
     "backbone_arch": "resnet18",
@@ -69,24 +72,6 @@ PREDECESSORS: dict[str, Any] = {
     "fast_dev_run": False,
 }
 
-# As the predecessor's README prints it; only the program's name is another.
-PUBLISHED = r"""
-   --batch_size 100 --img_per_place 4 --min_img_per_place 4 --shuffle_all False
-   --random_sample_from_each_place True --image_size "(320, 320)" --num_workers 8
-   --show_data_stats True --val_set_names '["sfxs_val"]'
-   --test_set_names '["sfxs_test", "tokyoxs_test"]' --backbone_arch "resnet18" --pretrained True
-   --layers_to_freeze -1 --layers_to_crop '[4]' --agg_arch "Gem" --agg_config '{"p":3}'
-   --lr 0.0002 --optimizer "adam" --weight_decay 0 --momentum 0.9 --warmpup_steps 600
-   --milestones '[5, 10, 15, 25]' --lr_mult 0.3 --loss_name "MultiSimilarityLoss"
-   --miner_name "BatchHardMiner" --miner_margin 0.1 --faiss_gpu True --monitor "sfxs_val/R1"
-   --filename "{self.backbone_arch}\_epoch({epoch:02d})\_step({step:04d})\_R1[{pitts30k_val/R1:.4f}]\_R5[{sfxs_val/R5:.4f}]"
-   --auto_insert_metric_name False --save_weights_only True --save_top_k 3 --mode "max"
-   --accelerator "gpu" --devices 1 --default_root_dir "./LOGS/{self.backbone_arch}"
-   --num_sanity_val_steps 0 --precision 32 --max_epochs 8 --check_val_every_n_epoch 1
-   --reload_dataloaders_every_n_epochs 1 --log_every_n_steps 20 --fast_dev_run False
-   --model_path '' --experiment_phase "train"
-"""  # noqa: E501
-
 
 def read(tokens: list[str]) -> TrainingArguments:
     """What the command makes of its tokens."""
@@ -109,7 +94,7 @@ def test_every_argument_of_the_predecessor_is_there_with_its_default(name: str) 
 
 
 def test_the_published_command_means_what_its_authors_ran() -> None:
-    arguments = read(shlex.split(PUBLISHED))
+    arguments = read(shlex.split(PUBLISHED_COMMAND))
     assert arguments.batch_size == 100
     assert arguments.image_size == (320, 320)
     assert arguments.val_set_names == ("sfxs_val",)
@@ -130,10 +115,13 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    answer = CliRunner().invoke(build_app(["train"]), ["train", *shlex.split(PUBLISHED)])
+    command = ["train", *shlex.split(PUBLISHED_COMMAND), "--pretrained", "False"]
+    answer = CliRunner().invoke(build_app(["train"]), command)
     assert answer.exit_code == 1
-    assert "no_gpu" in answer.output
-    assert "--accelerator cpu" in answer.output.replace("\n", " ")
+    shown = answer.output.replace("\n", " ")
+    assert "no_gpu" in shown
+    assert "--accelerator cpu" in shown
+    assert "data_root_missing" in shown, "every obstacle is listed at once"
 
 
 @pytest.mark.parametrize(
@@ -178,6 +166,8 @@ def test_hyphens_are_as_good_as_underscores() -> None:
         (["--logger", "none"], "logger", ()),
         (["--logger", "csv"], "logger", ("csv",)),
         (["--lr", "1e-3"], "lr", 1e-3),
+        (["--layers_to_crop", "4"], "layers_to_crop", (4,)),
+        (["--milestones", "5,10"], "milestones", (5, 10)),
     ],
 )
 def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: object) -> None:
@@ -185,9 +175,10 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "message"),
     [
-        ("pretrained", "maybe", "valid boolean"),
+        ("pretrained", "maybe", "Expected True or False"),
+        ("layers_to_crop", "layer4", r"Expected a JSON list, such as \[4\]"),
         ("optimizer", "adams", "'adam', 'adamw' or 'sgd'"),
         ("batch_size", "many", "valid integer"),
         ("batch_size", "0", "greater than or equal to 1"),
@@ -197,10 +188,18 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
         ("logger", "tensorbord", "'tensorboard', 'wandb'"),
     ],
 )
-def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: str) -> None:
-    with pytest.raises(InvalidRequest, match=said) as caught:
+def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, message: str) -> None:
+    with pytest.raises(InvalidRequest, match=message) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
+
+
+def test_a_word_after_a_boolean_option_is_its_value() -> None:
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--shuffle_all", "maybe"])
+    assert answer.exit_code == 1
+    shown = answer.output.replace("\n", " ")
+    assert "--shuffle_all" in shown
+    assert "Expected True or False (got 'maybe')" in shown
 
 
 def test_an_option_that_there_is_not_names_the_nearest() -> None:
@@ -237,14 +236,31 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_written_configuration_is_read_as_the_same_run(tmp_path: Path) -> None:
-    arguments = read(shlex.split(PUBLISHED))
+    arguments = read(shlex.split(PUBLISHED_COMMAND))
     save_yaml(arguments, tmp_path / "config.yaml")
     assert build_arguments(load_yaml(tmp_path / "config.yaml")) == arguments
 
 
-def test_the_help_shows_every_argument_in_its_group() -> None:
-    answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"], env={"COLUMNS": "200"})
+@pytest.mark.parametrize("columns", ["80", "200"])
+def test_the_help_shows_every_argument_in_its_group(
+    columns: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("typer.rich_utils.Table", Table)
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", int(columns))
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"])
     assert answer.exit_code == 0
     for name in TrainingArguments.model_fields:
         assert f"--{name} " in answer.output
     assert "Loss and miner" in answer.output
+
+
+def test_values_that_had_another_effect_in_the_predecessor_are_named() -> None:
+    published = read(shlex.split(PUBLISHED_COMMAND))
+    assert list_changed_meanings(published) == [], "without weight decay, Adam is AdamW"
+    differing = build_arguments(
+        {"optimizer": "adam", "weight_decay": 0.1, "experiment_phase": "all", "image_size": 224}
+    )
+    adam, size = list_changed_meanings(differing)
+    assert "--optimizer adamw" in adam
+    assert "224 x 224" in size
+    assert "--test_image_size native" in size

@@ -169,7 +169,7 @@ def test_a_photo_that_does_not_decode_is_left_out_and_named(
     assert sorted(torch.cat([batch.labels for batch in batches]).tolist()).count(2) == 1
 
 
-def test_a_photo_that_does_not_decode_is_an_error_where_that_was_asked(
+def test_a_photo_that_does_not_decode_is_an_error_in_strict_mode(
     photos_on_disk: list[TrainingPlace],
 ) -> None:
     broken = photos_on_disk[2].photos[1]
@@ -202,9 +202,9 @@ def test_a_large_jpeg_decoded_small_is_nearly_the_full_decoding(tmp_path: Path) 
     full = coarse.resize((1280, 960), Image.Resampling.BICUBIC)
     full.save(tmp_path / "large.jpg", quality=95)
     small = np.asarray(decode_resized(tmp_path / "large.jpg", (120, 160)), dtype=float)
-    wanted = np.asarray(full.resize((160, 120), Image.Resampling.BILINEAR), dtype=float)
+    expected = np.asarray(full.resize((160, 120), Image.Resampling.BILINEAR), dtype=float)
     assert small.shape == (120, 160, 3)
-    assert np.abs(small - wanted).mean() < 2
+    assert np.abs(small - expected).mean() < 2
 
 
 def test_a_photo_on_its_side_comes_out_upright(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "said"),
+    ("text", "code", "message"),
     [
         ("bases: {}", "bad_grid", "Did you mean base"),
         ("base: {lr: 1}", "bad_grid", "nothing to train"),
@@ -78,12 +78,12 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
     ],
 )
 def test_a_grid_that_can_not_be_is_refused_before_its_first_run(
-    text: str, code: str, said: str, tmp_path: Path
+    text: str, code: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(PlacewiseError) as caught:
         plan_of(tmp_path, text)
     assert caught.value.code == code
-    assert said in caught.value.detail
+    assert message in caught.value.detail
 
 
 def test_the_predecessors_grid_is_its_28_published_runs() -> None:
@@ -113,10 +113,11 @@ def plain_plan(*names: str) -> GridPlan:
 
 
 class Runs:
-    """Trainer whose runs end as they are told to, at once."""
+    """Trainer whose runs end at once with the given outcome."""
 
     def __init__(self, out: Path, **endings: Exception | float) -> None:
         self.out, self.endings, self.calls = out, endings, list[str]()
+        self.obstacles: list[PlacewiseError] = []
 
     def begin(self, arguments: Any, display: Display, stop: StopRequest) -> dict[str, Any]:
         return self._end("begin", self.out / arguments.run_name, arguments)
@@ -141,6 +142,7 @@ class Runs:
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(run, "run", self.begin)
             patched.setattr(run, "resume", self.resume)
+            patched.setattr(run, "find_obstacles", lambda arguments: self.obstacles)
             return run_grid(plan, self.out, NullDisplay(), StopRequest(), lambda outcomes: None)
 
 
@@ -173,6 +175,14 @@ def test_a_failed_run_is_named_and_the_others_are_made(tmp_path: Path) -> None:
     ]
     assert outcomes[1].error == {"code": "RuntimeError", "detail": "out of memory"}
     assert "out of memory" in (tmp_path / "b" / "failed.json").read_text()
+
+
+def test_a_grid_stops_when_no_run_can_start_for_the_same_reason(tmp_path: Path) -> None:
+    runs = Runs(tmp_path, a=Misconfigured("no_gpu", "x"), b=0.5)
+    runs.obstacles = [Misconfigured("no_gpu", "x")]
+    outcomes = runs.go(plain_plan("a", "b"))
+    assert [outcome.state for outcome in outcomes] == [RunState.FAILED, RunState.WAITING]
+    assert runs.calls == ["begin a"]
 
 
 def test_a_grid_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -209,6 +219,13 @@ def test_the_leaderboard_is_ranked_by_the_best_epochs_and_names_failures(tmp_pat
     with (tmp_path / "leaderboard.csv").open() as file:
         assert list(csv.DictReader(file)) == rows
     assert (tmp_path / "leaderboard.md").read_text().count("\n") == 5
+
+
+def test_the_leaderboard_counts_epochs_and_not_validations(tmp_path: Path) -> None:
+    plan = plain_plan("a")
+    outcomes = Runs(tmp_path, a=0.5).go(plan)
+    outcomes[0].report["epochs"] = [{"number": 3, "figures": {}}, {"number": 7, "figures": {}}]
+    assert leaderboard(plan, outcomes)[0]["epochs"] == "8"
 
 
 @pytest.mark.parametrize(("fingerprint", "shown"), [("abc", True), ("abd", False), (None, False)])

@@ -118,7 +118,7 @@ def test_a_folder_may_name_arguments_and_nothing_else() -> None:
         format_folder("./LOGS/{epoch}", {})
 
 
-def kept_in(folder: Path, *, top_k: int = 2, mode: str = "max") -> TopKCheckpoints:
+def checkpoints_in(folder: Path, *, top_k: int = 2, mode: str = "max") -> TopKCheckpoints:
     name = CheckpointNameTemplate("e{epoch}", {}, ["s/R1"])
     return TopKCheckpoints(folder, name, "s/R1", mode, top_k, True)
 
@@ -137,37 +137,37 @@ def write(path: Path, weights_only: bool) -> None:
     ],
 )
 def test_the_best_checkpoints_stay(tmp_path: Path, mode: str, top_k: int, stay: list[str]) -> None:
-    kept = kept_in(tmp_path, mode=mode, top_k=top_k)
+    checkpoints = checkpoints_in(tmp_path, mode=mode, top_k=top_k)
     for epoch, score in enumerate((0.1, 0.5, 0.9, 0.3, 0.7)):
-        kept.save_if_best(write, {"s/R1": score}, epoch, step=epoch)
+        checkpoints.save_if_best(write, {"s/R1": score}, epoch, step=epoch)
     assert sorted(path.stem for path in tmp_path.glob("*")) == stay
 
 
 def test_of_equal_scores_the_earlier_checkpoint_is_the_best(tmp_path: Path) -> None:
-    kept = kept_in(tmp_path, top_k=1)
-    assert kept.save_if_best(write, {"s/R1": 0.5}, 0, 0)
-    assert not kept.save_if_best(write, {"s/R1": 0.5}, 1, 1)
-    assert not kept.save_if_best(write, {"s/R1": math.nan}, 2, 2)
-    assert kept.best_path == tmp_path / "e0.ckpt"
+    checkpoints = checkpoints_in(tmp_path, top_k=1)
+    assert checkpoints.save_if_best(write, {"s/R1": 0.5}, 0, 0)
+    assert not checkpoints.save_if_best(write, {"s/R1": 0.5}, 1, 1)
+    assert not checkpoints.save_if_best(write, {"s/R1": math.nan}, 2, 2)
+    assert checkpoints.best_path == tmp_path / "e0.ckpt"
 
 
 def test_the_last_checkpoint_holds_everything_whatever_the_best_ones_hold(tmp_path: Path) -> None:
-    kept = kept_in(tmp_path)
-    kept.save_if_best(write, {"s/R1": 0.5}, 0, 0)
-    kept.save_last(write)
+    checkpoints = checkpoints_in(tmp_path)
+    checkpoints.save_if_best(write, {"s/R1": 0.5}, 0, 0)
+    checkpoints.save_last(write)
     assert (tmp_path / "e0.ckpt").read_text() == "weights"
-    assert kept.last_path.read_text() == "everything"
+    assert checkpoints.last_path.read_text() == "everything"
 
 
 def test_two_checkpoints_never_share_a_name(tmp_path: Path) -> None:
     name = CheckpointNameTemplate("same{lr}", {"lr": 1}, ["s/R1"])
-    kept = TopKCheckpoints(tmp_path, name, "s/R1", "max", 3, True)
+    checkpoints = TopKCheckpoints(tmp_path, name, "s/R1", "max", 3, True)
     for epoch in range(3):
-        kept.save_if_best(write, {"s/R1": 0.5}, epoch, 0)
+        checkpoints.save_if_best(write, {"s/R1": 0.5}, epoch, 0)
     assert len(list(tmp_path.glob("*.ckpt"))) == 3
 
 
-def test_random_numbers_go_on_where_they_were_kept() -> None:
+def test_random_numbers_continue_from_the_stored_state() -> None:
     import random
 
     import numpy as np

@@ -6,6 +6,7 @@ import { takesDrops, takesPastes } from "../drop.js";
 import { percent, plural, score, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 import { original, thumbnail } from "../photo.js";
+import { shrinkPhoto } from "../shrink.js";
 import { drawRings, verdict } from "./verdict.js";
 
 const TOP_K = 12;
@@ -27,10 +28,11 @@ export async function showAsk(view, { signal, id }) {
   }
   const map = await get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
   const entry = askEntry(map, (file) => {
+    const small = shrinkPhoto(file, map.extractor);
     const asked = {
       name: file.name,
       picture: () => localPicture(file, signal),
-      find: (query, onjob) => findSimilar("/similarity", query, file, onjob, signal),
+      find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal),
     };
     view.classList.add("asked");
     return showAnswer(answer, asked, signal);

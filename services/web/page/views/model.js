@@ -10,6 +10,7 @@ const RECALLS = ["R@1", "R@5", "R@10"];
 
 const STANDING = {
   own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
+  provisional: ["Provisional", "The vocabulary was learnt when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
   foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
   none: ["None", "This extractor uses no vocabulary."],
 };
@@ -37,7 +38,7 @@ export async function showModel(view, { signal }) {
           h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)))),
       h("div", { class: "standing-words" },
         h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to learn from."),
-        map.photos ? fits && button(map.vocabulary === "own" ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos")),
+        map.photos ? fits && button(["own", "provisional"].includes(map.vocabulary) ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos")),
       work),
     comparison(evaluations, generations, vocabularies, () => measure(follow)),
     generationsTable(generations, vocabularies),

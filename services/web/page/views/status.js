@@ -29,7 +29,7 @@ export async function showStatus(view, { signal }) {
   signal.addEventListener("abort", () => clearInterval(timer));
 }
 
-const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search" };
+const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", extractors: "Extractors", uploads: "Uploads" };
 
 function drawHealth(card, health) {
   const { load } = health;

@@ -25,6 +25,7 @@ export function verdict(found) {
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
     found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
+    found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
     found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
 }
 

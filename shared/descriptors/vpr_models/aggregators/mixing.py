@@ -41,7 +41,7 @@ from shared.descriptors.vpr_models.aggregators.base import (
 )
 
 
-class FeatureMixer(nn.Module):
+class _FeatureMixer(nn.Module):
     """Residual MLP along the positions of a (B, C, hw) map."""
 
     def __init__(self, positions: int, hidden: int) -> None:
@@ -77,7 +77,7 @@ class MixVPR(Aggregator):
         self.size = (in_h, in_w)
         positions = in_h * in_w
         hidden = max(1, int(positions * mlp_ratio))
-        self.mixers = nn.Sequential(*(FeatureMixer(positions, hidden) for _ in range(mix_depth)))
+        self.mixers = nn.Sequential(*(_FeatureMixer(positions, hidden) for _ in range(mix_depth)))
         self.channels = nn.Linear(in_channels, out_channels)
         self.rows = nn.Linear(positions, out_rows)
 
@@ -99,7 +99,7 @@ HEAD_WIDTH = 64  # channels of one attention head
 FEEDFORWARD_FACTOR = 4  # of an encoder layer's MLP
 
 
-class BoqBlock(nn.Module):
+class _BoqBlock(nn.Module):
     """One encoder layer and the cross-attention of its learnt queries."""
 
     def __init__(self, width: int, queries: int) -> None:
@@ -141,7 +141,9 @@ class BoQ(Aggregator):
         super().__init__(proj_channels * row_dim)
         self.project = nn.Conv2d(in_channels, proj_channels, kernel_size=3, padding=1)
         self.norm = nn.LayerNorm(proj_channels)
-        self.blocks = nn.ModuleList(BoqBlock(proj_channels, num_queries) for _ in range(num_layers))
+        self.blocks = nn.ModuleList(
+            _BoqBlock(proj_channels, num_queries) for _ in range(num_layers)
+        )
         self.rows = nn.Linear(num_layers * num_queries, row_dim)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:

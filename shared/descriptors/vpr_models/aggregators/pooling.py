@@ -59,13 +59,13 @@ class GeM(Aggregator):
 
     def __init__(self, in_channels: Size, p: Positive = GEM_POWER, eps: Positive = GEM_EPS) -> None:
         super().__init__(in_channels)
-        self.pool = GeneralizedMeanPooling(p, eps)
+        self.pool = _GeneralizedMeanPooling(p, eps)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         return normalise_rows(self.pool(maps))
 
 
-class GeneralizedMeanPooling(nn.Module):
+class _GeneralizedMeanPooling(nn.Module):
     """Generalised mean: (B, C, h, w) -> (B, C) float32, not normalised."""
 
     def __init__(self, p: float, eps: float) -> None:
@@ -87,7 +87,7 @@ class CosPlace(Aggregator):
 
     def __init__(self, in_dim: Size, out_dim: Size = 512) -> None:
         super().__init__(out_dim)
-        self.pool = GeneralizedMeanPooling(GEM_POWER, GEM_EPS)
+        self.pool = _GeneralizedMeanPooling(GEM_POWER, GEM_EPS)
         self.linear = nn.Linear(in_dim, out_dim)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,9 @@ PATCHES = 6
 
 
 @pytest.fixture
-def kept(store: FolderStore, monkeypatch: pytest.MonkeyPatch) -> Callable[..., StoredPatches]:
+def stored_patches(
+    store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., StoredPatches]:
     """Stores photos in batches, each photo with a share of `bytes_in_all`; then opens them."""
     prefixes = iter(f"work/{number}/patches-" for number in range(100))
 
@@ -48,50 +50,54 @@ def rows(points: torch.Tensor) -> set[tuple[float, ...]]:
     return {tuple(point.tolist()) for point in points}
 
 
-def test_all_patches_are_kept_where_there_is_room(kept: Callable[..., StoredPatches]) -> None:
-    found = kept(photos(), batch=4)
+def test_all_patches_are_kept_where_there_is_room(
+    stored_patches: Callable[..., StoredPatches],
+) -> None:
+    found = stored_patches(photos(), batch=4)
     assert len(found) == PHOTOS * PATCHES
     assert rows(found.read(0, len(found))) == rows(torch.cat(photos()))
 
 
-def test_any_piece_can_be_read(kept: Callable[..., StoredPatches]) -> None:
-    found = kept(photos(), batch=3)
+def test_any_piece_can_be_read(stored_patches: Callable[..., StoredPatches]) -> None:
+    found = stored_patches(photos(), batch=3)
     whole = found.read(0, len(found))
     for begin in range(len(found)):
         for end in range(begin + 1, len(found) + 1):
             assert torch.equal(found.read(begin, end), whole[begin:end])
 
 
-def test_photos_share_the_room_equally(kept: Callable[..., StoredPatches]) -> None:
-    found = kept(photos(), batch=4, bytes_in_all=PHOTOS * 2 * WIDTH * 4)
+def test_photos_share_the_room_equally(stored_patches: Callable[..., StoredPatches]) -> None:
+    found = stored_patches(photos(), batch=4, bytes_in_all=PHOTOS * 2 * WIDTH * 4)
     assert len(found) == PHOTOS * 2
     for number, photo in enumerate(photos()):
         assert rows(found.read(2 * number, 2 * number + 2)) <= rows(photo)
 
 
 def test_what_is_kept_depends_on_the_seed_and_not_on_the_batches(
-    kept: Callable[..., StoredPatches],
+    stored_patches: Callable[..., StoredPatches],
 ) -> None:
     little = PHOTOS * 3 * WIDTH * 4
-    first = kept(photos(), batch=1, bytes_in_all=little)
-    other = kept(photos(), batch=4, bytes_in_all=little)
+    first = stored_patches(photos(), batch=1, bytes_in_all=little)
+    other = stored_patches(photos(), batch=4, bytes_in_all=little)
     assert torch.equal(first.read(0, len(first)), other.read(0, len(other)))
-    seeded = kept(photos(), batch=4, seed=1, bytes_in_all=little)
+    seeded = stored_patches(photos(), batch=4, seed=1, bytes_in_all=little)
     assert not torch.equal(first.read(0, len(first)), seeded.read(0, len(seeded)))
 
 
 def test_patches_that_no_centre_can_describe_are_left_out(
-    kept: Callable[..., StoredPatches],
+    stored_patches: Callable[..., StoredPatches],
 ) -> None:
     flat, odd, *good = photos()[:4]
     odd[2], odd[3] = torch.nan, torch.inf
-    found = kept([torch.zeros_like(flat), odd, *good], batch=3)
+    found = stored_patches([torch.zeros_like(flat), odd, *good], batch=3)
     assert len(found) == 2 * PATCHES + PATCHES - 2
     assert bool(torch.isfinite(found.read(0, len(found))).all())
 
 
-def test_photos_of_different_sizes_are_kept_together(kept: Callable[..., StoredPatches]) -> None:
-    found = kept([unit_points(1, 3, WIDTH), unit_points(2, 5, WIDTH)], batch=2)
+def test_photos_of_different_sizes_are_kept_together(
+    stored_patches: Callable[..., StoredPatches],
+) -> None:
+    found = stored_patches([unit_points(1, 3, WIDTH), unit_points(2, 5, WIDTH)], batch=2)
     assert len(found) == 8
 
 

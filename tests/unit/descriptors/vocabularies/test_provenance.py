@@ -44,7 +44,7 @@ def test_what_makes_local_features_is_part_of_the_spec_of_their_descriptors(
     assert feature_provenance(tiny).items() <= tiny.spec(centres()).items()
 
 
-def test_a_vocabulary_of_the_same_features_fits_whatever_else_is_said(tiny: Extractor) -> None:
+def test_a_vocabulary_of_the_same_features_fits_with_any_other_metadata(tiny: Extractor) -> None:
     check_vocabulary_fits(
         {**feature_provenance(tiny), "photos": 3, "note": "mine"}, centres(), tiny
     )

@@ -321,3 +321,26 @@ def test_another_networks_weights_are_refused(no_network: Path) -> None:
         with pytest.raises(Misconfigured) as refused:
             build_vpr_model(config(pretrained=True), weights=no_network / name)
         assert refused.value.code == "weights_unfit"
+
+
+@pytest.mark.parametrize("name", ["dinov2_vits14", "swin_t"])
+def test_the_final_norm_can_be_left_out(name: str) -> None:
+    size = {"image_size": (56, 56)}
+    whole = laid_out(backbone_arch=name, **size)
+    bare = laid_out(backbone_arch=name, backbone_norm=False, **size)
+    left_out = whole.state_dict().keys() - bare.state_dict().keys()
+    assert left_out == {"backbone.norm.weight", "backbone.norm.bias"}
+
+
+def test_a_backbone_without_a_final_norm_is_refused_without_it() -> None:
+    with pytest.raises(Unprocessable, match="resnet18 has no final norm") as caught:
+        config(backbone_norm=False)
+    assert caught.value.code == "bad_model_config"
+
+
+def test_the_field_of_the_norm_is_stored_only_if_the_norm_is_left_out() -> None:
+    """Otherwise all fingerprints of earlier models would change."""
+    assert "backbone_norm" not in config().model_dump()
+    stored = config(backbone_arch="swin_t", backbone_norm=False).model_dump(mode="json")
+    assert stored["backbone_norm"] is False
+    assert not VprModelConfig.parse(stored).backbone_norm

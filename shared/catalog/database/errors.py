@@ -7,6 +7,7 @@ constraint, is raised unchanged.
 from __future__ import annotations
 
 import logging
+import re
 
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -23,6 +24,11 @@ POSTGRES_DAMAGED = ("XX001", "XX002")
 DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
 """Prefixes of the names of SQLite errors that mean a damaged file."""
 FULL_RETRY_SECONDS = 60
+# In messages of connections that fail, for which libpq gives no SQLSTATE.
+PERMANENT_FAILURES = re.compile(
+    "authentication failed|does not exist|no pg_hba.conf entry|not permitted to log in|"
+    "permission denied|no password supplied"
+)
 
 
 def get_sqlstate(error: BaseException) -> str | None:
@@ -72,6 +78,31 @@ def to_unavailable(error: BaseException) -> Unavailable | None:
             "catalog_unavailable", "The catalog is unreachable. Try again in a moment."
         )
     return None
+
+
+def explain_outage(error: BaseException) -> Unavailable | None:
+    """Convert a database error as `to_unavailable` does, with the details for an operator.
+
+    The detail of `catalog_unavailable` names the host, the database and the driver's reason, and
+    says whether the failure passes by itself. Responses to clients must not contain it.
+    """
+    unavailable = to_unavailable(error)
+    if unavailable is None or unavailable.code != "catalog_unavailable":
+        return unavailable
+    advice = (
+        "This will not pass by itself: correct DATABASE_URL, or the users and the pg_hba.conf of "
+        "the server."
+        if is_permanent(error)
+        else "This may pass: the server may be starting, overloaded or disconnected. If it lasts, "
+        "check the host and the port in DATABASE_URL."
+    )
+    reason = reason_of(error).rstrip(".")
+    return Unavailable("catalog_unavailable", f"The catalog is unreachable: {reason}. {advice}")
+
+
+def is_permanent(error: BaseException) -> bool:
+    """Return whether a connection fails until somebody changes the settings or the server."""
+    return PERMANENT_FAILURES.search(reason_of(error)) is not None
 
 
 def _catalog_busy_error(reason: str) -> Unavailable:

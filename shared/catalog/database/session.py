@@ -1,6 +1,6 @@
 """Database sessions: SQLite engine, pool and timeout settings, transactions and their retries.
 
-`shared.catalog.postgres` has the engine for PostgreSQL.
+`shared.catalog.database.postgres` has the engine for PostgreSQL.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
-from shared.catalog.base import SQLITE_DISTANCE_FUNCTION
-from shared.catalog.database_errors import ROLLBACK_SQLSTATES, get_sqlstate
+from shared.catalog.database.base import SQLITE_DISTANCE_FUNCTION
+from shared.catalog.database.errors import ROLLBACK_SQLSTATES, get_sqlstate
 from shared.config.settings import Settings
 from shared.geodesy import distance_m
 
@@ -102,7 +102,7 @@ class Catalog:
     `read()` opens a read-only session on a consistent snapshot; `write()` commits at the end of its
     block and rolls back when it raises; `run(unit)` is a `write()` that is retried after a
     deadlock. Objects stay readable after the block. Database errors raise SQLAlchemyError;
-    `shared.catalog.database_errors` tells which of them are outages.
+    `shared.catalog.database.errors` tells which of them are outages.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Catalog:
             event.listen(self.engine, "begin", _begin_sqlite)
         else:
             # Imported here, because psycopg takes a while to load.
-            from shared.catalog.postgres import make_postgres_engine
+            from shared.catalog.database.postgres import make_postgres_engine
 
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)

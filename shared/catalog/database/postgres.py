@@ -15,11 +15,12 @@ from psycopg.abc import RV, PQGen
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
 
-from shared.catalog.session import PoolConfig, TransactionTimeouts
+from shared.catalog.database.session import PoolConfig, TransactionTimeouts
 
 # Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
 ANSWER_MARGIN_SECONDS = 2.0
 PING_TIMEOUT_SECONDS = 2.0
+DEFAULT_PORT = 5432
 
 # Detects a peer that disappeared without closing the connection (lost network or machine).
 TCP_KEEPALIVE_OPTIONS = {
@@ -79,7 +80,12 @@ def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
     }
 
     def connect() -> TimeoutConnection:
-        return TimeoutConnection.connect(prepare_threshold=None, **arguments)
+        try:
+            return TimeoutConnection.connect(prepare_threshold=None, **arguments)
+        except psycopg.OperationalError as error:
+            # libpq names neither the database nor, for some failures, the host.
+            target = f"database {url.database} at {url.host}:{url.port or DEFAULT_PORT}"
+            raise type(error)(f"{target}: {error}") from error
 
     return connect
 

@@ -22,15 +22,21 @@ from pathlib import Path
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from shared.catalog.database_errors import DAMAGED, get_sqlstate, reason_of, to_unavailable
-from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.catalog.database.errors import (
+    DAMAGED,
+    explain_outage,
+    get_sqlstate,
+    is_permanent,
+    reason_of,
+)
+from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.config.disk_space import RELEASE_BELOW_BYTES
 from shared.config.private_files import FILE_MODE, make_private_folder
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 
 log = logging.getLogger(__name__)
 
-MIGRATIONS = Path(__file__).parent / "migrations"
+MIGRATIONS = Path(__file__).parent.parent / "migrations"
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
 # While a migration waits for a table's exclusive lock, all later statements on the table wait, too:
@@ -66,7 +72,7 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
         else:
             _migrate_postgres(catalog, time.monotonic() + timeout_seconds)
     except SQLAlchemyError as error:
-        unavailable = to_unavailable(error)
+        unavailable = explain_outage(error)
         if unavailable is None:
             raise
         raise unavailable from error
@@ -109,7 +115,8 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
     An SQLite catalog, which only processes of one machine share, is migrated instead.
 
     Raises:
-        Unavailable: The catalog is not reachable after `seconds`.
+        Unavailable: The catalog is not reachable after `seconds`; at once if that will not change,
+            as after a wrong password.
         Misconfigured: As `check_schema` raises, after `seconds`; `schema_too_new` at once.
     """
     if catalog.is_sqlite:
@@ -121,11 +128,11 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
             check_schema(catalog)
             return
         except (Misconfigured, SQLAlchemyError) as error:
-            reason = to_unavailable(error) or error
-            is_permanent = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
+            reason = explain_outage(error) or error
+            too_new = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
             if not isinstance(reason, PlacewiseError):
                 raise
-            if is_permanent or time.monotonic() > deadline:
+            if too_new or is_permanent(error) or time.monotonic() > deadline:
                 raise reason from error
             if not has_warned:
                 has_warned = True
@@ -290,7 +297,7 @@ def _to_misconfigured(path: Path, error: SQLAlchemyError) -> Misconfigured | Non
     if name.startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY", "SQLITE_PERM", "SQLITE_AUTH")):
         return _unreadable_error(path)
     if name.startswith("SQLITE_IOERR"):
-        unavailable = to_unavailable(error)
+        unavailable = explain_outage(error)
         assert unavailable is not None
         return Misconfigured(unavailable.code, f"{path}: {unavailable.detail}")
     return None

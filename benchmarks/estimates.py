@@ -1,0 +1,250 @@
+"""Place estimates: how many queries are answered, how many answers are right, how well calibrated.
+
+    placewise bench estimates FOLDER... [--splits 5]
+
+Each folder is an evaluation set with coordinates or place labels; labels with a slash are paths. It
+is described by the default extractor, with a vocabulary fitted on its database photos. The place
+model is fitted on the database photos only, as that of a live map is, and judged
+
+- on the set's queries;
+- on random splits: of all photos, as many as the set has queries become queries, so that a query
+  has the same neighbours as a photo of the map;
+- on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
+  four times: how many of the photos of these labels get an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import Report
+from services.cli.environment import read_settings
+from services.cli.output import Table
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.open_dataset import open_evaluation_set
+from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.place_fit import PlaceSample, fit_place_model
+from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_probability import PlaceEstimate
+from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.place_paths import label_levels
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+CERTAINTY = 0.95
+LEFT_OUT_GROUPS = 4
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescribedPhotos:
+    """All photos of a set with their descriptors."""
+
+    name: str
+    rows: NDArray[np.float32]
+    """(n, D)"""
+    locations: Sequence[PhotoLocation]
+    captured_at: Sequence[datetime | None]
+    is_query: Mask
+    """(n,) which photos are queries in the published split"""
+    scheme: LevelScheme
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """An estimate and whether each of its levels is right; None where the truth does not say."""
+
+    estimate: PlaceEstimate
+    is_right: Sequence[bool | None]
+
+    @property
+    def is_answer_right(self) -> bool | None:
+        return None if self.estimate.answer is None else self.is_right[self.estimate.answer]
+
+
+def measure(progress: Progress, *, folders: Sequence[Path], splits: int) -> Report:
+    """Measure the estimates of evaluation sets."""
+    report = Report(f"estimates at certainty {CERTAINTY}")
+    for folder in folders:
+        photos = describe_set(folder, progress)
+        bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
+        published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
+        add_answers(report, f"{photos.name}, its queries", published)
+        add_reliability(report, f"{photos.name}, its queries", published)
+        progress.advance(bar)
+        drawn: list[Judged] = []
+        for seed in range(splits):
+            chosen = np.zeros(len(photos.rows), dtype=bool)
+            rng = np.random.default_rng(seed)
+            chosen[rng.choice(len(chosen), photos.is_query.sum(), replace=False)] = True
+            drawn += fit_and_judge(photos, ~chosen, chosen)
+            progress.advance(bar)
+        if drawn:
+            add_answers(report, f"{photos.name}, {splits} random splits", drawn)
+            add_reliability(report, f"{photos.name}, {splits} random splits", drawn)
+        left_out = []
+        for missing in left_out_labels(photos):
+            in_map = ~photos.is_query & ~missing
+            left_out += fit_and_judge(photos, in_map, missing)
+            progress.advance(bar)
+        if left_out:
+            add_left_out(report, f"{photos.name}, labels left out", left_out)
+    return report
+
+
+def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
+    """Describe an evaluation set as a new map would be."""
+    # Decoder processes import the program, and their memory limit leaves no room for torch.
+    from services.cli.evaluation.describers import extractor_describer
+    from shared.evaluation.ranking import describe_to_matrix
+
+    settings = read_settings()
+    dataset = open_evaluation_set(folder)
+    photos = [*dataset.database, *dataset.queries]
+    describer = extractor_describer(
+        settings.new_map_extractor, None, dataset, settings, progress, fit=True
+    )
+    with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
+        matrix = np.array(rows)
+    return described_photos(dataset.name, photos, matrix, len(dataset.database))
+
+
+def described_photos(
+    name: str, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32], database: int
+) -> DescribedPhotos:
+    """Join photos, of which the first `database` are no queries, with their descriptors."""
+    settings = read_settings()
+    is_path = any("/" in (photo.place or "") for photo in photos)
+    return DescribedPhotos(
+        name,
+        rows,
+        [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
+        [photo.captured_at for photo in photos],
+        np.arange(len(photos)) >= database,
+        LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
+        settings.estimate_radius_m,
+    )
+
+
+class TrialMap:
+    """A map of some of the photos of a set, searched in memory.
+
+    Args:
+        photos: The set.
+        in_map: (n,) which of its photos are in the map.
+    """
+
+    def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
+        self.members = np.flatnonzero(in_map).tolist()
+        self._photos = photos
+        self._rows = photos.rows[self.members]
+        scores = self._rows @ self._rows.T
+        self.locations = [photos.locations[index] for index in self.members]
+        self.own_photos = OwnPhotoSampler(
+            self.locations,
+            [photos.captured_at[index] for index in self.members],
+            photos.scheme,
+            photos.radius_m,
+            lambda photo: _rank(scores[photo], without=photo),
+        )
+
+    def own_samples(self) -> tuple[list[PlaceSample], float]:
+        """Return the samples of the map's photos, and their unit of score differences."""
+        own = range(len(self.members))
+        spread = self.own_photos.spread(own)
+        return list(self.own_photos.samples(own, spread)), spread
+
+    def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
+        """Return the ranking of a photo of the set, and that of the best photo in it."""
+        found, scores = _rank(self._rows @ self._photos.rows[query])
+        ranking = [
+            RankedPhoto(score, self.locations[index], index)
+            for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
+        ]
+        return ranking, self.own_photos.neighbours(int(found[0]))
+
+
+def fit_and_judge(photos: DescribedPhotos, in_map: Mask, queries: Mask) -> list[Judged]:
+    """Fit the model of a map of some of the photos, and estimate the places of others."""
+    trial = TrialMap(photos, in_map)
+    samples, spread = trial.own_samples()
+    model = fit_place_model(samples, [], photos.scheme, spread).model
+    judged = []
+    for query in np.flatnonzero(queries).tolist():
+        estimate = model.estimate(*trial.search(query), photos.scheme, CERTAINTY, photos.radius_m)
+        if estimate is not None:
+            truth = photos.locations[query]
+            judged.append(Judged(estimate, [level.is_right(truth) for level in estimate.levels]))
+    return judged
+
+
+def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
+    """Yield the (n,) masks of the photos of each group of second coarsest labels."""
+    paths = [label_levels(p.place, photos.scheme.labels_are_paths) for p in photos.locations]
+    labels = np.array([path[-2] if len(path) > 1 else "" for path in paths])
+    names = sorted({*labels.tolist()} - {""})
+    for group in range(LEFT_OUT_GROUPS if len(names) > LEFT_OUT_GROUPS else 0):
+        yield np.isin(labels, names[group::LEFT_OUT_GROUPS])
+
+
+def add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the shares of answers, and of right ones among them, in %."""
+    answered = [j for j in judged if j.estimate.answer is not None]
+    finest = [j for j in answered if j.estimate.answer == 0]
+    report.add(f"{what}: answered", 100 * len(answered) / len(judged), "%", at_least=60)
+    report.add(f"{what}: right", _right_percent(answered), "%", at_least=100 * CERTAINTY)
+    report.add(
+        f"{what}: answered at the finest level", 100 * len(finest) / len(judged), "%", at_least=40
+    )
+    report.add(f"{what}: right there", _right_percent(finest), "%", at_least=100 * CERTAINTY)
+
+
+def add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the ECE of each level, and show the mean of stated and of observed probabilities."""
+    table = Table("level", "stated", "observed", "ECE", title=what)
+    for position in range(max(len(j.is_right) for j in judged)):
+        known = [
+            (j.estimate.probabilities[position], right)
+            for j in judged
+            if position < len(j.is_right) and (right := j.is_right[position]) is not None
+        ]
+        stated, observed = [p for p, _ in known], [right for _, right in known]
+        error = expected_calibration_error(stated, observed)
+        means = (float(np.mean(stated)), float(np.mean(observed)), error)
+        table.add_row(str(position), *(f"{value:.3f}" for value in means))
+        report.add(f"{what}: ECE of level {position}", error, at_most=0.05)
+    report.tables.append(table)
+
+
+def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the shares of photos that get an answer although their label is not in the map."""
+    finest = [j.estimate.answer == 0 for j in judged]
+    wrong = [j.is_answer_right is False for j in judged]
+    report.add(
+        f"{what}: answered at the finest level",
+        100 * float(np.mean(finest)),
+        "%",
+        at_most=100 * (1 - CERTAINTY),
+    )
+    report.add(f"{what}: wrong at any level", 100 * float(np.mean(wrong)), "%")
+
+
+def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanking:
+    order = np.argsort(-scores, kind="stable")
+    order = order[order != without] if without is not None else order
+    return order, scores[order].astype(np.float64)
+
+
+def _right_percent(judged: Sequence[Judged]) -> float:
+    known = [right for j in judged if (right := j.is_answer_right) is not None]
+    return 100 * float(np.mean(known)) if known else 100.0

@@ -1,0 +1,328 @@
+"""The checks of `placewise doctor`.
+
+Each check is a function of the settings that returns a summary, or raises a PlacewiseError whose
+`detail` says what is wrong and what to do. This module contains the checks of the embedded
+installation and of the extractor (device, memory, weights); `deployment_checks` contains those of
+separate services, `store_checks` those of the object store.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+from sqlalchemy import func, select
+from sqlalchemy.exc import SQLAlchemyError
+
+from placewise.client import Client
+from services.cli.operations.deployment_checks import (
+    check_gateway,
+    check_object_store,
+    check_postgres,
+    check_processes,
+    check_redis,
+    check_search,
+    check_steward,
+)
+from services.cli.operations.store_checks import collection_check, permissions_check
+from shared.catalog.database.errors import explain_outage
+from shared.catalog.database.schema import check_pages, check_schema
+from shared.catalog.photos import Photo
+from shared.catalog.tables import open_catalog
+from shared.config.embedded_home import find_running_server
+from shared.config.settings import Settings, memory_limit_bytes
+from shared.errors import Misconfigured
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, ExtractorConfig
+from shared.journal.outbox import catalog_lag
+from shared.storage.open_store import open_store
+
+BYTES_PER_PARAMETER = 4  # float32
+# Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
+# the next batch is decoded meanwhile. Larger photos go through in smaller batches.
+BYTES_PER_BATCH_PHOTO = 40_000_000
+PROCESS_OVERHEAD_BYTES = 1_000_000_000  # PyTorch or the CUDA context, without weights
+
+
+Check = Callable[[Settings], str]
+
+
+def list_checks(settings: Settings, server: str | None, key: str | None) -> list[tuple[str, Check]]:
+    """Return the checks of this installation, each with the name of the part that it checks.
+
+    Args:
+        settings: The settings, which decide what an installation has.
+        server: URL of a gateway that is checked as well.
+        key: API key for that gateway.
+    """
+    checks: list[tuple[str, Check]] = [("python", _check_python)]
+    checks.append(("settings", _check_settings))
+    if settings.s3_endpoint is None or settings.database_url is None:
+        checks.append(("folder", _check_home))  # other services need no writable folder
+        checks.append(("permissions", permissions_check))
+    if settings.s3_endpoint is None:
+        checks.append(("uploads", _check_upload_dir))
+    else:
+        checks.append(("objects", check_object_store))
+    checks.append(("collection", collection_check))
+    checks.append(("journal", _check_journal))
+    if settings.database_url is None:
+        checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
+    else:
+        checks += [
+            ("postgresql", check_postgres),
+            ("redis", check_redis),
+            ("search", check_search),
+            ("gateways", partial(check_processes, role="gateway")),
+            ("extractors", partial(check_processes, role="extractor")),
+            ("stewards", check_steward),
+        ]
+    if server is not None:
+        checks.append(("gateway", lambda _: check_gateway(server, key)))
+    checks += [("device", check_device), ("memory", check_memory), ("extractor", check_extractor)]
+    return checks
+
+
+def check_device(settings: Settings) -> str:
+    """Report the device and the precision that new generations use."""
+    import torch
+
+    from shared.descriptors.extractor import choose_device
+    from shared.descriptors.inference import choose_precision
+
+    device = choose_device(settings.device)
+    precision_note = (
+        "precision of new generations: "
+        f"{choose_precision(settings.precision, _default_extractor_config(settings), device)}"
+    )
+    if device.type == "cuda":
+        name = torch.cuda.get_device_name(device)
+        return f"CUDA: {name}, PyTorch {torch.__version__}, {precision_note}"
+    has_cuda = torch.cuda.is_available()
+    return f"CPU, PyTorch {torch.__version__} (CUDA available: {has_cuda}), {precision_note}"
+
+
+def check_memory(settings: Settings) -> str:
+    """Estimate whether the default extractor fits into the memory of its device.
+
+    Raises:
+        Misconfigured: `memory_short`.
+    """
+    import torch
+
+    from shared.descriptors.extractor import choose_device
+    from shared.descriptors.inference import DEFAULT_PHOTO_PIXELS
+    from shared.imaging.preprocessing import get_preprocessing
+
+    config = _default_extractor_config(settings)
+    if config.parameters is None or config.preprocessing is None:
+        return f"the size of {config.name} is unknown until it is loaded"
+    device = choose_device(settings.device)
+    if device.type == "cuda":
+        available, owner = torch.cuda.get_device_properties(device).total_memory, "the GPU"
+    else:
+        available, owner = memory_limit_bytes(), "this machine"
+    weights = config.parameters * BYTES_PER_PARAMETER
+    # A single photo is never split, however many pixels its preprocessing produces.
+    min_batch = math.ceil(get_preprocessing(config.preprocessing).max_pixels / DEFAULT_PHOTO_PIXELS)
+    batch = max(settings.batch_photos, min_batch) * BYTES_PER_BATCH_PHOTO
+    needed = PROCESS_OVERHEAD_BYTES + weights + batch
+    estimate = (
+        f"{config.name} requires about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, "
+        f"a batch of {settings.batch_photos} photos {batch / 1e9:.1f}), "
+        f"{owner} has {available / 1e9:.1f} GB"
+    )
+    if needed <= available:
+        return estimate
+    remedies = []
+    if (
+        settings.batch_photos > min_batch
+        and PROCESS_OVERHEAD_BYTES + weights + min_batch * BYTES_PER_BATCH_PHOTO <= available
+    ):
+        remedies.append(f"BATCH_PHOTOS below {settings.batch_photos}")
+    if config.depth is not None:
+        remedies.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
+    if min_batch > 1:
+        remedies.append("EXTRACTOR with the preprocessing square224")
+    if device.type == "cuda":
+        remedies.append("DEVICE=cpu")
+    raise Misconfigured(
+        "memory_short", f"{estimate}. Set {', or '.join(remedies) or 'more memory'}."
+    )
+
+
+def check_extractor(settings: Settings) -> str:
+    """Check that the weights of the default extractor are available.
+
+    DINOv2 weights (up to 4.5 GB) are inspected without loading them; others are loaded.
+
+    Raises:
+        Misconfigured: The weights are missing or don't fit the extractor.
+    """
+    config = _default_extractor_config(settings)
+    if config.depth is not None:
+        return _check_dinov2(config, settings.dino_weights)
+    if config.hub is not None:
+        from shared.descriptors.backbones.torchhub import find_local_code
+
+        find_local_code(config.hub)
+    from services.cli.descriptors.local_extractor import load_extractor
+
+    extractor = load_extractor(config, settings)
+    shipped = extractor.shipped_vocabulary()
+    return f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
+        f"shipped vocabulary of {shipped[0].clusters} centres"
+        if shipped
+        else "no shipped vocabulary"
+    )
+
+
+def _check_dinov2(config: ExtractorConfig, weights: Path | None) -> str:
+    from shared.descriptors.backbones.dinov2 import check_dinov2_weights
+    from shared.descriptors.backbones.dinov2_weights import find_local_weights, open_weights
+
+    assert config.layer is not None
+    assert config.facet is not None
+    size = config.backbone.removeprefix("dinov2-")
+    path = find_local_weights(size, weights)
+    check_dinov2_weights(size, config.layer, config.facet, open_weights(path, size))
+    return (
+        f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
+        "vocabulary: photos are described once one is fitted or imported"
+    )
+
+
+def _default_extractor_config(settings: Settings) -> ExtractorConfig:
+    return settings.extractor_config(settings.new_map_extractor)
+
+
+MIN_FREE_DISK_BYTES = 1_000_000_000
+
+
+def _check_python(_settings: Settings) -> str:
+    return f"Python {sys.version.split()[0]}"
+
+
+def _check_settings(settings: Settings) -> str:
+    """Report the settings; they are valid, or no check would run."""
+    if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
+        raise Misconfigured(
+            "otel_missing",
+            "OTEL_EXPORTER_OTLP_ENDPOINT is set, but the extra otel is not installed. Install it "
+            "(uv pip install '.[otel]') or unset the variable.",
+        )
+    return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # the parent package is missing
+        return False
+
+
+def _check_home(settings: Settings) -> str:
+    home = settings.placewise_home
+    existing = next(folder for folder in (home, *home.parents) if folder.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "no write permission for this user", str(existing))
+    free = shutil.disk_usage(existing).free
+    if free < MIN_FREE_DISK_BYTES:
+        raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(existing))
+    state = "is writable" if existing == home else "does not exist yet and can be created"
+    return f"{home} {state}, {free / 1e9:.0f} GB free"
+
+
+def _check_upload_dir(settings: Settings) -> str:
+    folder = settings.upload_dir
+    if folder is None:
+        return "originals are stored in PLACEWISE_HOME"
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "UPLOAD_DIR: no write permission for this user", str(existing))
+    return f"UPLOAD_DIR {folder} is writable"
+
+
+def _check_journal(settings: Settings) -> str:
+    """Check that the catalog contains every change recorded in the object store's journal."""
+    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
+        return "nothing is stored yet"
+    catalog = open_catalog(settings, "doctor")
+    try:
+        check_schema(catalog)
+        lag = catalog_lag(catalog, open_store(settings, exclusive=False))
+    except SQLAlchemyError as error:
+        raise explain_outage(error) or Misconfigured(
+            "catalog_unreadable",
+            f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
+            "restore it from a backup.",
+        ) from error
+    finally:
+        catalog.close()
+    if lag is not None:
+        raise Misconfigured("catalog_behind", lag.detail)
+    return "the catalog is up to date with the object store"
+
+
+def _check_vocabulary(settings: Settings) -> str:
+    running = find_running_server(settings.placewise_home)
+    if running is None:
+        return "checked only while a server runs"
+    with Client(running.url, key=running.key) as client:
+        maps = client.maps()
+    waiting = [m for m in maps if m.photos and m.generation_id is None]
+    if waiting:
+        names = ", ".join(f"{m.name} ({m.photos} photos)" for m in waiting)
+        raise Misconfigured(
+            "vocabulary_missing",
+            f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
+            "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
+            "photos were uploaded just now.",
+        )
+    provisional = [m.name for m in maps if m.vocabulary == "provisional"]
+    if provisional:
+        return (
+            f"vocabulary fitted on too few photos in {', '.join(provisional)}: fit another with "
+            f"`placewise vocabulary fit` when the map has {MIN_PHOTOS_TO_FIT} photos"
+        )
+    foreign = [m.name for m in maps if m.vocabulary == "foreign"]
+    if foreign:
+        return (
+            f"foreign vocabulary in {', '.join(foreign)}: fit one with `placewise vocabulary fit`"
+        )
+    return "no map uses a foreign vocabulary"
+
+
+def _check_server(settings: Settings) -> str:
+    running = find_running_server(settings.placewise_home)
+    if running is not None:
+        check_gateway(running.url, running.key)
+        with Client(running.url, key=running.key) as client:
+            maps = client.maps()
+        searchable, stored = sum(m.searchable for m in maps), sum(m.photos for m in maps)
+        names = ", ".join(m.name for m in maps)
+        return f"running on {running.url}: {searchable} of {stored} photos searchable ({names})"
+    if not (settings.placewise_home / "catalog.sqlite").exists():
+        return "not running, nothing is stored yet (start it with make run)"
+    catalog = open_catalog(settings, "doctor")
+    try:
+        check_pages(catalog, max_bytes=None)
+        with catalog.read() as session:
+            photos = session.scalar(
+                select(func.count()).select_from(Photo).where(Photo.deleted_at.is_(None))
+            )
+    except SQLAlchemyError as error:
+        raise Misconfigured(
+            "catalog_unreadable",
+            f"The catalog in {settings.placewise_home} can't be read ({type(error).__name__}). "
+            "Check its permissions, or restore it from a backup.",
+        ) from error
+    finally:
+        catalog.close()
+    return f"not running; {photos} photos are stored (start it with make run)"

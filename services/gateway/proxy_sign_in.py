@@ -1,0 +1,98 @@
+"""Sign-in by a trusted proxy: a user's name and groups from the headers of its requests.
+
+A company's identity provider stays the business of a proxy such as oauth2-proxy. Only connections
+from SIGN_IN_PROXIES are believed, by the address of the connection itself and never by a header;
+the same headers from anybody else are ignored. Requests with an API key are authenticated by it,
+also through the proxy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from ipaddress import IPv4Network, IPv6Network, ip_address, ip_network
+
+from starlette.datastructures import Headers
+
+from services.gateway.authentication import (
+    Authenticator,
+    Caller,
+    check_same_origin,
+)
+from shared.config.settings import Settings
+from shared.errors import Unauthorized
+from shared.security.api_keys import Scope, expand_scopes
+
+ANY_GROUP = "*"
+MAX_USER_CHARACTERS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class ProxySignIn:
+    """Authenticates users whom a trusted proxy has signed in; others as `keys` does."""
+
+    keys: Authenticator
+    networks: tuple[IPv4Network | IPv6Network, ...]
+    """Networks of the trusted proxies."""
+    user_header: str
+    groups_header: str
+    scopes_by_group: dict[str, frozenset[Scope]]
+    """Scopes of each group; those of ANY_GROUP belong to every user."""
+    trusted_origins: tuple[str, ...] = ()
+
+    async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
+        """Return the user, or the caller of the request's key.
+
+        Raises:
+            Unauthorized: `proxy_user_invalid` for an empty, repeated or too long name; and as
+                `keys` raises.
+            Forbidden: `foreign_page` for a web page of another origin, whose requests a browser
+                sends with the cookie of the proxy.
+        """
+        if (
+            "authorization" in headers
+            or self.user_header not in headers
+            or not self._is_trusted(peer)
+        ):
+            return await self.keys.authenticate(headers, peer)
+        names = headers.getlist(self.user_header)
+        if len(names) != 1 or not 0 < len(names[0].strip()) <= MAX_USER_CHARACTERS:
+            raise Unauthorized(
+                "proxy_user_invalid",
+                f"The proxy's header {self.user_header} must have one name of at most "
+                f"{MAX_USER_CHARACTERS} characters. Let the proxy replace the header of the "
+                "client.",
+            )
+        check_same_origin(headers, self.trusted_origins)
+        groups = [
+            group.strip()
+            for value in headers.getlist(self.groups_header)
+            for group in value.split(",")
+        ]
+        scopes: set[Scope] = set()
+        for group in (*groups, ANY_GROUP):
+            scopes |= self.scopes_by_group.get(group, frozenset())
+        return Caller(f"user {names[0].strip()}", expand_scopes(scopes))
+
+    async def record_use(self, caller: Caller) -> None:
+        await self.keys.record_use(caller)
+
+    def _is_trusted(self, peer: str | None) -> bool:
+        try:
+            address = ip_address(peer or "")
+        except ValueError:  # no IP address: a Unix socket, or a test
+            return False
+        return any(address in network for network in self.networks)
+
+
+def with_proxy_sign_in(keys: Authenticator, settings: Settings) -> Authenticator:
+    """Return an authenticator that also accepts users of SIGN_IN_PROXIES, if that is set."""
+    if not settings.sign_in_networks:
+        return keys
+    return ProxySignIn(
+        keys,
+        tuple(map(ip_network, settings.sign_in_networks)),
+        settings.sign_in_user_header,
+        settings.sign_in_groups_header,
+        settings.sign_in_scopes_by_group,
+        settings.allowed_origins,
+    )

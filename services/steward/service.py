@@ -1,0 +1,70 @@
+"""Steward service process: a thread each for periodic tasks, evaluations, batches and webhooks."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+
+from prometheus_client import CollectorRegistry
+
+from services.service_process import Announce, service_process, start_service_thread
+from services.steward.batches.worker import BatchWorker
+from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.metrics import StewardMetrics
+from services.steward.scheduler import Scheduler
+from services.steward.webhooks import WebhookDispatcher
+from shared.catalog.installation import open_installation_store
+from shared.catalog.processes import process_heartbeat
+from shared.config.settings import Settings
+from shared.errors import Misconfigured
+from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
+from shared.search_api.client import HttpSearchClient
+from shared.telemetry.metrics_server import serve_metrics
+
+
+def serve_steward(settings: Settings, announce: Announce) -> None:
+    """Run all tasks of the steward until SIGTERM.
+
+    Raises:
+        Misconfigured: `search_missing`, `redis_missing`; `part_died` if a thread has crashed.
+    """
+    stop, failed = threading.Event(), threading.Event()
+
+    def on_crash() -> None:
+        failed.set()
+        stop.set()
+
+    with (
+        service_process(settings, "steward") as catalog,
+        process_heartbeat(catalog, "steward"),
+        contextlib.closing(CeleryWakeups(create_celery_app(settings), settings)) as wakeups,
+        HttpSearchClient.from_settings(settings) as search,
+    ):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        store = open_installation_store(catalog, settings, exclusive=False)
+        name = f"steward-{socket.gethostname()}-{os.getpid()}"
+        registry = CollectorRegistry()
+        metrics = StewardMetrics(registry)
+        batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
+        scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
+        evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
+        webhooks = WebhookDispatcher(catalog, settings)
+        threads = [
+            start_service_thread(thread_name, run, stop, on_crash)
+            for thread_name, run in (
+                ("evaluator", evaluator.run),
+                ("batches", batches.run),
+                ("webhooks", webhooks.run),
+                ("steward", scheduler.run),
+            )
+        ]
+        announce("Placewise steward is running")
+        with serve_metrics(settings, registry):
+            for thread in threads:
+                thread.join()
+    if failed.is_set():
+        raise Misconfigured("part_died", "A thread of the steward failed. See the log above.")

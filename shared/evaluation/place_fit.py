@@ -1,0 +1,231 @@
+"""Fits the probabilities of a map's place estimates to its own photos and labelled queries.
+
+Each regression is fitted by maximum a posteriori. The Gaussian prior is centred on the shipped
+coefficients: a small map stays near them, a large one follows its own photos.
+
+The samples are the map's own photos, each searched without itself, and *impostors*: the same photos
+searched as if the map had no photo of a place that shows them. Impostors have the total weight
+`OUT_OF_MAP_SHARE`: that share of queries from outside the map is assumed. Labelled queries, if
+there are enough, refine the coefficients, with those of the own photos as the prior. Thresholds are
+chosen on predictions of samples that the model was not fitted on (cross-validation).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.evaluation.place_levels import FEATURES, CandidateLevel, FloatArray, LevelScheme
+from shared.evaluation.place_probability import (
+    OUT_OF_MAP_SHARE,
+    Coefficients,
+    PlaceModel,
+    PlacePrior,
+    shipped_prior,
+    sigmoid,
+)
+from shared.evaluation.place_thresholds import CERTAINTIES, HeldOutEstimate, choose_thresholds
+
+MIN_OWN_PHOTOS = 20
+MIN_LABELLED_QUERIES = 40
+PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
+NEWTON_STEPS = 50
+FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceSample:
+    """The levels of the estimate for a photo whose location is known."""
+
+    photo: int
+    """number of the photo; samples of one photo are held out together"""
+    levels: Sequence[CandidateLevel]
+    """finest first, not empty"""
+    is_right: Sequence[bool | None]
+    """for each level; None if the truth does not say"""
+    left_out: str | None = None
+    """what was left out of the map to make the photo an impostor; None if it is none"""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedPlaceModel:
+    """A model with the held-out estimates that its thresholds were chosen on."""
+
+    model: PlaceModel
+    held_out: Sequence[HeldOutEstimate]
+    """labelled queries, or the map's own photos; empty for the prior"""
+    impostors: Sequence[HeldOutEstimate]
+
+
+def fit_place_model(
+    samples: Sequence[PlaceSample],
+    labelled: Sequence[PlaceSample],
+    scheme: LevelScheme,
+    spread: float,
+) -> FittedPlaceModel:
+    """Fit the model of a map.
+
+    Args:
+        samples: The map's own photos and their impostors.
+        labelled: Labelled queries, taken in another session than the photos that they match.
+        scheme: The levels of the map.
+        spread: Unit of score differences of the samples' features.
+
+    Returns:
+        The model; the prior with fewer than MIN_OWN_PHOTOS own photos and fewer than
+        MIN_LABELLED_QUERIES labelled queries.
+    """
+    own = sum(sample.left_out is None for sample in samples)
+    if len(labelled) < MIN_LABELLED_QUERIES:
+        labelled = ()
+    if own < MIN_OWN_PHOTOS and not labelled:
+        return FittedPlaceModel(PlaceModel(), [], [])
+    own_held_out, labelled_held_out = _predict_held_out(samples, labelled, scheme, spread)
+    impostors = [s for s in own_held_out if s.left_out is not None]
+    thresholds = tuple(
+        choose_thresholds(labelled_held_out or own_held_out, impostors, certainty)
+        for certainty in CERTAINTIES
+    )
+    model = _fit_coefficients(samples, labelled, scheme, spread).model_copy(
+        update={"thresholds": thresholds, "own_photos": own}
+    )
+    in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
+    return FittedPlaceModel(model, in_map, impostors)
+
+
+def _fit_coefficients(
+    samples: Sequence[PlaceSample],
+    labelled: Sequence[PlaceSample],
+    scheme: LevelScheme,
+    spread: float,
+) -> PlaceModel:
+    prior = shipped_prior()
+    positions = max((len(sample.levels) for sample in [*samples, *labelled]), default=0)
+    levels = []
+    for position in range(positions):
+        own = fit_map_estimate(_level_table(samples, position), prior.level)
+        levels.append(fit_map_estimate(_level_table(labelled, position), own))
+    return PlaceModel(
+        source="labelled_queries" if labelled else "own_photos",
+        scheme=scheme,
+        spread=spread,
+        levels=tuple(levels),
+        not_in_map=fit_map_estimate(not_in_map_table(samples), prior.not_in_map),
+        labelled_queries=len(labelled),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegressionTable:
+    """Samples of a logistic regression."""
+
+    features: FloatArray
+    """(n, F)"""
+    target: FloatArray
+    """(n,) 0 or 1"""
+    weights: FloatArray
+    """(n,)"""
+
+    @classmethod
+    def of_rows(cls, rows: Iterable[tuple[FloatArray, bool, float]]) -> RegressionTable:
+        """Make a table of (features, target, weight) rows."""
+        columns = list(zip(*rows, strict=True)) or [(), (), ()]
+        return cls(
+            np.array(columns[0], dtype=np.float64).reshape(-1, len(FEATURES)),
+            np.array(columns[1], dtype=np.float64),
+            np.array(columns[2], dtype=np.float64),
+        )
+
+
+def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTable:
+    weights = sample_weights(samples, OUT_OF_MAP_SHARE)
+    return RegressionTable.of_rows(
+        (sample.levels[position].features, right, weight)
+        for sample, weight in zip(samples, weights, strict=True)
+        if position < len(sample.levels) and (right := sample.is_right[position]) is not None
+    )
+
+
+def not_in_map_table(samples: Sequence[PlaceSample]) -> RegressionTable:
+    """Return the samples of "not in the map", half of them impostors by weight."""
+    weights = sample_weights(samples, 0.5)
+    return RegressionTable.of_rows(
+        (sample.levels[0].features, sample.left_out is not None, weight)
+        for sample, weight in zip(samples, weights, strict=True)
+    )
+
+
+def sample_weights(samples: Sequence[PlaceSample], share: float) -> list[float]:
+    """Weigh own photos 1, and impostors so that each kind has the same part of `share`."""
+    kinds = Counter(sample.left_out for sample in samples)
+    own = kinds.pop(None, 0)
+    total = own * share / (1 - share)
+    return [
+        1.0 if sample.left_out is None else total / len(kinds) / kinds[sample.left_out]
+        for sample in samples
+    ]
+
+
+def fit_map_estimate(
+    table: RegressionTable,
+    center: Coefficients,
+    prior: PlacePrior | None = None,
+    precision: float = PRIOR_PRECISION,
+) -> Coefficients:
+    """Fit a logistic regression by maximum a posteriori, with Newton's method.
+
+    Args:
+        table: The samples; without any, the result is `center`.
+        center: Mean of the Gaussian prior of the coefficients.
+        prior: Standardises the features; the shipped prior by default.
+        precision: Precision of the Gaussian prior of each coefficient.
+    """
+    design = (prior or shipped_prior()).design(table.features)
+    mean = np.array(center)
+    beta = mean.copy()
+
+    def loss(beta: FloatArray) -> float:
+        margin = np.where(table.target > 0.5, 1, -1) * (design @ beta)
+        fit = float(table.weights @ np.logaddexp(0.0, -margin))
+        return fit + precision / 2 * float(((beta - mean) ** 2).sum())
+
+    for _ in range(NEWTON_STEPS if len(design) else 0):
+        probability = sigmoid(design @ beta)
+        gradient = design.T @ (table.weights * (table.target - probability))
+        gradient -= precision * (beta - mean)
+        variance = table.weights * probability * (1 - probability)
+        hessian = (design.T * variance) @ design + precision * np.eye(len(beta))
+        step = np.linalg.solve(hessian, gradient)
+        # A full step may overshoot where the prior's predictions are extreme.
+        while loss(beta + step) > loss(beta) and float(np.abs(step).max()) > 1e-8:
+            step /= 2
+        beta += step
+        if float(np.abs(step).max()) < 1e-8:
+            break
+    return tuple(beta.tolist())
+
+
+def _predict_held_out(
+    samples: Sequence[PlaceSample],
+    labelled: Sequence[PlaceSample],
+    scheme: LevelScheme,
+    spread: float,
+) -> tuple[list[HeldOutEstimate], list[HeldOutEstimate]]:
+    """Predict the samples and the labelled queries by cross-validation."""
+    predicted: tuple[list[HeldOutEstimate], list[HeldOutEstimate]] = ([], [])
+    for fold in range(FOLDS):
+        own, queries = (
+            [s for s in each if s.photo % FOLDS != fold] for each in (samples, labelled)
+        )
+        model = _fit_coefficients(own, queries, scheme, spread)
+        for each, into in zip((samples, labelled), predicted, strict=True):
+            held_out = [s for s in each if s.photo % FOLDS == fold]
+            weights = sample_weights(held_out, OUT_OF_MAP_SHARE)
+            into += [
+                HeldOutEstimate(*model.probabilities(s.levels), s.is_right, s.left_out, weight)
+                for s, weight in zip(held_out, weights, strict=True)
+            ]
+    return predicted

@@ -1,0 +1,125 @@
+"""`GET /health` reports whether photos can be described, and uploads report what they wait for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import pytest
+
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.maps import get_map
+from shared.catalog.processes import RegisteredProcess, process_heartbeat
+from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import add_map, set_columns
+from tests.support.photos import photo_bytes
+
+ANYLOC = "anyloc-vits14:clusters=2,layer=0"
+
+
+def extractors(service: Service, status: int) -> Any:
+    return service.json("GET", "/health", status)["parts"]["extractors"]
+
+
+def register(service: Service, seconds_ago: float = 0, **state: Any) -> None:
+    with service.catalog.write() as session:
+        session.add(
+            RegisteredProcess(
+                role="extractor",
+                name="one",
+                release="1",
+                state=state or None,
+                seen_at=db_now_plus(-seconds_ago),
+            )
+        )
+
+
+def test_extractors_that_are_scaled_to_zero_are_healthy_until_a_job_is_overdue(
+    service: Service,
+) -> None:
+    assert extractors(service, 200)["processes"] == []
+    job_id = UUID(service.upload(photo_bytes(1))["job_id"])
+    assert extractors(service, 200)["status"] == "healthy"
+    set_columns(service.catalog, job_id, created_at=db_now_plus(-60))
+    part = extractors(service, 503)
+    assert part["status"] == "degraded"
+    assert "no extractor is running" in part["detail"]
+
+
+def test_health_is_degraded_when_every_extractor_was_killed(service: Service) -> None:
+    register(service, seconds_ago=60, device="cpu", models=["test-tiny-avg"], errors={})
+    assert extractors(service, 503)["processes"] == []
+    assert service.json("GET", "/database/stats")["device"] is None
+    register(service, device="cuda", models=["test-tiny-avg"], errors={})
+    part = extractors(service, 200)
+    assert [process["device"] for process in part["processes"]] == ["cuda"]
+    assert service.json("GET", "/database/stats")["device"] == "cuda"
+
+
+def test_a_new_extractor_replaces_the_killed_ones_in_the_registry(service: Service) -> None:
+    register(service, seconds_ago=60)
+    with process_heartbeat(service.catalog, "extractor"):
+        pass
+    assert extractors(service, 200)["status"] == "healthy"
+
+
+def test_health_ignores_load_errors_of_extractors_that_no_map_uses(service: Service) -> None:
+    register(service, device="cpu", models=[], errors={ANYLOC: "weights_missing"})
+    assert extractors(service, 200)["status"] == "healthy"
+    with service.catalog.write() as session:
+        add_map(session, "other", ANYLOC)
+    part = extractors(service, 503)
+    assert part["processes"][0]["errors"] == {ANYLOC: "weights_missing"}
+    assert part["detail"].startswith(f"{ANYLOC} can't be loaded (weights_missing)")
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path of DINO_WEIGHTS, where no file exists yet; before the settings are read."""
+    path = tmp_path / "dinov2_vits14_pretrain.pth"
+    monkeypatch.setenv("DINO_WEIGHTS", str(path))
+    return path
+
+
+def test_a_worker_reports_missing_weights_until_the_model_is_loaded(
+    weights: Path, service: Service
+) -> None:
+    from shared.descriptors.backbones.dinov2 import SHAPES
+    from tests.support.vit import random_weights, save
+
+    with service.catalog.write() as session:
+        get_map(session, "default").extractor = ANYLOC
+    uploaded = service.upload(photo_bytes(1))
+    service.drain()
+    assert service.worker.state() == {
+        "device": "cpu",
+        "models": [],
+        "errors": {ANYLOC: "weights_missing"},
+    }
+    waited = service.json(
+        "POST",
+        "/upload",
+        files={"file": ("photo.jpg", photo_bytes(1))},
+        headers={"Prefer": "wait=0.1"},
+    )
+    assert waited["job_id"] == uploaded["job_id"]
+    assert "Describing it failed" in waited["message"], waited["message"]
+
+    save(random_weights(SHAPES["vits14"], blocks=1), weights)
+    set_columns(service.catalog, UUID(uploaded["job_id"]), run_after=None)
+    service.drain()
+    assert service.worker.state()["errors"] == {}
+    assert service.worker.state()["models"] == [ANYLOC]
+    assert extractors(service, 200)["waiting_for_vocabulary"] == ["default"]
+    waited = service.json(
+        "POST",
+        "/upload",
+        202,
+        files={"file": ("photo.jpg", photo_bytes(2))},
+        headers={"Prefer": "wait=0.1"},
+    )
+    assert waited["message"].endswith("described in the background.")
+    service.drain()
+    again = service.json("POST", "/upload", files={"file": ("photo.jpg", photo_bytes(2))})
+    assert again["message"].endswith("Its job is waiting for vocabulary.")

@@ -1,0 +1,52 @@
+"""`placewise maps`: the labels of a map."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from typer.testing import CliRunner
+
+from services.cli.maps import app
+from tests.support.api_responses import TIME
+from tests.unit.client.test_client import running_server
+
+MAP: dict[str, Any] = {
+    "name": "tower",
+    "extractor": "efficientnet-lite0-vlad128",
+    "version": 0,
+    "photos": 0,
+    "searchable": 0,
+    "labelled_queries": 0,
+    "counted_at": TIME,
+    "generation_id": None,
+    "vocabulary": None,
+    "dimension": None,
+    "pca_from": None,
+    "place_labels_are_paths": True,
+    "created_at": TIME,
+}
+
+
+def test_create_makes_a_map_whose_labels_are_paths() -> None:
+    with running_server() as server:
+        server.will_answer(201, MAP)
+        arguments = ["create", "tower", "--place-labels-are-paths", "--server", server.url]
+        result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    _, path, body = server.requests[0]
+    assert path == "/api/v1/maps"
+    assert json.loads(body) == {"name": "tower", "place_labels_are_paths": True}
+
+
+def test_list_says_whose_labels_are_paths() -> None:
+    with running_server() as server:
+        server.will_answer(200, [MAP, MAP | {"name": "city", "place_labels_are_paths": False}])
+        result = CliRunner().invoke(app, ["list", "--server", server.url])
+    assert result.exit_code == 0, result.output
+    head, *rows = (line.split("\t") for line in result.output.splitlines())
+    listed = [dict(zip(head, row, strict=True)) for row in rows]
+    assert [(each["map"], each["labels"]) for each in listed] == [
+        ("tower", "paths"),
+        ("city", "names"),
+    ]

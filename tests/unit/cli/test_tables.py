@@ -1,0 +1,98 @@
+"""Tables of commands: readable in 80 columns on a terminal, tab-separated elsewhere."""
+
+from __future__ import annotations
+
+import pytest
+from rich.progress_bar import ProgressBar
+
+from services.cli.output import Table, print_table
+
+LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
+MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"
+
+
+def make_table() -> Table:
+    table = Table("map", "photos", "extractor", "vocabulary", "dimension", "photo", "")
+    table.add_row(
+        MAP,
+        "1234567",
+        "efficientnet-lite0-vlad128:clusters=256",
+        "foreign",
+        "512 (PCA of 14336)",
+        LONG_PATH,
+        ProgressBar(total=1, completed=0.5, width=4),
+    )
+    return table
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+
+
+@pytest.mark.usefixtures("terminal")
+def test_long_names_are_shortened_in_the_middle_to_fit_80_columns(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table(make_table())
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    row = next(line for line in lines if "1234567" in line)
+    shortened = [word for word in row.split() if "…" in word]
+    names = (MAP, "efficientnet-lite0-vlad128:clusters=256", LONG_PATH)
+    for shown, name in zip(shortened, names, strict=True):
+        start, end = shown.split("…")
+        assert len(start) >= 4, shown
+        assert len(end) >= 4, shown
+        assert name.startswith(start), shown
+        assert name.endswith(end), shown
+    assert " foreign " in row
+    assert "(PCA" in " ".join(lines), "text with spaces wraps"
+
+
+@pytest.mark.usefixtures("terminal")
+def test_names_that_fit_are_shown_in_full(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table("photo", "place")
+    table.add_row("queries/frame_000123.jpg", "tower/floor7/elevator")
+    print_table(table)
+    assert "queries/frame_000123.jpg  tower/floor7/elevator" in capsys.readouterr().out
+
+
+def test_output_that_is_no_terminal_is_tab_separated_with_full_names(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table(make_table())
+    head, row = capsys.readouterr().out.splitlines()
+    assert head.split("\t") == [
+        "map",
+        "photos",
+        "extractor",
+        "vocabulary",
+        "dimension",
+        "photo",
+    ], "the column of bars, which has no header, is left out"
+    assert row.split("\t") == [
+        MAP,
+        "1234567",
+        "efficientnet-lite0-vlad128:clusters=256",
+        "foreign",
+        "512 (PCA of 14336)",
+        LONG_PATH,
+    ]
+
+
+def test_tab_separated_cells_hold_no_markup_tabs_or_line_breaks(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = Table("name", "note", title="two words", caption="a caption")
+    table.add_row("[bold]a\\[b].jpg[/bold]", "one\ttwo\nthree")
+    table.add_row(None, "")
+    print_table(table)
+    assert capsys.readouterr().out.splitlines() == [
+        "two words",
+        "name\tnote",
+        "a[b].jpg\tone two three",
+        "\t",
+        "a caption",
+    ]

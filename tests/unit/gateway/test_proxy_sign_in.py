@@ -1,0 +1,137 @@
+"""Users whom a trusted proxy has signed in, and everybody else who says so."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from fastapi import FastAPI, Request
+from starlette.datastructures import Headers
+
+from services.gateway.authentication import ApiKeyAuthenticator, Authenticator, Caller
+from services.gateway.proxy_sign_in import with_proxy_sign_in
+from services.http_connections import ConnectionLimits, Connections
+from services.http_server import PEER_ADDRESS, http_server, listen
+from shared.catalog.database.session import Catalog
+from shared.config.settings import Settings
+from shared.errors import Forbidden, Unauthorized
+from shared.security.api_keys import ALL_SCOPES, Scope, hash_api_key
+
+KEY = "pw_0123456789abcdef"
+PROXY = "10.0.0.5"
+
+
+@pytest.fixture
+def keys(migrated_sqlite: Path) -> Iterator[Authenticator]:
+    catalog = Catalog(f"sqlite:///{migrated_sqlite}")
+    yield ApiKeyAuthenticator(catalog, hash_api_key(KEY))
+    catalog.close()
+
+
+@pytest.fixture
+def sign_in(keys: Authenticator, monkeypatch: pytest.MonkeyPatch) -> Authenticator:
+    monkeypatch.setenv("SIGN_IN_PROXIES", f"{PROXY}, fd00::/8")
+    monkeypatch.setenv("SIGN_IN_SCOPES", "*:read, editors:write, chiefs:admin")
+    return with_proxy_sign_in(keys, Settings())
+
+
+def call(authenticator: Authenticator, peer: str | None, *pairs: tuple[str, str]) -> Caller:
+    raw = [(b"host", b"places.example"), *((n.lower().encode(), v.encode()) for n, v in pairs)]
+    return asyncio.run(authenticator.authenticate(Headers(raw=raw), peer))
+
+
+def code(authenticator: Authenticator, peer: str | None, *pairs: tuple[str, str]) -> str:
+    with pytest.raises((Unauthorized, Forbidden)) as caught:
+        call(authenticator, peer, *pairs)
+    return caught.value.code
+
+
+USER = ("X-Forwarded-User", "ada")
+
+
+@pytest.mark.parametrize("peer", [PROXY, "fd12::1"])
+def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
+    sign_in: Authenticator, peer: str
+) -> None:
+    assert call(sign_in, peer, USER) == Caller("user ada", frozenset({Scope.READ}))
+    editor = call(sign_in, peer, USER, ("X-Forwarded-Groups", "others, editors"))
+    assert editor.scopes == {Scope.READ, Scope.WRITE}
+    assert call(sign_in, peer, USER, ("X-Forwarded-Groups", "chiefs")).scopes == ALL_SCOPES
+
+
+@pytest.mark.parametrize("peer", ["10.0.0.6", "127.0.0.1", "::1", "", None, "unix"])
+def test_the_same_headers_from_anybody_else_are_ignored(
+    sign_in: Authenticator, peer: str | None
+) -> None:
+    chief = (USER, ("X-Forwarded-Groups", "chiefs"), ("X-Forwarded-For", PROXY))
+    assert code(sign_in, peer, *chief) == "key_missing"
+
+
+def test_a_key_counts_more_than_the_user(sign_in: Authenticator) -> None:
+    assert call(sign_in, PROXY, USER, ("Authorization", f"Bearer {KEY}")).identity == "admin"
+    assert code(sign_in, PROXY, USER, ("Authorization", "Bearer wrong")) == "key_unknown"
+    assert code(sign_in, PROXY) == "key_missing"
+
+
+@pytest.mark.parametrize("names", [("ada", "eve"), ("",), ("  ",), ("x" * 201,)])
+def test_a_name_that_is_not_one_name_is_refused(
+    sign_in: Authenticator, names: tuple[str, ...]
+) -> None:
+    headers = [("X-Forwarded-User", name) for name in names]
+    assert code(sign_in, PROXY, *headers) == "proxy_user_invalid"
+
+
+def test_pages_of_other_origins_can_not_use_the_cookie_of_the_proxy(
+    sign_in: Authenticator,
+) -> None:
+    assert code(sign_in, PROXY, USER, ("Origin", "https://evil.example")) == "foreign_page"
+    assert call(sign_in, PROXY, USER, ("Origin", "https://places.example")).identity == "user ada"
+
+
+def test_without_the_setting_nobody_is_signed_in(keys: Authenticator) -> None:
+    assert with_proxy_sign_in(keys, Settings()) is keys
+    assert code(keys, PROXY, USER) == "key_missing"
+
+
+def test_the_peer_is_the_connection_and_not_what_its_headers_say(settings: Settings) -> None:
+    trusting = settings.model_copy(update={"trusted_proxies": "127.0.0.0/8"})
+    app = FastAPI()
+
+    @app.get("/whoami")
+    def whoami(request: Request) -> dict[str, Any]:
+        assert request.client is not None
+        return {"client": request.client.host, "peer": request.scope[PEER_ADDRESS]}
+
+    with listen("127.0.0.1", 0) as listener:
+        server = http_server(app, Connections(ConnectionLimits.of(trusting)))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            url = f"http://127.0.0.1:{listener.getsockname()[1]}/whoami"
+            found = httpx2.get(url, headers={"X-Forwarded-For": "192.0.2.7"}).json()
+        finally:
+            server.should_exit = True
+            thread.join()
+    assert found == {"client": "192.0.2.7", "peer": "127.0.0.1"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("SIGN_IN_PROXIES", "proxy.example"),
+        ("SIGN_IN_USER_HEADER", "X Forwarded"),
+        ("SIGN_IN_SCOPES", "editors"),
+        ("SIGN_IN_SCOPES", "editors:everything"),
+    ],
+)
+def test_settings_that_can_not_work_are_refused(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str
+) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(ValueError, match=name.lower()):
+        Settings()
