@@ -34,7 +34,7 @@ class Belief:
     outside: float
     """outside the map"""
     seen: dict[str, float]
-    """probabilities of the last frame's hits, to tell how much the next frame adds"""
+    """what the last frame's hits had beyond their prior, to tell how much the next frame adds"""
     status: TrackStatus = "converging"
     frames: int = 0
     """number of frames so far"""

@@ -28,6 +28,8 @@ RANK_EXPONENT = 0.25
 """a: the photo of the right place comes first in 3,000 photos with 3000**-0.25 = 14 %"""
 MAX_EXCESS = 8.0
 """of a score, in units of the mean excess"""
+MIN_TAIL = 10
+"""Number of scores that the mean excess is computed from, at least"""
 MIN_PROBABILITY = 1e-4
 
 FloatArray = NDArray[np.float64]
@@ -136,8 +138,12 @@ def rank_shares(scores: FloatArray, photo_count: int) -> tuple[FloatArray, float
     count = len(scores)
     if count == 0:
         return np.zeros(0), 1.0
-    excess = scores - scores[-1]
+    # The threshold is the last hit, or on a small map the last of the best tenth.
+    tail = min(count, max(photo_count // 10, MIN_TAIL))
+    excess = scores[:tail] - scores[tail - 1]
     excess = np.minimum(excess / max(float(excess.mean()), 1e-12), MAX_EXCESS)
-    weights = np.exp((1 - RANK_EXPONENT) * excess)
+    ranks = np.arange(1.0, count + 1)
+    ranks[:tail] = tail * np.exp(-excess)
+    weights = ranks ** (RANK_EXPONENT - 1)
     within = (count / max(photo_count, count)) ** RANK_EXPONENT
     return within * weights / weights.sum(), 1 - within

@@ -14,13 +14,14 @@ probability that the camera was carried away, e and c those of leaving and enter
 Update. The frame's evidence has posterior probabilities q of a single frame, and its prior is
 known, so their ratio is the likelihood up to a factor (Bayes' rule):
 
-    p(j)      ~ p'(j) * (q(j) / ((1 - s) / n)) ** w        outside ~ outside' * (q_out / s) ** w
+    p(j)      ~ p'(j) * (n * q(j) / (1 - q_out)) ** w
+    outside   ~ outside' * ((q_out / (1 - q_out)) / (s / (1 - s))) ** (w / 2)
 
 with s = OUT_OF_MAP_SHARE; photos that are no hits share what the hits leave. Two frames of the same
-view are not independent, so w is the share of the evidence that is new: w = 1 - sum_j sqrt(q(j)
-q_before(j)), the squared Hellinger distance from the last frame's hits. A camera that stands still
-adds nothing. SeqSLAM (Milford and Wyeth 2012) sums scores along lines of constant speed instead;
-it is the baseline of the evaluation.
+view are not independent, so w is the share of the evidence that is new: the squared Hellinger
+distance w = 1 - sum_j sqrt(d(j) d_before(j)) of what exceeds the prior, d(j) ~ max(q(j) - (1 - s) /
+n, 0), from the frame before. A camera that stands still adds nothing. SeqSLAM (Milford and Wyeth
+2012) sums scores along lines of constant speed instead; it is the baseline of the evaluation.
 """
 
 from __future__ import annotations
@@ -52,15 +53,23 @@ LEAVING = 0.002
 """Probability per frame that the camera leaves the map"""
 ENTERING = 0.02
 """Probability per frame that a camera outside enters the map, at any place"""
-SPACING_M = 5.0
-"""Standard deviation between a frame and the photo of the map that is nearest to it"""
+OUTSIDE_WEIGHT = 0.5
+"""Weight of a frame's evidence for "outside the map". Another season makes all frames of a ride
+look foreign alike, so that their evidence is not independent."""
+SPACING_M = 10.0
+"""Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
 """A camera that may have moved farther is carried away as far as the filter knows"""
-MAX_PHOTOS = 1000
+MAX_PHOTOS = 300
 """of a belief; the least probable ones beyond go back to `elsewhere`"""
+MOVING_PHOTOS = 100
+"""of a belief, the most probable. What is near the others is not added, which bounds the time of a
+step while the place is not known"""
 ALWAYS_KEPT = 50
-MIN_GAIN = 1.5
+MIN_GAIN = 2.0
 """A photo of a belief is at least this much more probable than one elsewhere"""
+NEGLIGIBLE = 1e-3
+"""Probability that the least probable photos of a belief give back to `elsewhere`"""
 FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
@@ -159,9 +168,12 @@ class TrackFilter:
         row_of = {photo: row for row, photo in enumerate(before.photos)}
         rows = np.array([row_of[photo] for photo in sources.ids], dtype=np.int64)
         reach_m = self._reach_m(seconds, evidence.odometry)
-        targets = self._targets(sources, evidence, min(reach_m, MAX_REACH_M))
+        moving = np.argsort(-before.probabilities[rows], kind="stable")[:MOVING_PHOTOS]
+        reach = min(reach_m, MAX_REACH_M)
+        targets = self._targets(sources, sources.take(moving), evidence, reach)
         kernel = self._kernel(sources, targets, seconds, evidence.odometry)
-        news = _news(before.seen, evidence)
+        seen = _excess(evidence, count)
+        news = _news(before.seen, seen)
 
         # Photos that were deleted since have given their probability to the others.
         own = before.probabilities[rows]
@@ -192,7 +204,7 @@ class TrackFilter:
             probabilities=posterior[kept],
             elsewhere=posterior_elsewhere + float(posterior.sum() - posterior[kept].sum()),
             outside=posterior_outside / total,
-            seen={hit.photo: hit.probability for hit in evidence.hits},
+            seen=seen,
             status=before.status,
             frames=before.frames + 1,
         )
@@ -216,11 +228,13 @@ class TrackFilter:
             return odometry.distance_m + 3 * (odometry.distance_accuracy_m + SPACING_M)
         return self._motion.max_speed_mps * seconds + 3 * SPACING_M
 
-    def _targets(self, sources: PhotoTable, evidence: FrameEvidence, reach_m: float) -> PhotoTable:
+    def _targets(
+        self, sources: PhotoTable, moving: PhotoTable, evidence: FrameEvidence, reach_m: float
+    ) -> PhotoTable:
         reach_seconds = reach_m / self._motion.typical_speed_mps
         tables = [self._graph.photos([hit.photo for hit in evidence.hits])]
-        if len(sources):
-            tables.append(self._graph.around(sources, reach_m, reach_seconds))
+        if len(moving):
+            tables.append(self._graph.around(moving, reach_m, reach_seconds))
         if evidence.fix is not None:
             tables.append(_near_fix(self._graph, evidence.fix))
         return sources.union(*tables)
@@ -228,20 +242,33 @@ class TrackFilter:
     def _kernel(
         self, sources: PhotoTable, targets: PhotoTable, seconds: float, odometry: Odometry | None
     ) -> FloatArray:
-        """Return (n, m) probabilities to move from source to target photos; rows add up to 1."""
+        """Return (n, m) probabilities to move from source to target photos; rows add up to 1.
+
+        The photos are coarser than the motion between two frames, so a camera changes its photo
+        only so often that it moves no farther than it can on average.
+        """
         away = distance_matrix_m(sources, targets, self._motion.typical_speed_mps)
         if odometry is None:
-            width = np.hypot(SPACING_M, self._motion.max_speed_mps * seconds / 2)
+            moved_m = self._motion.max_speed_mps * seconds
+            width = np.hypot(SPACING_M, moved_m / 2)
             kernel = np.exp(-0.5 * (np.minimum(away, 1e9) / width) ** 2)
-            kernel[away > self._motion.max_speed_mps * seconds + 3 * SPACING_M] = 0.0
         else:
+            moved_m = odometry.distance_m + odometry.distance_accuracy_m
             kernel = _odometry_kernel(away, sources, targets, odometry)
+        kernel[away > min(self._reach_m(seconds, odometry), MAX_REACH_M)] = 0.0
         total = kernel.sum(axis=1, keepdims=True)
-        moved: FloatArray = np.divide(kernel, total, out=np.zeros_like(kernel), where=total > 0)
         # A photo that nothing can be reached from keeps its probability.
-        stuck = np.flatnonzero(total[:, 0] <= 0)
-        moved[stuck, stuck] = 1.0  # the sources are the first targets
-        return moved
+        kernel = np.divide(kernel, total, out=np.zeros_like(kernel), where=total > 0)
+        mean_m = np.sum(kernel * np.where(kernel > 0, away, 0.0), axis=1)
+        moving = np.minimum(
+            1.0, np.divide(moved_m, mean_m, out=np.ones_like(mean_m), where=mean_m > 0)
+        )
+        moving[total[:, 0] <= 0] = 0.0
+        kernel *= moving[:, None]
+        diagonal = np.arange(len(sources))  # the sources are the first targets
+        kernel[diagonal, diagonal] += 1 - moving
+        moves: FloatArray = kernel
+        return moves
 
 
 def _start(time: datetime) -> Belief:
@@ -268,28 +295,32 @@ def _near_fix(graph: PhotoGraph, fix: PositionFix) -> PhotoTable:
     return graph.near(fix.latitude, fix.longitude, 3 * np.hypot(fix.accuracy_m, SPACING_M))
 
 
-def _news(seen: dict[str, float], evidence: FrameEvidence) -> float:
+def _excess(evidence: FrameEvidence, count: int) -> dict[str, float]:
+    """Return by how much the probabilities of the hits exceed their prior."""
+    prior = (1 - OUT_OF_MAP_SHARE) / count
+    return {h.photo: h.probability - prior for h in evidence.hits if h.probability > prior}
+
+
+def _news(seen: dict[str, float], now: dict[str, float]) -> float:
     """Return the share of a frame's evidence that the frame before did not have."""
-    now = sum(hit.probability for hit in evidence.hits)
-    before = sum(seen.values())
-    if now <= 0 or before <= 0:
+    if not seen or not now:
         return 1.0
-    shared = sum(np.sqrt(hit.probability * seen.get(hit.photo, 0.0)) for hit in evidence.hits)
-    return float(min(1.0, max(0.0, 1 - shared / np.sqrt(now * before))))
+    shared = sum(np.sqrt(value * seen.get(photo, 0.0)) for photo, value in now.items())
+    return float(max(0.0, 1 - shared / np.sqrt(sum(now.values()) * sum(seen.values()))))
 
 
 def _likelihoods(
     targets: PhotoTable, evidence: FrameEvidence, count: int, news: float
 ) -> tuple[FloatArray, float, float]:
     """Return the likelihoods of the targets, of any other photo, and of "outside the map"."""
-    prior = (1 - OUT_OF_MAP_SHARE) / count
-    probability = {hit.photo: hit.probability for hit in evidence.hits}
-    rest = max(0.0, 1 - evidence.not_in_map - sum(probability.values()))
-    other = rest / max(count - len(probability), 1)
+    inside = max(1 - evidence.not_in_map, 1e-9)
+    probability = {hit.photo: hit.probability / inside for hit in evidence.hits}
+    other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
     values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
-    weights = np.maximum(values / prior, 1e-9) ** news
-    elsewhere = max(other / prior, 1e-9) ** news
-    outside = max(evidence.not_in_map / OUT_OF_MAP_SHARE, 1e-9) ** news
+    weights = np.maximum(values * count, 1e-9) ** news
+    elsewhere = max(other * count, 1e-9) ** news
+    odds = max(evidence.not_in_map, 1e-9) / inside * (1 - OUT_OF_MAP_SHARE) / OUT_OF_MAP_SHARE
+    outside = odds ** (OUTSIDE_WEIGHT * news)
     if evidence.fix is not None:
         near = _fix_weights(targets, evidence.fix, count)
         weights, elsewhere = weights * near, elsewhere * FIX_OUTLIERS
@@ -312,9 +343,10 @@ def _fix_weights(targets: PhotoTable, fix: PositionFix, count: int) -> FloatArra
 def _kept(posterior: FloatArray, density: float) -> Indices:
     """Return the rows of the photos that keep a probability of their own."""
     order = np.argsort(-posterior, kind="stable")[:MAX_PHOTOS]
-    probable = posterior[order] > max(MIN_GAIN * density, 1e-9)
-    probable[:ALWAYS_KEPT] = True
-    return np.sort(order[probable])
+    tail = posterior.sum() - np.cumsum(posterior[order])
+    kept = (posterior[order] > MIN_GAIN * density) & (tail > NEGLIGIBLE)
+    kept[:ALWAYS_KEPT] = True
+    return np.sort(order[kept])
 
 
 def _backward(steps: Sequence[_Step], count: int) -> list[Belief]:

@@ -129,7 +129,11 @@ def distance_matrix_m(
     paths may change the sequence at such a label. Infinite where no way is known.
     """
     a, b = unit_vectors(sources), unit_vectors(targets)
-    distances: FloatArray = EARTH_RADIUS_M * np.sqrt(np.maximum(0.0, 2 - 2 * (a @ b.T)))
+    # The squares are computed around a point nearby; around the Earth's centre they lose metres.
+    near = b[~np.isnan(targets.latitudes)][:1].sum(axis=0)
+    a, b = a - near, b - near
+    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)[None, :] - 2 * (a @ b.T)
+    distances: FloatArray = EARTH_RADIUS_M * np.sqrt(np.maximum(0.0, squares))
     unknown = np.isnan(distances)
     if not unknown.any():
         return distances

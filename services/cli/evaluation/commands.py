@@ -155,6 +155,20 @@ def evaluate(
         bool, typer.Option("--only-wrong", help="Show only failed queries in the report.")
     ] = False,
     faiss_gpu: FaissGpuOption = False,
+    sequences: Annotated[
+        bool,
+        typer.Option(
+            "--sequences",
+            help="With --data: follow the sequences of the sets (rides, MSLS, folders of seasons) "
+            "frame by frame, instead of ranking single photos.",
+        ),
+    ] = False,
+    motion: Annotated[
+        str,
+        typer.Option(
+            help="With --sequences: walk, bicycle, car, train, or a maximum speed in m/s."
+        ),
+    ] = "car",
     place_labels_are_paths: Annotated[
         bool,
         typer.Option(
@@ -209,7 +223,8 @@ def evaluate(
         "--queries": queries,
     }
     output_options: OptionValues = {
-        "--out": out, "--against": against, "--pairs": pairs, "--set": sets
+        "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
+        "--sequences": sequences,
     }  # fmt: skip
     with report_errors(as_json):
         # Must be set before torch is loaded below; see services/cli/__init__.py.
@@ -248,6 +263,13 @@ def evaluate(
             target = EvaluationTarget(
                 checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
             )
+            if sequences:
+                from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
+
+                _reject_options("with --sequences", {"--out": out, "--pairs": pairs})
+                speeds = parse_motion(motion)
+                evaluate_sequences(data, sets, protocol, rule, target, speeds, as_json)
+                return
             evaluate_sets(data, sets, protocol, rule, target, report_options)
             return
         _reject_options("without --data", model_options | file_options | output_options)

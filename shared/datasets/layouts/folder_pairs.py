@@ -1,6 +1,11 @@
 """Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
-Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL).
+Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Beside `database/`,
+`rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
+as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
+2013): the first is the database, and photos of about the same number show the same place. In
+`database/` and `queries/` with as many photos each, without positions and labels, photos are
+numbered as well, for the rule `frames 10`.
 
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
@@ -10,7 +15,7 @@ deep-visual-geo-localization-benchmark)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +26,10 @@ from shared.datasets.utm_coordinates import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
+RIDES = "rides"
+SEASONS = ("summer", "spring", "fall", "autumn", "winter")
+"""Names of folders of one season each; the database is the first one that exists"""
+SAME_INDEX_RULE = "frames 10"
 VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
@@ -33,25 +42,60 @@ class FolderPairs:
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         homes = {prefix: base, **{f"{prefix}_{split}": base / split for split in SPLITS}}
-        return {
+        pairs = {
             f"{name}{queries.name.removeprefix('queries')}": queries.relative_to(base).as_posix()
             for name, home in homes.items()
             if (home / "database").is_dir()
             for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
             if queries.is_dir()
         }
+        rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
+        seasons = [season for season in SEASONS if (base / season).is_dir()]
+        return {**pairs, **rides, **{f"{prefix}_{season}": season for season in seasons[1:]}}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        if key == RIDES:
+            photos = _read_photos(base / "database", base)
+            return ListedSet(photos, _read_rides(base), _default_rule(photos))
+        if key in SEASONS:
+            first = next(season for season in SEASONS if (base / season).is_dir())
+            before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
+            return ListedSet(before, after, SAME_INDEX_RULE)
         folder = base / key
         database, queries = (
             _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
         )
+        if len(database) == len(queries) and not any(map(_is_located, database + queries)):
+            database, queries = _number(database), _number(queries)
         if protocol == VME_PROTOCOL:
             database, queries = (
                 tuple(replace(photo, zone=None) for photo in photos)
                 for photos in (database, queries)
             )
         return ListedSet(database, queries, _default_rule(database + queries))
+
+
+def _is_located(photo: DatasetPhoto) -> bool:
+    return photo.easting is not None or photo.place is not None
+
+
+def _has_rides(folder: Path) -> bool:
+    return (folder / "database").is_dir() and (folder / RIDES).is_dir()
+
+
+def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
+    """Read the folders of rides: frames in the order of capture time, or else of name."""
+    frames: list[DatasetPhoto] = []
+    for folder in sorted(path for path in (base / RIDES).iterdir() if path.is_dir()):
+        photos = [replace(photo, place=None) for photo in _read_photos(folder, base)]
+        if all(photo.captured_at is not None for photo in photos):
+            photos.sort(key=lambda photo: str(photo.captured_at))
+        frames += [replace(photo, sequence=folder.name) for photo in _number(photos)]
+    return tuple(frames)
+
+
+def _number(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    return tuple(replace(photo, frame=number) for number, photo in enumerate(photos))
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:
