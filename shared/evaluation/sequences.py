@@ -134,7 +134,8 @@ def _fit_model(
     rng = np.random.default_rng(seed)
     sampled = rng.permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
     spread = sampler.spread(sampled)
-    return fit_place_model(list(sampler.samples(sampled, spread)), (), scheme, spread).model
+    fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), scheme, spread)
+    return fitted.model
 
 
 def split_sequences(queries: Sequence[DatasetPhoto]) -> list[list[int]]:

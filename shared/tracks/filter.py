@@ -33,9 +33,10 @@ from datetime import datetime
 import numpy as np
 
 from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, Odometry, PositionFix
+from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel
 from shared.tracks.photo_graph import (
     FloatArray,

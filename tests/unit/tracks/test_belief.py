@@ -52,13 +52,9 @@ def test_bytes_that_are_no_belief_are_an_error(data: bytes) -> None:
 
 
 def test_the_probabilities_of_a_frame_add_up_to_one() -> None:
+    best = [True, False, False], 0.6
     evidence = frame_evidence(
-        at(0),
-        ["a", "b", "c"],
-        [0.9, 0.5, 0.4],
-        1000,
-        not_in_map=0.2,
-        best_place=([True, False, False], 0.6),
+        at(0), ["a", "b", "c"], [0.9, 0.5, 0.4], 1000, not_in_map=0.2, best_place=best
     )
     probabilities = [hit.probability for hit in evidence.hits]
     assert probabilities[0] == pytest.approx(0.6)
