@@ -37,12 +37,13 @@ from shared.catalog.tracks import (
 from shared.errors import Conflict, Gone, PlacewiseError
 from shared.evaluation.place_evidence import EVIDENCE_DEPTH
 from shared.evaluation.place_levels import LevelScheme, photos_inside
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import query_expired_error
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, frame_evidence
+from shared.tracks.evidence import FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
 
 START_ACCURACY_M = 50.0
