@@ -24,6 +24,7 @@ from shared.datasets.dataset import (
 from shared.datasets.ground_truth import find_positives, parse_rule
 from shared.datasets.layouts import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
 from shared.datasets.layouts.base import EvaluationLayout, ListedSet, TrainingLayout
+from shared.datasets.layouts.folder_pairs import RIDES, SEASONS
 from shared.errors import InvalidRequest, NotFound
 
 __all__ = [
@@ -44,6 +45,7 @@ PART_FOLDERS = frozenset(
         *("database", "queries", "queries_v1", "queries_v2"),
         *("ref", "query"),
         *("train", "val", "test", "train_val", "images"),
+        *(RIDES, *SEASONS),
     }
 )
 """Subfolders of datasets that are never datasets of their own"""

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from shared.datasets.utm_filenames import UtmFileName
 from shared.synthetic_city.camera import Camera
+from shared.synthetic_city.rides import plan_ride
 from shared.synthetic_city.sessions import (
     DATABASE_SESSIONS,
     QUERY_SESSIONS,
+    RIDE_SESSIONS,
     SESSIONS,
     CaptureSession,
 )
@@ -61,6 +63,8 @@ class CityOptions:
     height: int
     train: bool = True
     """Whether to generate a training set, too"""
+    ride_frames: int = 0
+    """Frames of each ride; 0 for no rides"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +72,9 @@ class PlannedPhoto:
     """One photo to be rendered."""
 
     role: str
-    """`database`, `query` or `train`"""
+    """`database`, `query`, `ride` or `train`"""
     kind: str
-    """`in_map`, `out_of_map` or `other_way`; always `in_map` for photos that are not queries"""
+    """`in_map`, `out_of_map` or `other_way`; always `in_map` for database and training photos"""
     quarter: str
     place: int
     camera: Camera
@@ -119,7 +123,7 @@ def make_plan(options: CityOptions) -> CityPlan:
     quarters, places = {}, {}
     for name, place_count in (
         ("map", options.places),
-        ("outskirts", max(1, min(outside, options.places))),
+        ("outskirts", max(1, min(max(outside, options.ride_frames), options.places))),
         ("school", options.places),
     ):
         quarter, view_points = make_quarter(options.seed, name, place_count, origin)
@@ -137,6 +141,7 @@ def make_plan(options: CityOptions) -> CityPlan:
             kind, quarter_name = "out_of_map", "outskirts"
             place = places["outskirts"][(number - inside) % len(places["outskirts"])]
         photos.append(_query_photo(options, place, quarter_name, kind, number))
+    photos += _ride_photos(options, places["map"], places["outskirts"])
     if options.train:
         photos += _train_photos(options, places["school"])
     photos.sort(key=lambda photo: (photo.quarter, photo.place, photo.role, photo.number))
@@ -184,6 +189,34 @@ def _query_photo(
     )
     session = QUERY_SESSIONS[int(rng.integers(len(QUERY_SESSIONS)))]
     return _plan_photo(options, "query", kind, quarter, place, camera, session, number)
+
+
+def _ride_photos(
+    options: CityOptions, places: list[ViewPoint], outskirts: list[ViewPoint]
+) -> list[PlannedPhoto]:
+    """Plan the same ride in each of RIDE_SESSIONS, with another camera each time."""
+    if not options.ride_frames:
+        return []
+    frames = plan_ride(random_stream(options.seed, "ride"), places, outskirts, options.ride_frames)
+    photos = []
+    for session in RIDE_SESSIONS:
+        fov = random_stream(options.seed, "ride", session.name).uniform(*QUERY_FOV)
+        for number, frame in enumerate(frames):
+            rng = random_stream(options.seed, "ride", session.name, number)
+            camera = _camera(
+                options,
+                frame.place,
+                along=frame.along,
+                across=rng.normal(0, 0.1),
+                yaw=rng.normal(0, 1.5),
+                fov=fov,
+                rng=rng,
+            )
+            kind, quarter = ("in_map", "map") if frame.is_in_map else ("out_of_map", "outskirts")
+            photos.append(
+                _plan_photo(options, "ride", kind, quarter, frame.place, camera, session, number)
+            )
+    return photos
 
 
 def _train_photos(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
@@ -252,7 +285,8 @@ def _plan_photo(
     number: int,
 ) -> PlannedPhoto:
     city = city_name(options)
-    folder = {"database": "database", "query": "queries"}.get(role, f"gsv_xs/train/{city}")
+    folders = {"database": "database", "query": "queries", "ride": f"rides/{session.name}"}
+    folder = folders.get(role, f"gsv_xs/train/{city}")
     # gsv_xs stores the place in the note; other photos store the session's name there.
     note = f"{place.number:05d}_{city}" if role == "train" else session.name
     name = UtmFileName(
@@ -262,7 +296,9 @@ def _plan_photo(
         zone_letter=ZONE_LETTER,
         pano_id=f"{quarter}{place.number:05d}-{session.name}-{number:06d}",
         heading=camera.yaw,
-        captured_at=_capture_time(session, number),
+        captured_at=session.starts_at + timedelta(seconds=number)
+        if role == "ride"
+        else _capture_time(session, number),
         note=note,
     ).file_name()
     return PlannedPhoto(role, kind, quarter, place.number, camera, session, number, folder, name)

@@ -181,7 +181,7 @@ def describe_city(plan: CityPlan) -> dict[str, Any]:
             role: dict(
                 sorted(Counter(s.session.name for s in plan.photos if s.role == role).items())
             )
-            for role in ("database", "query", "train")
+            for role in ("database", "query", "ride", "train")
         },
         "queries": {
             photo.name: {"kind": photo.kind, "session": photo.session.name}

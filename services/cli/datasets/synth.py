@@ -70,6 +70,16 @@ def synth(
     train: Annotated[
         bool, typer.Option(help="Also generate a training set; nearly half of the run time.")
     ] = True,
+    rides: Annotated[
+        int,
+        typer.Option(
+            metavar="FRAMES",
+            min=0,
+            max=100_000,
+            help="Also generate a ride of so many frames through the city, in winter and at night: "
+            "one frame per second, with stops, a detour outside the map and a jump.",
+        ),
+    ] = 0,
     layout: Annotated[
         TrainingLayoutName, typer.Option(help="Layout of the training set.")
     ] = TrainingLayoutName.GSV_XS,
@@ -78,13 +88,14 @@ def synth(
     """Generate a synthetic city with a database, queries and a training set.
 
     The output is deterministic for given arguments. Photos in OUT/database and OUT/queries have
-    @UTM@ names. OUT/gsv_xs (or OUT/gsv-cities) is the training set, with separate streets.
+    @UTM@ names, those in OUT/rides/SEASON too. OUT/gsv_xs (or OUT/gsv-cities) is the training set,
+    with separate streets.
     OUT/city.json contains the arguments and the kind of each query.
     """
     width, height = parse_size(size)
     query_count = queries if queries is not None else max(1, places // 2)
     options = CityOptions(
-        places, views, query_count, seed, catalogue_seed, out_of_map, width, height, train
+        places, views, query_count, seed, catalogue_seed, out_of_map, width, height, train, rides
     )
     with report_errors(as_json):
         check_output_empty(out)

@@ -164,6 +164,20 @@ def evaluate(
         bool, typer.Option("--only-wrong", help="Show only failed queries in the report.")
     ] = False,
     faiss_gpu: FaissGpuOption = False,
+    sequences: Annotated[
+        bool,
+        typer.Option(
+            "--sequences",
+            help="With --data: follow the sequences of the sets (rides, MSLS, folders of seasons) "
+            "frame by frame, instead of ranking single photos.",
+        ),
+    ] = False,
+    motion: Annotated[
+        str,
+        typer.Option(
+            help="With --sequences: walk, bicycle, car, train, or a maximum speed in m/s."
+        ),
+    ] = "car",
     place_labels_are_paths: Annotated[
         bool,
         typer.Option(
@@ -208,7 +222,7 @@ def evaluate(
     }
     output_options: OptionValues = {
         "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
-        "--recall-at": recall_at,
+        "--sequences": sequences, "--recall-at": recall_at,
     }  # fmt: skip
     with report_errors(as_json):
         report_options = ReportOptions(
@@ -262,6 +276,17 @@ def evaluate(
             target = EvaluationTarget(
                 checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
             )
+            if sequences:
+                from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
+
+                unused: OptionValues = {
+                    "--out": out, "--pairs": pairs, "--recall-at": recall_at,
+                    "--ground-truth": ground_truth,
+                }  # fmt: skip
+                _reject_options("with --sequences", unused)
+                speeds = parse_motion(motion)
+                evaluate_sequences(data, sets, protocol, rule, target, speeds, as_json)
+                return
             evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
             return
         _reject_options("without --data", model_options | file_options | output_options)

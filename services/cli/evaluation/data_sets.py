@@ -291,7 +291,7 @@ def evaluate_sets(
                     evaluation_set, ranked, options, has_scores=True, about=figures
                 )
             else:
-                describer = _make_describer(evaluation_set, target, settings, progress)
+                describer = make_describer(evaluation_set, target, settings, progress)
                 result = _evaluate_describer(evaluation_set, describer, options, settings, progress)
                 run = EvaluationRun(describer.name, describer.fingerprint, describer.about)
             results.append(result)
@@ -308,9 +308,10 @@ def _replace_ground_truth(evaluation_set: EvaluationSet, path: Path) -> Evaluati
     return replace(evaluation_set, positives=tuple(positives), rule=rule or f"given by {path.name}")
 
 
-def _make_describer(
+def make_describer(
     evaluation_set: EvaluationSet, target: EvaluationTarget, settings: Settings, progress: Progress
 ) -> Describer:
+    """Create the describer of a checkpoint or an extractor."""
     if target.checkpoint is not None:
         return checkpoint_describer(target.checkpoint, target.image_size, settings)
     assert target.extractor is not None

@@ -1,34 +1,35 @@
-"""Layouts of two folders: the common one, and that of VPR-Bench.
+"""Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
 
-The common one has `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
-
-Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL).
+Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Beside `database/`,
+`rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
+as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
+2013): the first is the database, and photos of about the same number show the same place. In
+`database/` and `queries/` with as many photos each, without positions, labels and numbers in file
+names, photos are numbered as well, for the rule `frames 10`.
 
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
 one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
 deep-visual-geo-localization-benchmark)
-
-VPR-Bench has `ref/` and `query/` with numbered photos, and their ground truth in
-`ground_truth_new.npy`.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from shared.datasets.dataset import DatasetPhoto
-from shared.datasets.ground_truth_files import read_numbered_ground_truth
 from shared.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
 from shared.datasets.photo_lists import add_exif_positions, photo_from_filename
 from shared.datasets.utm_coordinates import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
-NUMBERED_GROUND_TRUTH = "ground_truth_new.npy"
+RIDES = "rides"
+SEASONS = ("summer", "spring", "fall", "autumn", "winter")
+"""Names of folders of one season each; the database is the first one that exists"""
+SAME_INDEX_RULE = "frames 10"
 VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
@@ -41,19 +42,31 @@ class FolderPairs:
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         homes = {prefix: base, **{f"{prefix}_{split}": base / split for split in SPLITS}}
-        return {
+        pairs = {
             f"{name}{queries.name.removeprefix('queries')}": queries.relative_to(base).as_posix()
             for name, home in homes.items()
             if (home / "database").is_dir()
             for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
             if queries.is_dir()
         }
+        rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
+        seasons = [season for season in SEASONS if (base / season).is_dir()]
+        return {**pairs, **rides, **{f"{prefix}_{season}": season for season in seasons[1:]}}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        if key == RIDES:
+            photos = _read_photos(base / "database", base)
+            return ListedSet(photos, _read_rides(base), _default_rule(photos))
+        if key in SEASONS:
+            first = next(season for season in SEASONS if (base / season).is_dir())
+            before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
+            return ListedSet(before, after, SAME_INDEX_RULE)
         folder = base / key
         database, queries = (
             _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
         )
+        if len(database) == len(queries) and not any(map(_is_placed, database + queries)):
+            database, queries = _number(database), _number(queries)
         if protocol == VME_PROTOCOL:
             database, queries = (
                 tuple(replace(photo, zone=None) for photo in photos)
@@ -62,36 +75,28 @@ class FolderPairs:
         return ListedSet(database, queries, _default_rule(database + queries))
 
 
-class VprBench:
-    """Evaluation sets as two folders of numbered photos and a ground truth."""
-
-    name = "VPR-Bench"
-    protocols = (PLACEWISE_PROTOCOL,)
-
-    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
-        parts = (base / "ref", base / "query", base / NUMBERED_GROUND_TRUTH)
-        return {prefix: "."} if all(part.exists() for part in parts) else {}
-
-    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
-        database, queries = (
-            tuple(
-                photo_from_filename(path, path.relative_to(base).as_posix())
-                for path in sorted(photos_below(base / folder), key=_numeric_order)
-            )
-            for folder in ("ref", "query")
-        )
-        positives = read_numbered_ground_truth(
-            base / NUMBERED_GROUND_TRUTH,
-            database=[photo.name for photo in database],
-            queries=[photo.name for photo in queries],
-        )
-        return ListedSet(database, queries, f"given by {NUMBERED_GROUND_TRUTH}", tuple(positives))
+def _is_placed(photo: DatasetPhoto) -> bool:
+    """Whether a photo has a position, a label, or a number in its file name."""
+    return any(value is not None for value in (photo.easting, photo.place, photo.frame))
 
 
-def _numeric_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which `9.jpg` precedes `10.jpg`; the ground truth counts in this order."""
-    parts = re.split(r"(\d+)", path.as_posix())
-    return [(int(part) if part.isdecimal() else 0, part) for part in parts]
+def _has_rides(folder: Path) -> bool:
+    return (folder / "database").is_dir() and (folder / RIDES).is_dir()
+
+
+def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
+    """Read the folders of rides: frames in the order of capture time, or else of name."""
+    frames: list[DatasetPhoto] = []
+    for folder in sorted(path for path in (base / RIDES).iterdir() if path.is_dir()):
+        photos = [replace(photo, place=None) for photo in _read_photos(folder, base)]
+        if all(photo.captured_at is not None for photo in photos):
+            photos.sort(key=lambda photo: str(photo.captured_at))
+        frames += [replace(photo, sequence=folder.name) for photo in _number(photos)]
+    return tuple(frames)
+
+
+def _number(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    return tuple(replace(photo, frame=number) for number, photo in enumerate(photos))
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:

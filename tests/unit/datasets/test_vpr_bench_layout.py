@@ -75,7 +75,7 @@ def test_a_missing_table_is_described_by_its_header(tmp_path: Path) -> None:
     header = "path,latitude,longitude,heading,place,frame,sequence"
     with pytest.raises(NotFound, match=header):
         open_evaluation_set(tmp_path)
-    write_photos(tmp_path / "database", ["a.jpg"])
+    write_photos(tmp_path / "database", ["a.jpg", "c.jpg"])
     write_photos(tmp_path / "queries", ["b.jpg"])
     for rule in (None, "frames 2", "heading"):
         with pytest.raises(InvalidRequest, match=header):

@@ -1,0 +1,157 @@
+"""`placewise evaluate --data DIR --sequences`: single frames, SeqSLAM and tracks. Imports torch."""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import Progress
+from rich.table import Column, Table
+
+from services.cli.environment import read_settings
+from services.cli.evaluation.data_sets import EvaluationTarget, make_describer, progress_bars
+from services.cli.output import console, print_json, progress_bar
+from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
+from shared.errors import InvalidRequest, NotFound
+from shared.evaluation.ranking import describe_evaluation_set
+from shared.evaluation.sequences import (
+    evaluate_sequence,
+    prepare_map,
+    sequence_figures,
+    split_sequences,
+)
+from shared.tracks.motion import MotionModel, motion_model
+
+Json = dict[str, Any]
+
+METHODS = {
+    "single": "single frames",
+    "seqslam": "SeqSLAM, constant velocity",
+    "filter": "filter",
+    "smoothed": "filter, forward and backward",
+}
+
+
+def parse_motion(text: str) -> MotionModel:
+    """Parse `walk`, `bicycle`, `car`, `train` or a maximum speed.
+
+    Raises:
+        InvalidRequest: `bad_motion`.
+    """
+    try:
+        return motion_model(text)
+    except ValueError as error:
+        raise InvalidRequest("bad_motion", str(error)) from error
+
+
+def evaluate_sequences(
+    data: Path,
+    names: list[str] | None,
+    protocol: str | None,
+    rule: str | None,
+    target: EvaluationTarget,
+    motion: MotionModel,
+    as_json: bool,
+) -> None:
+    """Evaluate tracks on the sets below `data` that have sequences.
+
+    Raises:
+        NotFound: `no_evaluation_set`, `no_sequences`.
+        InvalidRequest: `options_contradict`, `no_model`, and errors of opening the sets.
+    """
+    target.check()
+    if target.checkpoint is None and target.extractor is None:
+        raise InvalidRequest(
+            "options_contradict", "--sequences requires --checkpoint or --extractor."
+        )
+    figures: dict[str, Json] = {}
+    with progress_bar() as progress:
+        for name in names or evaluation_set_names(data):
+            evaluation_set = open_evaluation_set(data, name, protocol=protocol, rule=rule)
+            if split_sequences(evaluation_set.queries):
+                figures[name] = _evaluate_set(evaluation_set, target, motion, progress)
+    if not figures:
+        raise NotFound(
+            "no_sequences",
+            f"No evaluation set in {data} has sequences. They need `rides/`, two folders of "
+            "seasons, MSLS, or the columns `sequence` and `frame` of a CSV.",
+        )
+    if as_json:
+        print_json({"motion": motion.name, "sets": figures})
+        return
+    for name, result in figures.items():
+        _print_figures(name, result)
+
+
+def _evaluate_set(
+    evaluation_set: EvaluationSet, target: EvaluationTarget, motion: MotionModel, progress: Progress
+) -> Json:
+    describer = make_describer(evaluation_set, target, read_settings(), progress)
+    on_progress = progress_bars(progress, evaluation_set.name)
+    with describe_evaluation_set(
+        describer.describe, evaluation_set, on_progress=on_progress
+    ) as matrices:
+        database, queries = (_normalise(rows) for rows in matrices)
+    map_ = prepare_map(evaluation_set, database, motion)
+    sequences, milliseconds = [], []
+    members_of = split_sequences(evaluation_set.queries)
+    for number, members in enumerate(members_of):
+        frames, seconds = evaluate_sequence(map_, evaluation_set, members, queries[members], motion)
+        sequences.append(frames)
+        milliseconds.append(1000 * seconds)
+        on_progress("tracking", number + 1, len(members_of))
+    by_sequence = {
+        str(evaluation_set.queries[members[0]].sequence): sequence_figures([frames])
+        for members, frames in zip(members_of, sequences, strict=True)
+    }
+    return {
+        "rule": evaluation_set.rule,
+        "database": len(database),
+        "filter_ms_a_frame": statistics.fmean(milliseconds),
+        **sequence_figures(sequences),
+        "sequences": by_sequence,
+    }
+
+
+def _normalise(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    normalised: NDArray[np.float32] = rows / np.maximum(lengths, 1e-12)
+    return normalised
+
+
+def _print_figures(name: str, figures: Json) -> None:
+    console.print(
+        f"{name}: {figures['frames']} frames ({figures['frames_outside']} outside the map) against "
+        f"{figures['database']} photos; {figures['rule']}; "
+        f"{figures['filter_ms_a_frame']:.1f} ms of CPU time a frame.",
+        soft_wrap=True,
+        markup=False,
+    )
+    table = Table(
+        "method", Column("recall", justify="right"), Column("at 99 % precision", justify="right")
+    )
+    for key, title in METHODS.items():
+        precise = figures["recall_at_99_precision"].get(key)
+        table.add_row(title, _percent(figures["recall"][key]), _percent(precise))
+    console.print(table)
+    console.print(
+        f"Tracking {_percent(figures['tracking'])} of the frames in the map, of which "
+        f"{_percent(figures['tracking_precision'])} are right; calibration error (ECE) "
+        f"{figures['calibration_error']:.3f}. Frames to localise: "
+        f"{_frame_counts(figures['frames_to_localise'])}; to notice that the map was left: "
+        f"{_frame_counts(figures['frames_to_notice_lost'])}; claimed to be tracked outside: "
+        f"{_percent(figures['claimed_outside'])}.",
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.1%}"
+
+
+def _frame_counts(counts: list[int | None]) -> str:
+    return ", ".join("never" if count is None else str(count) for count in counts) or "-"

@@ -1,0 +1,354 @@
+"""Evaluation of tracks on data sets with sequences: single frames, SeqSLAM and the filter.
+
+A frame is right if the photo that it is matched to is a positive of the set's rule. Frames without
+positives were taken outside the map; there every answer is wrong. All methods use the same scores.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.datasets.dataset import DatasetPhoto, EvaluationSet
+from shared.datasets.ground_truth import parse_rule
+from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.place_fit import fit_place_model
+from shared.evaluation.place_levels import LevelScheme, photos_inside
+from shared.evaluation.place_probability import PlaceModel
+from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.seqslam import seqslam_matches
+from shared.tracks.belief import Belief, TrackStatus
+from shared.tracks.evidence import FrameEvidence, frame_evidence
+from shared.tracks.filter import TrackFilter
+from shared.tracks.motion import MotionModel
+from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+
+Rows = NDArray[np.float32]
+
+HITS = 200
+"""of a frame, as in the API"""
+COARSE_RADII_M = (100.0, 500.0, 2000.0)
+OWN_PHOTOS_SAMPLED = 1000
+JUMP_M = 100.0
+"""between two frames, from which on the camera was carried away"""
+NOTICE_FRAMES = 20
+"""frames after which a track outside the map must be lost"""
+MAX_PRECISION_ERROR = 0.01
+SEQSLAM_CELL_M = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """What the methods answer for a frame."""
+
+    query: int
+    """index in the evaluation set"""
+    has_positive: bool
+    is_start: bool
+    """whether the track begins here: first frame, back in the map, or carried away"""
+    single_is_right: bool
+    seqslam_is_right: bool
+    filter_is_right: bool
+    smoothed_is_right: bool
+    single_score: float
+    probability: float
+    status: TrackStatus
+
+
+@dataclass(frozen=True)
+class SequenceMap:
+    """The map of a set: its photos, as the filter needs them, with descriptors."""
+
+    photos: Sequence[DatasetPhoto]
+    rows: Rows
+    """(n, D), of unit length"""
+    graph: ArrayPhotoGraph
+    locations: Sequence[PhotoLocation]
+    scheme: LevelScheme
+    model: PlaceModel | None
+    """None without coordinates and labels"""
+
+
+def prepare_map(
+    evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel, seed: int = 0
+) -> SequenceMap:
+    """Build the photo graph, and fit the place model on the map's own photos.
+
+    Args:
+        evaluation_set: The set; its rule is the tolerance.
+        rows: (n, D) descriptors of its database photos, of unit length.
+        motion: For the distance between photos without coordinates.
+        seed: Of the sample of own photos.
+    """
+    photos = evaluation_set.database
+    rule = parse_rule(evaluation_set.rule.removesuffix(" m"))
+    finest = (rule.frames + 0.5) * motion.typical_speed_mps
+    if rule.kind != "frames":
+        finest = rule.radius_m
+    coarser = tuple(radius for radius in COARSE_RADII_M if radius > finest)
+    scheme = LevelScheme(labels_are_paths=False, radii_m=(finest, *coarser))
+    table = PhotoTable.of_rows(
+        (
+            str(number),
+            photo.latitude,
+            photo.longitude,
+            photo.heading,
+            photo.place,
+            None if photo.frame is None else photo.sequence or "",
+            None if photo.frame is None else float(photo.frame),
+        )
+        for number, photo in enumerate(photos)
+    )
+    locations = [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos]
+    model = None
+    if any(location.is_known for location in locations):
+        model = _fit_model(photos, locations, rows, scheme, finest, seed)
+    return SequenceMap(photos, rows, ArrayPhotoGraph(table), locations, scheme, model)
+
+
+def _fit_model(
+    photos: Sequence[DatasetPhoto],
+    locations: Sequence[PhotoLocation],
+    rows: Rows,
+    scheme: LevelScheme,
+    radius_m: float,
+    seed: int,
+) -> PlaceModel:
+    def rank(photo: int) -> IndexRanking:
+        scores = (rows @ rows[photo]).astype(np.float64)
+        order = np.argsort(-scores, kind="stable")
+        order = order[order != photo]
+        return order, scores[order]
+
+    sampler = OwnPhotoSampler(
+        locations, [photo.captured_at for photo in photos], scheme, radius_m, rank
+    )
+    known = np.flatnonzero([location.is_known for location in locations])
+    rng = np.random.default_rng(seed)
+    sampled = rng.permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
+    spread = sampler.spread(sampled)
+    fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), scheme, spread)
+    return fitted.model
+
+
+def split_sequences(queries: Sequence[DatasetPhoto]) -> list[list[int]]:
+    """Return the query indices of each sequence, in the order of frames."""
+    sequences: dict[str | None, list[int]] = {}
+    for index, photo in enumerate(queries):
+        if photo.frame is not None:
+            sequences.setdefault(photo.sequence, []).append(index)
+    for members in sequences.values():
+        members.sort(key=lambda index: queries[index].frame or 0)
+    return list(sequences.values())
+
+
+def evaluate_sequence(
+    map_: SequenceMap,
+    evaluation_set: EvaluationSet,
+    members: Sequence[int],
+    rows: Rows,
+    motion: MotionModel,
+) -> tuple[list[FrameResult], float]:
+    """Follow one sequence.
+
+    Args:
+        map_: The map.
+        evaluation_set: The set.
+        members: Query indices in the order of frames.
+        rows: (len(members), D) descriptors of these queries, of unit length.
+        motion: The motion model.
+
+    Returns:
+        The frames, and the CPU seconds of the filter per frame.
+    """
+    queries = [evaluation_set.queries[index] for index in members]
+    scores = rows @ map_.rows.T
+    evidence = [
+        frame_of(map_, time_, row) for time_, row in zip(_times(queries), scores, strict=True)
+    ]
+    track_filter = TrackFilter(map_.graph, motion, map_.scheme)
+    belief: Belief | None = None
+    states = []
+    started = time.process_time()
+    for frame in evidence:
+        belief = track_filter.advance(belief, frame)
+        states.append(track_filter.state(belief))
+    seconds = (time.process_time() - started) / max(len(evidence), 1)
+    smoothed = [track_filter.state(each) for each in track_filter.smooth(evidence)]
+    sequence_matches = _seqslam(map_, scores, motion)
+    results = []
+    for number, index in enumerate(members):
+        positives = set(evaluation_set.positives[index].tolist())
+        results.append(
+            FrameResult(
+                query=index,
+                has_positive=bool(positives),
+                is_start=bool(positives) and _is_start(evaluation_set, members, number),
+                single_is_right=int(scores[number].argmax()) in positives,
+                seqslam_is_right=int(sequence_matches[number]) in positives,
+                filter_is_right=_photo(states[number].photo) in positives,
+                smoothed_is_right=_photo(smoothed[number].photo) in positives,
+                single_score=float(scores[number].max()),
+                probability=states[number].probability,
+                status=states[number].status,
+            )
+        )
+    return results, seconds
+
+
+def frame_of(map_: SequenceMap, time_: datetime, scores: Rows) -> FrameEvidence:
+    """Return the evidence of a frame from its scores, with the map's place model if it has one.
+
+    Args:
+        map_: The map.
+        time_: When the frame was taken.
+        scores: (n,) similarities to the map's photos.
+    """
+    count = min(HITS, len(scores))
+    order = np.argpartition(-scores, count - 1)[:count]
+    order = order[np.argsort(-scores[order], kind="stable")]
+    ids, found = [str(photo) for photo in order], scores[order].astype(np.float64).tolist()
+    not_in_map, best_place = None, None
+    if map_.model is not None:
+        ranking = [
+            RankedPhoto(score, map_.locations[p]) for p, score in zip(order, found, strict=True)
+        ]
+        estimate = map_.model.estimate(
+            ranking, _neighbours(map_, int(order[0])), map_.scheme, 0.95, map_.scheme.radii_m[0]
+        )
+        if estimate is not None:
+            not_in_map = estimate.not_in_map
+            inside = photos_inside(estimate.levels[0], ranking).tolist()
+            best_place = inside, estimate.probabilities[0]
+    return frame_evidence(
+        time_, ids, found, len(scores), not_in_map=not_in_map, best_place=best_place
+    )
+
+
+def _neighbours(map_: SequenceMap, photo: int) -> list[RankedPhoto]:
+    scores = map_.rows @ map_.rows[photo]
+    scores[photo] = -np.inf
+    order = np.argsort(-scores, kind="stable")[: min(EVIDENCE_DEPTH, len(scores) - 1)]
+    return [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
+
+
+def _times(queries: Sequence[DatasetPhoto]) -> list[datetime]:
+    """Return capture times; without them, frame numbers count seconds."""
+    captured = [photo.captured_at for photo in queries if photo.captured_at is not None]
+    if len(captured) == len(queries):
+        return captured
+    start = datetime(2000, 1, 1, tzinfo=UTC)
+    return [start + timedelta(seconds=photo.frame or 0) for photo in queries]
+
+
+def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int) -> bool:
+    if number == 0 or not len(evaluation_set.positives[members[number - 1]]):
+        return True
+    pair = members[number - 1 : number + 1]
+    metres = np.array(
+        [(photo.easting, photo.northing) for photo in (evaluation_set.queries[n] for n in pair)],
+        dtype=np.float64,
+    )
+    return bool(np.hypot(*(metres[1] - metres[0])) > JUMP_M)  # not for unknown ones, NaN
+
+
+def _seqslam(map_: SequenceMap, scores: Rows, motion: MotionModel) -> NDArray[np.int64]:
+    eastings = np.array([photo.easting for photo in map_.photos], dtype=np.float64)
+    northings = np.array([photo.northing for photo in map_.photos], dtype=np.float64)
+    if not np.isnan(eastings).any():
+        positions = np.stack([eastings, northings], axis=1)
+        return seqslam_matches(scores, positions, motion.typical_speed_mps, SEQSLAM_CELL_M)
+    order = np.arange(len(map_.photos), dtype=np.float64)[:, None]
+    return seqslam_matches(scores, order, 1.0, 1.0)
+
+
+def _photo(photo: str | None) -> int:
+    return -1 if photo is None else int(photo)
+
+
+def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, Any]:
+    """Compute the figures of the frames of all sequences.
+
+    Recall is over frames with positives; `calibration_error` over all frames.
+    """
+    frames = [frame for sequence in sequences for frame in sequence]
+    inside = [frame for frame in frames if frame.has_positive]
+    tracked = [frame for frame in frames if frame.status == "tracking"]
+    localised, noticed, claimed = [], [], []
+    for sequence in sequences:
+        for start, frame in enumerate(sequence):
+            if frame.is_start:
+                localised.append(_frames_until_right(sequence, start))
+            elif start and not frame.has_positive and sequence[start - 1].has_positive:
+                later = sequence[start : start + NOTICE_FRAMES + 1]
+                noticed.append(next((n for n, f in enumerate(later) if f.status == "lost"), None))
+        outside = _frames_outside(sequence)
+        claimed += [sequence[n].status == "tracking" for n, o in outside if o >= NOTICE_FRAMES]
+    return {
+        "frames": len(frames),
+        "frames_outside": len(frames) - len(inside),
+        "recall": {
+            name: _share([getattr(frame, f"{name}_is_right") for frame in inside])
+            for name in ("single", "seqslam", "filter", "smoothed")
+        },
+        "recall_at_99_precision": {
+            "single": _recall_at_precision(
+                [(frame.single_score, frame.single_is_right) for frame in frames], len(inside)
+            ),
+            "filter": _recall_at_precision(
+                [(frame.probability, frame.filter_is_right) for frame in frames], len(inside)
+            ),
+        },
+        "tracking": _share([frame.status == "tracking" for frame in inside]),
+        "tracking_precision": _share([frame.filter_is_right for frame in tracked]),
+        "calibration_error": expected_calibration_error(
+            [frame.probability for frame in frames], [frame.filter_is_right for frame in frames]
+        ),
+        "frames_to_localise": localised,
+        "frames_to_notice_lost": noticed,
+        "claimed_outside": _share(claimed),
+    }
+
+
+def _frames_until_right(sequence: Sequence[FrameResult], start: int) -> int | None:
+    """Return the frames until the place is tracked and right; None if the camera leaves before."""
+    for number, frame in enumerate(sequence[start:]):
+        if number and (frame.is_start or not frame.has_positive):
+            return None
+        if frame.status == "tracking" and frame.filter_is_right:
+            return number
+    return None
+
+
+def _frames_outside(sequence: Sequence[FrameResult]) -> list[tuple[int, int]]:
+    """Return the number of each frame outside the map, with how long it has been outside."""
+    found, since = [], 0
+    for number, frame in enumerate(sequence):
+        since = 0 if frame.has_positive else since + 1
+        if since:
+            found.append((number, since - 1))
+    return found
+
+
+def _recall_at_precision(answers: Sequence[tuple[float, bool]], inside: int) -> float | None:
+    """Return the largest share of frames found at a precision of 99 %."""
+    if not inside:
+        return None
+    ordered = sorted(answers, key=lambda answer: -answer[0])
+    right = np.cumsum([is_right for _, is_right in ordered])
+    precise = right >= (1 - MAX_PRECISION_ERROR) * np.arange(1, len(right) + 1)
+    # A score that several answers share can't separate them.
+    values = np.array([value for value, _ in ordered])
+    precise &= np.append(values[:-1] != values[1:], True)
+    return float(right[precise].max(initial=0)) / inside
+
+
+def _share(values: Sequence[bool]) -> float | None:
+    return float(np.mean(values)) if len(values) else None

@@ -1,0 +1,86 @@
+"""Belief of a track: where the camera may be after the frames so far."""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT_VERSION = 1
+MAX_BYTES = 1_000_000
+FloatArray = NDArray[np.float64]
+
+TrackStatus = Literal["converging", "tracking", "lost"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """Probabilities of where the camera is. Photos, `elsewhere` and `outside` add up to 1."""
+
+    time: datetime
+    """UTC, of the last frame"""
+    photos: tuple[str, ...]
+    """(n,) ids of the photos with a probability of their own"""
+    probabilities: FloatArray
+    """(n,)"""
+    elsewhere: float
+    """at any other photo of the map, all equally probable"""
+    outside: float
+    """outside the map"""
+    seen: dict[str, float]
+    """what the last frame's hits had beyond their prior, to tell how much the next frame adds"""
+    status: TrackStatus = "converging"
+    frames: int = 0
+    """number of frames so far"""
+
+    def to_bytes(self) -> bytes:
+        """Serialise: compressed JSON with a format version."""
+        content = {
+            "version": FORMAT_VERSION,
+            "time": self.time.isoformat(),
+            "photos": self.photos,
+            "probabilities": self.probabilities.tolist(),
+            "elsewhere": self.elsewhere,
+            "outside": self.outside,
+            "seen": self.seen,
+            "status": self.status,
+            "frames": self.frames,
+        }
+        return zlib.compress(json.dumps(content, separators=(",", ":")).encode())
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Belief:
+        """Read what `to_bytes` wrote.
+
+        Raises:
+            ValueError: Damaged, longer than MAX_BYTES, or of a newer format.
+        """
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"A belief has at most {MAX_BYTES} bytes, not {len(data)}.")
+        try:
+            content: dict[str, Any] = json.loads(zlib.decompress(data))
+            version = content.pop("version")
+            if version != FORMAT_VERSION:
+                raise ValueError(f"Belief format {version} is not known, only {FORMAT_VERSION}.")
+            belief = cls(
+                **content
+                | {
+                    "time": datetime.fromisoformat(content["time"]),
+                    "photos": tuple(content["photos"]),
+                    "probabilities": np.array(content["probabilities"], dtype=np.float64),
+                }
+            )
+        except (zlib.error, KeyError, TypeError, UnicodeDecodeError) as error:
+            raise ValueError(f"Not a belief: {error}") from error
+        total = float(belief.probabilities.sum()) + belief.elsewhere + belief.outside
+        if len(belief.photos) != len(belief.probabilities) or not math.isclose(
+            total, 1.0, abs_tol=1e-6
+        ):
+            raise ValueError("Not a belief: its probabilities do not add up to 1.")
+        return belief

@@ -1,0 +1,400 @@
+"""Discrete Bayes filter over the photos of a map, and its forward-backward smoother.
+
+The hidden state of a frame is the photo of the map that was taken nearest to it, or "outside the
+map" (topological localisation: Cummins and Newman 2008, FAB-MAP; Xu et al. 2021, "Probabilistic
+visual place recognition for hierarchical localization"). The belief is sparse: photos that were
+found or can be reached have a probability of their own, all others share `elsewhere` equally.
+
+Prediction. With K(i, j) the probability to move from photo i to j (rows add up to 1), r the
+probability that the camera was carried away, e and c those of leaving and entering the map:
+
+    p'(j)     = (1 - r - e) * sum_i p(i) K(i, j) + (r * (1 - outside) + c * outside) / n
+    outside'  = (1 - c) * outside + e * (1 - outside)
+
+Update. The frame's evidence has posterior probabilities q of a single frame, and its prior is
+known, so their ratio is the likelihood up to a factor (Bayes' rule):
+
+    p(j)      ~ p'(j) * (n * q(j) / (1 - q_out)) ** w
+    outside   ~ outside' * ((q_out / (1 - q_out)) / (s / (1 - s))) ** (w / 2)
+
+with s = OUT_OF_MAP_SHARE; photos that are no hits share what the hits leave. Two frames of the same
+view are not independent, so w is the share of the evidence that is new: the squared Hellinger
+distance w = 1 - sum_j sqrt(d(j) d_before(j)) of what exceeds the prior, d(j) ~ max(q(j) - (1 - s) /
+n, 0), from the frame before. A camera that stands still adds nothing. SeqSLAM (Milford and Wyeth
+2012) sums scores along lines of constant speed instead; it is the baseline of the evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.geodesy import EARTH_RADIUS_M
+from shared.tracks.belief import Belief
+from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix
+from shared.tracks.motion import DEFAULT_MOTION, MotionModel
+from shared.tracks.photo_graph import (
+    FloatArray,
+    Indices,
+    PhotoGraph,
+    PhotoTable,
+    distance_matrix_m,
+    unit_vectors,
+)
+from shared.tracks.state import TrackState, next_status, track_state
+
+CARRIED_AWAY = 0.002
+"""Probability per frame that the camera goes on at any place of the map"""
+LEAVING = 0.002
+"""Probability per frame that the camera leaves the map"""
+ENTERING = 0.02
+"""Probability per frame that a camera outside enters the map, at any place"""
+OUTSIDE_WEIGHT = 0.5
+"""Weight of a frame's evidence for "outside the map". Another season makes all frames of a ride
+look foreign alike, so that their evidence is not independent."""
+SPACING_M = 10.0
+"""Standard deviation between a frame and the photo of the map that shows it"""
+MAX_REACH_M = 1000.0
+"""A camera that may have moved farther is carried away as far as the filter knows"""
+MAX_PHOTOS = 300
+"""of a belief; the least probable ones beyond go back to `elsewhere`"""
+MOVING_PHOTOS = 100
+"""of a belief, the most probable. What is near the others is not added, which bounds the time of a
+step while the place is not known"""
+ALWAYS_KEPT = 50
+MIN_GAIN = 2.0
+"""A photo of a belief is at least this much more probable than one elsewhere"""
+NEGLIGIBLE = 1e-3
+"""Probability that the least probable photos of a belief give back to `elsewhere`"""
+FIX_OUTLIERS = 0.02
+"""Share of the position fixes that are wrong by more than their accuracy explains"""
+HEADING_FLOOR = 0.05
+"""Weight of photos that look in a direction which the odometry excludes"""
+SMOOTHED_AT_ONCE = 200
+LATER_FRAMES = 100
+"""Frames after those that are smoothed at once"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """One step of the filter, in the form that the backward pass needs."""
+
+    sources: Indices
+    """(n,) rows of the belief before that are still in the map"""
+    kernel: FloatArray
+    """(n, m) from them to the photos of the belief after it; what is missing to 1 was pruned"""
+    stay: float
+    """1 - r - e"""
+    carried_away: float
+    leaving: float
+    entering: float
+    weights: FloatArray
+    """(m,) likelihoods of the photos"""
+    weight_elsewhere: float
+    weight_outside: float
+    belief: Belief
+
+
+class TrackFilter:
+    """Follows a camera through a map.
+
+    Args:
+        graph: The photos of the map.
+        motion: How fast the camera moves.
+        scheme: The levels of the map, for the state.
+    """
+
+    def __init__(
+        self,
+        graph: PhotoGraph,
+        motion: MotionModel = DEFAULT_MOTION,
+        scheme: LevelScheme | None = None,
+    ) -> None:
+        self._graph = graph
+        self._motion = motion
+        self._scheme = scheme or LevelScheme(
+            labels_are_paths=False, radii_m=(25.0, 100.0, 500.0, 2000.0)
+        )
+
+    def advance(self, belief: Belief | None, evidence: FrameEvidence) -> Belief:
+        """Return the belief after a frame.
+
+        Args:
+            belief: The belief after the frame before; None for the first frame.
+            evidence: The frame, not older than the belief.
+
+        Raises:
+            ValueError: The frame is older than the belief.
+        """
+        return self._step(belief or _start(evidence.time), evidence).belief
+
+    def state(self, belief: Belief) -> TrackState:
+        """Return where the camera is according to a belief."""
+        return track_state(
+            belief, self._graph.photos(belief.photos), self._scheme, self._motion.typical_speed_mps
+        )
+
+    def smooth(self, frames: Sequence[FrameEvidence], start: Belief | None = None) -> list[Belief]:
+        """Return the belief at each frame given all frames, earlier and later.
+
+        This is the forward-backward algorithm (Rabiner 1989) on the sparse beliefs of the forward
+        pass; a photo that the forward pass gave up stays given up. In a long track, at least
+        LATER_FRAMES later frames count, so that memory does not grow with its length.
+
+        Args:
+            frames: In the order of time.
+            start: The belief before the first frame; None if nothing is known.
+        """
+        steps: list[_Step] = []
+        smoothed: list[Belief] = []
+        for frame in frames:
+            before = steps[-1].belief if steps else start or _start(frame.time)
+            steps.append(self._step(before, frame))
+            if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
+                smoothed += _backward(steps, self._graph.photo_count)[:SMOOTHED_AT_ONCE]
+                del steps[:SMOOTHED_AT_ONCE]
+        return smoothed + _backward(steps, self._graph.photo_count)
+
+    def _step(self, before: Belief, evidence: FrameEvidence) -> _Step:
+        seconds = (evidence.time - before.time).total_seconds()
+        if seconds < 0:
+            raise ValueError(f"The frame of {evidence.time} is older than {before.time}.")
+        count = max(self._graph.photo_count, 1)
+        sources = self._graph.photos(before.photos)
+        row_of = {photo: row for row, photo in enumerate(before.photos)}
+        rows = np.array([row_of[photo] for photo in sources.ids], dtype=np.int64)
+        reach_m = self._reach_m(seconds, evidence.odometry)
+        moving = np.argsort(-before.probabilities[rows], kind="stable")[:MOVING_PHOTOS]
+        reach = min(reach_m, MAX_REACH_M)
+        targets = self._targets(sources, sources.take(moving), evidence, reach)
+        kernel = self._kernel(sources, targets, seconds, evidence.odometry)
+        seen = _excess(evidence, count)
+        news = _news(before.seen, seen)
+
+        # Photos that were deleted since have given their probability to the others.
+        own = before.probabilities[rows]
+        elsewhere = before.elsewhere + float(before.probabilities.sum() - own.sum())
+        density = elsewhere / max(count - len(own), 1)
+        carried = max(CARRIED_AWAY * news, 1 - MAX_REACH_M / max(reach_m, MAX_REACH_M))
+        leaving, entering = LEAVING * news, ENTERING * news
+        stay = max(0.0, 1 - carried - leaving)
+        inside = 1 - before.outside
+        entered = (carried * inside + entering * before.outside) / count
+        is_new = np.arange(len(targets)) >= len(sources)  # the sources are the first targets
+        predicted = stay * (own @ kernel + density * is_new) + entered
+        remaining = max(count - len(targets), 0)
+        unseen = count - len(own) - int(is_new.sum())
+        predicted_elsewhere = stay * density * max(unseen, 0) + entered * remaining
+        predicted_outside = (1 - entering) * before.outside + leaving * inside
+
+        weights, weight_elsewhere, weight_outside = _likelihoods(targets, evidence, count, news)
+        posterior = predicted * weights
+        posterior_elsewhere = predicted_elsewhere * weight_elsewhere
+        posterior_outside = predicted_outside * weight_outside
+        total = float(posterior.sum()) + posterior_elsewhere + posterior_outside
+        posterior, posterior_elsewhere = posterior / total, posterior_elsewhere / total
+        kept = _kept(posterior, posterior_elsewhere / max(remaining, 1))
+        after = Belief(
+            time=evidence.time,
+            photos=tuple(targets.ids[kept].tolist()),
+            probabilities=posterior[kept],
+            elsewhere=posterior_elsewhere + float(posterior.sum() - posterior[kept].sum()),
+            outside=posterior_outside / total,
+            seen=seen,
+            status=before.status,
+            frames=before.frames + 1,
+        )
+        state = track_state(after, targets.take(kept), self._scheme, self._motion.typical_speed_mps)
+        after = replace(after, status=next_status(before.status, state.probability, after.outside))
+        return _Step(
+            rows,
+            kernel[:, kept],
+            stay,
+            carried,
+            leaving,
+            entering,
+            weights[kept],
+            weight_elsewhere,
+            weight_outside,
+            after,
+        )
+
+    def _reach_m(self, seconds: float, odometry: Odometry | None) -> float:
+        if odometry is not None:
+            return odometry.distance_m + 3 * (odometry.distance_accuracy_m + SPACING_M)
+        return self._motion.max_speed_mps * seconds + 3 * SPACING_M
+
+    def _targets(
+        self, sources: PhotoTable, moving: PhotoTable, evidence: FrameEvidence, reach_m: float
+    ) -> PhotoTable:
+        reach_seconds = reach_m / self._motion.typical_speed_mps
+        tables = [self._graph.photos([hit.photo for hit in evidence.hits])]
+        if len(moving):
+            tables.append(self._graph.around(moving, reach_m, reach_seconds))
+        if evidence.fix is not None:
+            tables.append(_near_fix(self._graph, evidence.fix))
+        return sources.union(*tables)
+
+    def _kernel(
+        self, sources: PhotoTable, targets: PhotoTable, seconds: float, odometry: Odometry | None
+    ) -> FloatArray:
+        """Return (n, m) probabilities to move from source to target photos; rows add up to 1.
+
+        The photos are coarser than the motion between two frames, so a camera changes its photo
+        only so often that it moves no farther than it can on average.
+        """
+        away = distance_matrix_m(sources, targets, self._motion.typical_speed_mps)
+        if odometry is None:
+            moved_m = self._motion.max_speed_mps * seconds
+            width = np.hypot(SPACING_M, moved_m / 2)
+            kernel = np.exp(-0.5 * (np.minimum(away, 1e9) / width) ** 2)
+        else:
+            moved_m = odometry.distance_m + odometry.distance_accuracy_m
+            kernel = _odometry_kernel(away, sources, targets, odometry)
+        kernel[away > min(self._reach_m(seconds, odometry), MAX_REACH_M)] = 0.0
+        total = kernel.sum(axis=1, keepdims=True)
+        # A photo that nothing can be reached from keeps its probability.
+        kernel = np.divide(kernel, total, out=np.zeros_like(kernel), where=total > 0)
+        mean_m = np.sum(kernel * np.where(kernel > 0, away, 0.0), axis=1)
+        moving = np.minimum(
+            1.0, np.divide(moved_m, mean_m, out=np.ones_like(mean_m), where=mean_m > 0)
+        )
+        moving[total[:, 0] <= 0] = 0.0
+        kernel *= moving[:, None]
+        diagonal = np.arange(len(sources))  # the sources are the first targets
+        kernel[diagonal, diagonal] += 1 - moving
+        moves: FloatArray = kernel
+        return moves
+
+
+def _start(time: datetime) -> Belief:
+    return Belief(time, (), np.zeros(0), 1 - OUT_OF_MAP_SHARE, OUT_OF_MAP_SHARE, {})
+
+
+def _odometry_kernel(
+    away: FloatArray, sources: PhotoTable, targets: PhotoTable, odometry: Odometry
+) -> FloatArray:
+    """Weigh moves by odometry. The distance between the ends may be shorter than the path."""
+    width = np.hypot(odometry.distance_accuracy_m, SPACING_M)
+    shorter = np.hypot(width, 0.3 * odometry.distance_m)
+    difference = np.minimum(away, 1e9) - odometry.distance_m
+    kernel = np.exp(-0.5 * (difference / np.where(difference > 0, width, shorter)) ** 2)
+    if odometry.heading_change_degrees is not None:
+        turned = targets.headings[None, :] - sources.headings[:, None]
+        turned = (turned - odometry.heading_change_degrees + 180) % 360 - 180
+        fit = np.exp(-0.5 * (turned / odometry.heading_accuracy_degrees) ** 2)
+        kernel *= np.where(np.isnan(turned), 1.0, HEADING_FLOOR + (1 - HEADING_FLOOR) * fit)
+    return kernel
+
+
+def _near_fix(graph: PhotoGraph, fix: PositionFix) -> PhotoTable:
+    return graph.near(fix.latitude, fix.longitude, 3 * np.hypot(fix.accuracy_m, SPACING_M))
+
+
+def _excess(evidence: FrameEvidence, count: int) -> dict[str, float]:
+    """Return by how much the probabilities of the hits exceed their prior."""
+    prior = (1 - OUT_OF_MAP_SHARE) / count
+    return {h.photo: h.probability - prior for h in evidence.hits if h.probability > prior}
+
+
+def _news(seen: dict[str, float], now: dict[str, float]) -> float:
+    """Return the share of a frame's evidence that the frame before did not have."""
+    if not seen or not now:
+        return 1.0
+    shared = sum(np.sqrt(value * seen.get(photo, 0.0)) for photo, value in now.items())
+    return float(max(0.0, 1 - shared / np.sqrt(sum(now.values()) * sum(seen.values()))))
+
+
+def _likelihoods(
+    targets: PhotoTable, evidence: FrameEvidence, count: int, news: float
+) -> tuple[FloatArray, float, float]:
+    """Return the likelihoods of the targets, of any other photo, and of "outside the map"."""
+    inside = max(1 - evidence.not_in_map, 1e-9)
+    probability = {hit.photo: hit.probability / inside for hit in evidence.hits}
+    other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
+    values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
+    weights = np.maximum(values * count, 1e-9) ** news
+    elsewhere = max(other * count, 1e-9) ** news
+    odds = max(evidence.not_in_map, 1e-9) / inside * (1 - OUT_OF_MAP_SHARE) / OUT_OF_MAP_SHARE
+    outside = odds ** (OUTSIDE_WEIGHT * news)
+    if evidence.fix is not None:
+        near = _fix_weights(targets, evidence.fix, count)
+        weights, elsewhere = weights * near, elsewhere * FIX_OUTLIERS
+    return weights, elsewhere, outside
+
+
+def _fix_weights(targets: PhotoTable, fix: PositionFix, count: int) -> FloatArray:
+    """Return the likelihoods of a position fix, 1 on average over the map."""
+    point = PhotoTable.of_rows([("", fix.latitude, fix.longitude, None, None, None, None)])
+    chords = np.linalg.norm(unit_vectors(targets) - unit_vectors(point), axis=1) * EARTH_RADIUS_M
+    # A Rayleigh distribution has 68 % within 1.51 standard deviations.
+    width = np.hypot(fix.accuracy_m / 1.51, SPACING_M)
+    near = np.nan_to_num(np.exp(-0.5 * (chords / width) ** 2))
+    total = float(near.sum())
+    share = near * count / total if total > 1e-9 else near
+    weights: FloatArray = FIX_OUTLIERS + (1 - FIX_OUTLIERS) * share
+    return weights
+
+
+def _kept(posterior: FloatArray, density: float) -> Indices:
+    """Return the rows of the photos that keep a probability of their own."""
+    order = np.argsort(-posterior, kind="stable")[:MAX_PHOTOS]
+    tail = posterior.sum() - np.cumsum(posterior[order])
+    kept = (posterior[order] > MIN_GAIN * density) & (tail > NEGLIGIBLE)
+    kept[:ALWAYS_KEPT] = True
+    return np.sort(order[kept])
+
+
+def _backward(steps: Sequence[_Step], count: int) -> list[Belief]:
+    """Run the backward pass, and multiply it with the forward beliefs."""
+    smoothed: list[Belief] = []
+    photos = np.ones(len(steps[-1].belief.photos)) if steps else np.zeros(0)
+    elsewhere = outside = 1.0
+    for index in range(len(steps) - 1, -1, -1):
+        belief = steps[index].belief
+        own = belief.probabilities * photos
+        parts = belief.elsewhere * elsewhere, belief.outside * outside
+        total = float(own.sum()) + sum(parts)
+        smoothed.append(
+            replace(
+                belief,
+                probabilities=own / total,
+                elsewhere=parts[0] / total,
+                outside=parts[1] / total,
+            )
+        )
+        step = steps[index]
+        message = step.weights * photos
+        else_message = step.weight_elsewhere * elsewhere
+        out_message = step.weight_outside * outside
+        if index == 0:
+            break
+        before = steps[index - 1].belief
+        kept = len(message)
+        anywhere = (float(message.sum()) + (count - kept) * else_message) / count
+        moved = step.kernel @ message + (1 - step.kernel.sum(axis=1)) * else_message
+        carried = step.carried_away * anywhere + step.leaving * out_message
+        elsewhere_after = _from_elsewhere(step, before, message, else_message, count)
+        elsewhere = step.stay * elsewhere_after + carried
+        photos = np.full(len(before.photos), elsewhere)  # those of deleted photos
+        photos[step.sources] = step.stay * moved + carried
+        outside = (1 - step.entering) * out_message + step.entering * anywhere
+        scale = max(float(photos.max(initial=0.0)), elsewhere, outside)
+        photos, elsewhere, outside = photos / scale, elsewhere / scale, outside / scale
+    return smoothed[::-1]
+
+
+def _from_elsewhere(
+    step: _Step, before: Belief, message: FloatArray, else_message: float, count: int
+) -> float:
+    """Return the message to `elsewhere`, whose photos stay where they are."""
+    sources = {before.photos[row] for row in step.sources.tolist()}
+    is_new = np.array([photo not in sources for photo in step.belief.photos], dtype=bool)
+    unseen = max(count - len(sources), 1)
+    appeared = float(message[is_new].sum())
+    return (appeared + max(unseen - int(is_new.sum()), 0) * else_message) / unseen

@@ -1,0 +1,50 @@
+"""Motion models: how fast a camera moves through the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+TYPICAL_SHARE = 0.4
+"""Typical speed of a motion model that is given by its maximum, as a share of the maximum"""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """Speeds of a kind of motion in metres per second."""
+
+    name: str
+    typical_speed_mps: float
+    max_speed_mps: float
+
+
+MOTION_MODELS = {
+    model.name: model
+    for model in (
+        MotionModel("walk", 1.4, 3.0),
+        MotionModel("bicycle", 5.0, 12.0),
+        MotionModel("car", 12.0, 40.0),
+        MotionModel("train", 30.0, 90.0),
+    )
+}
+DEFAULT_MOTION = MOTION_MODELS["car"]
+
+
+def motion_model(motion: str | float) -> MotionModel:
+    """Return a motion model by its name, or by its maximum speed in metres per second.
+
+    Raises:
+        ValueError: An unknown name, or a speed that is not positive and finite.
+    """
+    if isinstance(motion, str) and motion in MOTION_MODELS:
+        return MOTION_MODELS[motion]
+    try:
+        speed = float(motion)
+    except ValueError:
+        speed = math.nan
+    if not (math.isfinite(speed) and speed > 0):
+        raise ValueError(
+            f"The motion must be {', '.join(MOTION_MODELS)} or a maximum speed in m/s above 0, "
+            f"not {motion!r}."
+        )
+    return MotionModel(f"{speed:g}", speed * TYPICAL_SHARE, speed)

@@ -1,0 +1,293 @@
+"""The filter and the smoother against brute force over all paths of small hidden Markov models."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.tracks.belief import Belief
+from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
+from shared.tracks.filter import CARRIED_AWAY, ENTERING, LEAVING, SPACING_M, TrackFilter
+from shared.tracks.motion import MOTION_MODELS, motion_model
+from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_map
+
+COUNT = 4
+WALK = MOTION_MODELS["walk"]
+
+
+def random_frames(seed: int, steps: int) -> list[FrameEvidence]:
+    rng = np.random.default_rng(seed)
+    frames = []
+    for step in range(steps):
+        shares = rng.dirichlet(np.full(COUNT + 1, 0.5)) * 0.98 + 0.02 / (COUNT + 1)
+        frames.append(frame(2.0 * step, shares[:COUNT].tolist(), float(shares[COUNT])))
+    return frames
+
+
+def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
+    """(steps, photos + 1) smoothed probabilities over all paths; the last is "outside"."""
+    away = 10.0 * np.abs(np.subtract.outer(np.arange(COUNT), np.arange(COUNT)))
+    width = np.hypot(SPACING_M, WALK.max_speed_mps * 2.0 / 2)
+    kernel = np.exp(-0.5 * (away / width) ** 2)
+    kernel[away > WALK.max_speed_mps * 2.0 + 3 * SPACING_M] = 0.0
+    kernel /= kernel.sum(axis=1, keepdims=True)
+    moving = np.minimum(1, 2.0 * WALK.max_speed_mps / (kernel * away).sum(axis=1))[:, None]
+    kernel = moving * kernel + (1 - moving) * np.eye(COUNT)
+    start = np.append(np.full(COUNT, (1 - OUT_OF_MAP_SHARE) / COUNT), OUT_OF_MAP_SHARE)
+    shown = np.array([[hit.probability for hit in f.hits] for f in frames])
+    prior_odds = OUT_OF_MAP_SHARE / (1 - OUT_OF_MAP_SHARE)
+    likelihood = np.column_stack(
+        [
+            [[hit.probability / (1 - f.not_in_map) * COUNT for hit in f.hits] for f in frames],
+            [np.sqrt(f.not_in_map / (1 - f.not_in_map) / prior_odds) for f in frames],
+        ]
+    )
+    news = np.ones(len(frames))
+    for step in range(1, len(frames)):
+        now, before = (
+            np.maximum(shown[n] - (1 - OUT_OF_MAP_SHARE) / COUNT, 0) for n in (step, step - 1)
+        )
+        if now.sum() > 0 and before.sum() > 0:
+            news[step] = 1 - np.sqrt(now * before).sum() / np.sqrt(now.sum() * before.sum())
+    moves = []
+    for step in range(len(frames)):
+        move = np.zeros((COUNT + 1, COUNT + 1))
+        carried, leaving, entering = (
+            rate * news[step] for rate in (CARRIED_AWAY, LEAVING, ENTERING)
+        )
+        # A first frame moves nothing: all photos are equally probable before it.
+        walked = np.eye(COUNT) if step == 0 else kernel
+        move[:COUNT, :COUNT] = (1 - carried - leaving) * walked + carried / COUNT
+        move[:COUNT, COUNT] = leaving
+        move[COUNT, :COUNT] = entering / COUNT
+        move[COUNT, COUNT] = 1 - entering
+        moves.append(move)
+    smoothed = np.zeros((len(frames), COUNT + 1))
+    first = start @ moves[0]
+    for path in itertools.product(range(COUNT + 1), repeat=len(frames)):
+        probability = first[path[0]] * likelihood[0, path[0]] ** news[0]
+        for step in range(1, len(frames)):
+            probability *= moves[step][path[step - 1], path[step]]
+            probability *= likelihood[step, path[step]] ** news[step]
+        for step, state in enumerate(path):
+            smoothed[step, state] += probability
+    normalised: NDArray[np.float64] = smoothed / smoothed.sum(axis=1, keepdims=True)
+    return normalised
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_forward_pass_is_that_of_the_hidden_markov_model(seed: int) -> None:
+    frames = random_frames(seed, 5)
+    track_filter, belief = TrackFilter(line_map(COUNT), WALK), None
+    for step, each in enumerate(frames):
+        belief = track_filter.advance(belief, each)
+        expected = brute_force(frames[: step + 1])[-1]
+        found = dict(zip(belief.photos, belief.probabilities, strict=True))
+        assert [found[str(photo)] for photo in range(COUNT)] == pytest.approx(expected[:COUNT])
+        assert belief.outside == pytest.approx(expected[COUNT])
+        assert belief.elsewhere == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_forward_and_backward_together_are_those_of_the_hidden_markov_model(seed: int) -> None:
+    frames = random_frames(seed, 5)
+    smoothed = TrackFilter(line_map(COUNT), WALK).smooth(frames)
+    for belief, expected in zip(smoothed, brute_force(frames), strict=True):
+        found = dict(zip(belief.photos, belief.probabilities, strict=True))
+        assert [found[str(photo)] for photo in range(COUNT)] == pytest.approx(expected[:COUNT])
+        assert belief.outside == pytest.approx(expected[COUNT])
+
+
+def test_a_camera_that_stands_still_learns_nothing_from_more_frames_of_the_same_view() -> None:
+    track_filter = TrackFilter(line_map(20), WALK)
+    first = track_filter.advance(None, pointing_at(7, 20, 0))
+    belief = first
+    for _ in range(30):
+        belief = track_filter.advance(belief, pointing_at(7, 20, 0))
+    state, before = track_filter.state(belief), track_filter.state(first)
+    assert state.probability == pytest.approx(before.probability, abs=0.1)
+
+
+def test_frames_that_follow_the_street_are_tracked_with_their_position_and_heading() -> None:
+    track_filter, belief = TrackFilter(line_map(200), motion_model(15.0)), None
+    statuses = []
+    for step in range(12):
+        belief = track_filter.advance(belief, pointing_at(50 + step, 200, step, 0.3))
+        statuses.append(belief.status)
+    assert belief is not None
+    state = track_filter.state(belief)
+    assert statuses[0] == "converging"
+    assert state.status == "tracking"
+    assert state.photo in {"60", "61"}
+    assert state.longitude == pytest.approx(61 * np.degrees(10 / 6_371_008.8), abs=2e-4)
+    assert state.heading == 90.0
+    assert state.probability > 0.9
+    probabilities = [level.probability for level in state.levels]
+    assert probabilities == sorted(probabilities)
+    assert state.radius_68_m is not None
+    assert state.radius_68_m <= 25.0
+
+
+def test_a_camera_that_was_carried_away_is_found_again() -> None:
+    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
+    for step in range(20):
+        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, 0.3))
+    assert belief is not None
+    assert str(track_filter.state(belief).photo) in {"68", "69", "70"}
+    for step in range(20, 25):
+        belief = track_filter.advance(belief, pointing_at(380 + step, 500, step, 0.3))
+    assert belief.status == "tracking"
+    assert str(track_filter.state(belief).photo) in {"403", "404", "405"}
+
+
+def test_a_camera_that_leaves_the_map_is_lost_and_nowhere_else() -> None:
+    rng = np.random.default_rng(3)
+    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
+    for step in range(20):
+        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, 0.3))
+    statuses = []
+    for step in range(20, 60):
+        shares = rng.dirichlet(np.full(500, 0.05)) * 0.7
+        belief = track_filter.advance(belief, frame(step, shares.tolist(), 0.3))
+        statuses.append(belief.status)
+    assert statuses.index("lost") < 20
+    assert "tracking" not in statuses[20:]
+    assert belief is not None
+    assert belief.outside > 0.5
+
+
+def test_odometry_decides_between_two_directions_of_the_same_view() -> None:
+    track_filter = TrackFilter(line_map(200), motion_model(40.0))
+    belief = track_filter.advance(None, pointing_at(100, 200, 0, 0.9))
+    after = pointing_at(100, 200, 1, 0.9)
+    still = after.model_copy(
+        update={"odometry": Odometry(distance_m=0.0, distance_accuracy_m=1.0), "hits": ()}
+    )
+    moved = after.model_copy(
+        update={"odometry": Odometry(distance_m=60.0, distance_accuracy_m=1.0), "hits": ()}
+    )
+    at_rest, away = (track_filter.advance(belief, each) for each in (still, moved))
+
+    def at_start(after_frame: Belief) -> float:
+        return float(after_frame.probabilities[after_frame.photos.index("100")])
+
+    assert at_start(at_rest) > 3 * at_start(away)
+
+
+def test_a_position_fix_finds_photos_that_no_hit_points_to() -> None:
+    graph = line_map(300)
+    fix = PositionFix(latitude=0.0, longitude=np.degrees(2000 / 6_371_008.8), accuracy_m=8.0)
+    track_filter, belief = TrackFilter(graph, WALK), None
+    for step in range(4):
+        evidence = FrameEvidence(time=at(step), fix=fix)
+        belief = track_filter.advance(belief, evidence)
+    assert belief is not None
+    state = track_filter.state(belief)
+    assert state.status == "tracking"
+    assert state.photo in {"199", "200", "201"}
+
+
+def test_photos_that_were_deleted_between_two_frames_lose_their_probability() -> None:
+    belief = TrackFilter(line_map(30), WALK).advance(None, pointing_at(29, 30, 0, 0.9))
+    after = TrackFilter(line_map(10), WALK).advance(belief, pointing_at(3, 10, 1, 0.3))
+    assert set(after.photos) <= {str(number) for number in range(10)}
+    total = after.probabilities.sum() + after.elsewhere + after.outside
+    assert total == pytest.approx(1.0)
+
+
+def test_a_frame_older_than_the_belief_is_an_error() -> None:
+    track_filter = TrackFilter(line_map(5), WALK)
+    belief = track_filter.advance(None, pointing_at(1, 5, 10))
+    with pytest.raises(ValueError, match="older"):
+        track_filter.advance(belief, pointing_at(1, 5, 9))
+
+
+def test_sequences_without_coordinates_are_followed_along_their_own_time() -> None:
+    rng = np.random.default_rng(0)
+    track_filter, belief = TrackFilter(sequence_map(1000), MOTION_MODELS["train"]), None
+    right = 0
+    for step in range(60):
+        # One frame in three shows its own photo best, the others show any.
+        shown = 300 + step if rng.uniform() < 0.34 else int(rng.integers(1000))
+        hits = tuple(
+            Hit(photo=str(photo), score=probability, probability=probability)
+            for photo, probability in ((shown, 0.25), (int(rng.integers(1000)), 0.05))
+        )
+        belief = track_filter.advance(belief, FrameEvidence(time=at(step), hits=hits))
+        photo = track_filter.state(belief).photo
+        right += photo is not None and abs(int(photo) - 300 - step) <= 10
+    assert right > 40
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_probabilities_add_up_to_one_for_any_times_odometry_and_hits(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = line_map(60) if seed % 2 else sequence_map(60)
+    track_filter, belief, seconds = TrackFilter(graph, motion_model("car")), None, 0.0
+    for _ in range(15):
+        seconds += float(rng.choice([0.0, 1e-6, 0.03, 1.0, 60.0, 1e6, 1e9]))
+        shares = rng.dirichlet(np.full(8, 0.2)) * rng.uniform(0, 1)
+        photos = rng.choice(90, size=7, replace=False)  # some are not in the map
+        evidence = FrameEvidence(
+            time=at(seconds),
+            hits=tuple(
+                Hit(photo=str(photo), score=share, probability=min(1.0, share))
+                for photo, share in zip(photos.tolist(), shares.tolist(), strict=False)
+            ),
+            not_in_map=float(1 - shares[:7].sum()) if seed % 3 else 0.0,
+            odometry=Odometry(
+                distance_m=float(rng.choice([0.0, 1e-9, 5.0, 1e6])),
+                distance_accuracy_m=float(rng.choice([1e-9, 1.0, 1e6])),
+                heading_change_degrees=float(rng.choice([-360.0, 0.0, 90.0])),
+            )
+            if rng.uniform() < 0.5
+            else None,
+            fix=PositionFix(
+                latitude=float(rng.choice([0.0, 90.0])), longitude=180.0, accuracy_m=1e-9 + 50
+            )
+            if rng.uniform() < 0.3
+            else None,
+        )
+        belief = track_filter.advance(belief, evidence)
+        total = float(belief.probabilities.sum()) + belief.elsewhere + belief.outside
+        assert total == pytest.approx(1.0)
+        assert (belief.probabilities >= 0).all()
+        assert 0 <= track_filter.state(belief).probability <= 1
+        assert len(belief.to_bytes()) < 1_000_000
+
+
+def test_the_belief_does_not_depend_on_how_large_the_map_beyond_reach_is() -> None:
+    for count in (300, 3000):
+        track_filter, belief = TrackFilter(line_map(count), motion_model(15.0)), None
+        for step in range(10):
+            evidence = pointing_at(50 + step, 100, step, 0.5)
+            belief = track_filter.advance(belief, replace_hits(evidence, 20))
+        assert belief is not None
+        assert len(belief.photos) <= 60
+
+
+def replace_hits(evidence: FrameEvidence, count: int) -> FrameEvidence:
+    """Keep the most probable hits of a frame."""
+    hits = sorted(evidence.hits, key=lambda hit: -hit.probability)[:count]
+    return evidence.model_copy(update={"hits": tuple(hits)})
+
+
+def test_smoothing_of_no_frames_is_empty() -> None:
+    assert TrackFilter(line_map(3)).smooth([]) == []
+
+
+def test_a_belief_survives_its_serialisation_between_two_frames() -> None:
+    track_filter = TrackFilter(line_map(50), WALK)
+    belief = track_filter.advance(None, pointing_at(7, 50, 0))
+    restored = type(belief).from_bytes(belief.to_bytes())
+    again, direct = (
+        track_filter.advance(each, pointing_at(8, 50, 1)) for each in (restored, belief)
+    )
+    assert again.photos == direct.photos
+    assert again.probabilities.tolist() == direct.probabilities.tolist()
+    assert replace(again, photos=(), probabilities=np.zeros(0), seen={}).time == direct.time
