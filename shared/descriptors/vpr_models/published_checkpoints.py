@@ -102,6 +102,7 @@ _RESNETS = {
     "resnet34": ((64, 64, 3, 3), (3, 4, 6, 3)),
     "resnet50": ((64, 64, 1, 1), (3, 4, 6, 3)),
     "resnet101": ((64, 64, 1, 1), (3, 4, 23, 3)),
+    "resnet152": ((64, 64, 1, 1), (3, 8, 36, 3)),
     "resnext50_32x4d": ((128, 64, 1, 1), (3, 4, 6, 3)),
 }
 """Shape of the first convolution of the first stage, and the number of blocks of each stage"""

@@ -189,7 +189,15 @@ def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size(
 
 @pytest.mark.parametrize(
     "backbone",
-    ["resnet34", "resnet50", "resnet101", "resnext50_32x4d", "dinov2_vitb14", "dinov2_vitl14"],
+    [
+        "resnet34",
+        "resnet50",
+        "resnet101",
+        "resnet152",
+        "resnext50_32x4d",
+        "dinov2_vitb14",
+        "dinov2_vitl14",
+    ],
 )
 def test_the_backbone_is_recognised_by_its_tensors(backbone: str) -> None:
     is_resnet = not backbone.startswith("dinov2")
