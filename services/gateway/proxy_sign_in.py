@@ -9,7 +9,7 @@ also through the proxy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from ipaddress import IPv4Network, IPv6Network, ip_address, ip_network
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 
 from starlette.datastructures import Headers
 
@@ -81,6 +81,9 @@ class ProxySignIn:
             address = ip_address(peer or "")
         except ValueError:  # no IP address: a Unix socket, or a test
             return False
+        # A server that listens on :: sees 10.0.0.5 as ::ffff:10.0.0.5.
+        if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+            address = address.ipv4_mapped
         return any(address in network for network in self.networks)
 
 

@@ -126,7 +126,11 @@ def parse_relative_path(text: str) -> str | None:
     """
     parts = ("".join(c for c in part if c.isprintable()) for part in re.split(r"[/\\]", text))
     kept = [part for part in parts if part not in ("", ".", "..") and not DRIVE.fullmatch(part)]
-    return "/".join(kept)[-MAX_PATH_CHARACTERS:] or None
+    path = "/".join(kept)
+    if len(path) > MAX_PATH_CHARACTERS:
+        # The end may begin with what has to be dropped: `/1.jpg`, or `../1.jpg` of `a../1.jpg`.
+        return parse_relative_path(path[-MAX_PATH_CHARACTERS:])
+    return path or None
 
 
 def _number(values: dict[str, str], field: str, minimum: float, maximum: float) -> float | None:

@@ -20,6 +20,7 @@ router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
 DAY_SECONDS = 86_400
 MAX_KEY_DAYS = 36_500
 
+MapName = Annotated[str, Field(min_length=1, max_length=100, pattern=NO_NUL_PATTERN)]
 KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 
@@ -28,7 +29,7 @@ class CreateKeyRequest(RequestModel):
 
     name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
     scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))
-    maps: list[str] | None = Field(
+    maps: list[MapName] | None = Field(
         None,
         min_length=1,
         max_length=100,

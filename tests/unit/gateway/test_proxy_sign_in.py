@@ -54,7 +54,7 @@ def code(authenticator: Authenticator, peer: str | None, *pairs: tuple[str, str]
 USER = ("X-Forwarded-User", "ada")
 
 
-@pytest.mark.parametrize("peer", [PROXY, "fd12::1"])
+@pytest.mark.parametrize("peer", [PROXY, f"::ffff:{PROXY}", "fd12::1"])
 def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
     sign_in: Authenticator, peer: str
 ) -> None:
@@ -64,7 +64,9 @@ def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
     assert call(sign_in, peer, USER, ("X-Forwarded-Groups", "chiefs")).scopes == ALL_SCOPES
 
 
-@pytest.mark.parametrize("peer", ["10.0.0.6", "127.0.0.1", "::1", "", None, "unix"])
+@pytest.mark.parametrize(
+    "peer", ["10.0.0.6", "::ffff:10.0.0.6", "127.0.0.1", "::1", "", None, "unix"]
+)
 def test_the_same_headers_from_anybody_else_are_ignored(
     sign_in: Authenticator, peer: str | None
 ) -> None:

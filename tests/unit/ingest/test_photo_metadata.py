@@ -77,6 +77,12 @@ def test_of_a_long_path_the_end_is_kept() -> None:
     assert path.endswith("/deep/1.jpg")
 
 
+@pytest.mark.parametrize("cut", ["/", "../", "x../", "C:/"])
+def test_the_end_of_a_long_path_is_a_label_too(cut: str) -> None:
+    rest = "a" * (1000 - len(cut.removeprefix("x")))
+    assert parse_relative_path(f"folder{cut}{rest}") == rest
+
+
 def test_empty_and_missing_fields_are_left_out() -> None:
     assert read_form_fields({}) == PhotoFields()
     assert read_form_fields({"latitude": "", "place": "  ", "tags": "", "metadata": ""}) == (
