@@ -31,6 +31,7 @@ def described() -> DescribedPhotos:
         [PhotoLocation(None, None, place) for place in places],
         [None] * len(places),
         np.arange(len(places)) % PER_PLACE == 0,
+        np.arange(len(places)) // PER_PLACE,
         LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
         25.0,
     )
