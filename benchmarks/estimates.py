@@ -303,7 +303,10 @@ def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
 
 def _tower() -> Path:
     if "PLACEWISE_TEST_DATA" not in os.environ:
-        raise Misconfigured("name an evaluation set, or set PLACEWISE_TEST_DATA")
+        raise Misconfigured(
+            "no_data_set",
+            "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA.",
+        )
     return Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"
 
 
