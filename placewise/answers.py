@@ -167,6 +167,70 @@ class Similar(Answer):
     missing: list[str]
 
 
+class TrackState(Answer):
+    """Where the camera of a track is: `status` is converging, tracking or lost."""
+
+    status: str
+    image_id: UUID | None
+    latitude: float | None
+    longitude: float | None
+    place: str | None
+    heading: float | None
+    probability: float
+    levels: list[EstimateLevel]
+    """finest first"""
+    radius_68_m: float | None
+    radius_95_m: float | None
+    not_in_map_probability: float
+
+
+class Track(Answer):
+    """A track with the state after its last applied frame."""
+
+    track_id: UUID
+    motion: str | None
+    max_speed_mps: float | None
+    version: int
+    """number of accepted frames"""
+    pending: int
+    """number of accepted frames that are not applied yet"""
+    state: TrackState | None
+    created_at: datetime
+    updated_at: datetime
+    expires_at: datetime
+
+
+class TrackFrame(Answer):
+    """A frame of a track: `status` is pending, applied or failed."""
+
+    frame_id: UUID
+    captured_at: datetime
+    filename: str
+    status: str
+    state: TrackState | None
+    error: dict[str, Any] | None
+    job_id: UUID
+    job_url: str
+    frame_url: str
+    version: int
+    """that of the track when the frame was accepted"""
+
+
+class OneTrack(Track):
+    """A track with its frames, in the order of their times."""
+
+    smoothed: bool
+    frames: list[TrackFrame]
+
+
+class DeletedTrack(Answer):
+    """Response to the deletion of a track."""
+
+    success: bool
+    message: str
+    deleted_track_id: UUID
+
+
 class Progress(Answer):
     """Progress counters of a job."""
 

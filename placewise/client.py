@@ -10,6 +10,7 @@ import inspect
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
@@ -23,18 +24,22 @@ from placewise.answers import (
     CreatedKey,
     Deleted,
     DeletedMap,
+    DeletedTrack,
     Evaluation,
     Generation,
     Job,
     Key,
     Map,
     OnePhoto,
+    OneTrack,
     Photo,
     RemovedModel,
     Search,
     Similar,
     Started,
     Stats,
+    Track,
+    TrackFrame,
     Uploaded,
     Vocabulary,
     WordWeights,
@@ -196,6 +201,81 @@ class Client(Transport):
                 pass
             answer = self._call("GET", answer["result_url"].removeprefix(API))
         return Similar(**answer)
+
+    def begin_track(
+        self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
+    ) -> Track:
+        """Begin a track: a sequence of frames that is followed through the map.
+
+        Args:
+            motion: How the camera moves: `walk`, `bicycle`, `car` (the default) or `train`.
+            max_speed_mps: Its maximum speed in m/s, instead of `motion`.
+            start: Where the track begins, if known: `latitude`, `longitude` (degrees) and
+                `accuracy_m`; or `place`.
+        """
+        body = drop_none(motion=motion, max_speed_mps=max_speed_mps, **start)
+        return Track(**self._call("POST", "/tracks", json=body))
+
+    def add_frame(
+        self,
+        track_id: Id,
+        photo: str | Path,
+        captured_at: datetime,
+        *,
+        wait: bool = True,
+        expected_version: int | None = None,
+        **measured: float | None,
+    ) -> TrackFrame:
+        """Add a frame to a track. The photo is not stored in the map.
+
+        Args:
+            track_id: The track.
+            photo: The file.
+            captured_at: When it was taken; unique in the track.
+            wait: Wait for the state; False returns as soon as the frame is stored.
+            expected_version: Version that the track must have, such as `version` of the frame
+                before.
+            measured: `latitude`, `longitude` (degrees) and `accuracy_m` of a position;
+                `distance_m` and `distance_accuracy_m`, also `turn_degrees` and
+                `turn_accuracy_degrees`, of odometry since the frame before.
+
+        Raises:
+            Conflict: `track_changed`, `frame_differs`, `frame_too_late` or `track_full`.
+            Unprocessable: A field or the image is invalid.
+        """
+        fields = drop_none(
+            captured_at=captured_at.isoformat(), expected_version=expected_version, **measured
+        )
+        answer = self._send_file(
+            f"/tracks/{track_id}/frames",
+            Path(photo),
+            data={name: str(value) for name, value in fields.items()},
+            headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
+        )
+        frame = TrackFrame(**answer)
+        while wait and frame.status == "pending":
+            frame = self.track_frame(track_id, frame.frame_id, wait_seconds=POLL_SECONDS)
+        return frame
+
+    def track_frame(self, track_id: Id, frame_id: Id, *, wait_seconds: float = 0) -> TrackFrame:
+        """Get a frame of a track; with `wait_seconds`, wait that long until it is applied."""
+        path = f"/tracks/{track_id}/frames/{frame_id}"
+        headers = {"Prefer": f"wait={wait_seconds:.0f}"}
+        return TrackFrame(**self._call("GET", path, headers=headers))
+
+    def track(self, track_id: Id, *, smoothed: bool = False) -> OneTrack:
+        """Get a track with all frames; `smoothed` uses the later frames for each state, too."""
+        params = drop_none(smoothed=smoothed or None)
+        return OneTrack(**self._call("GET", f"/tracks/{track_id}", params=params))
+
+    def tracks(self) -> Iterator[Track]:
+        """Iterate over the tracks of the map, newest first."""
+        for track in self._iterate("/tracks", "tracks"):
+            yield Track(**track)
+
+    def delete_track(self, track_id: Id) -> DeletedTrack:
+        """Delete a track with its frames."""
+        return DeletedTrack(**self._call("DELETE", f"/tracks/{track_id}"))
 
     def job(self, work: Work, wait_seconds: float = 0) -> Job:
         """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""

@@ -28,6 +28,7 @@ COMMANDS = {
     "index": ("ingest.index", "index"),
     "import-anyloc": ("ingest.import_anyloc", "import_anyloc"),
     "query": ("query", "query"),
+    "track": ("track.command", "track"),
     "export": ("export", "app"),
     "describe": ("descriptors.describe", "describe"),
     "evaluate": ("evaluation.commands", "evaluate"),

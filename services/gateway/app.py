@@ -31,6 +31,7 @@ from services.gateway.routes import (
     presigned_uploads,
     similarity,
     stats,
+    tracks,
     uploads,
     webhooks,
 )
@@ -103,6 +104,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         presigned_uploads,
         jobs,
         similarity,
+        tracks,
         photos,
         model_changes,
         models,

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 from uuid import UUID
 
 from fastapi import Depends, Query, Request
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, Counter
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
@@ -229,10 +229,19 @@ class GatewayContext:
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
     neighbours: NeighbourCache = field(default_factory=NeighbourCache)
+    track_frames: Counter = field(init=False)
+    """Applied frames of tracks by the status of the track, or `failed`."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "job_notifier", JobNotifier(self.catalog))
         object.__setattr__(self, "connections", Connections(ConnectionLimits.of(self.settings)))
+        track_frames = Counter(
+            "placewise_gateway_track_frames",
+            "Frames of tracks that were applied, by the status of their track.",
+            ["status"],
+            registry=self.registry,
+        )
+        object.__setattr__(self, "track_frames", track_frames)
 
 
 def get_gateway_context(request: Request) -> GatewayContext:
@@ -325,6 +334,8 @@ UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
 JobId = Annotated[UUID, _uuid_or_not_found("job")]
 GenerationId = Annotated[UUID, _uuid_or_not_found("generation")]
 KeyId = Annotated[UUID, _uuid_or_not_found("key")]
+TrackId = Annotated[UUID, _uuid_or_not_found("track")]
+FrameId = Annotated[UUID, _uuid_or_not_found("frame")]
 WebhookId = Annotated[UUID, _uuid_or_not_found("webhook")]
 
 

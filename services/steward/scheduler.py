@@ -26,6 +26,7 @@ from services.steward.tasks.maintenance import (
     delete_old_deliveries,
     delete_old_jobs,
     delete_old_searches,
+    delete_old_tracks,
     release_expired_leases,
     resend_wakeups,
     update_statistics_of_large_maps,
@@ -188,6 +189,11 @@ class Scheduler:
                 "forget old searches",
                 10.0,
                 lambda: delete_old_searches(catalog, settings.search_history_days),
+            ),
+            PeriodicTask(
+                "delete old tracks",
+                10.0,
+                lambda: delete_old_tracks(catalog, settings.track_retention_days),
             ),
             PeriodicTask(
                 "forget old deliveries",

@@ -21,6 +21,7 @@ from shared.catalog import (  # noqa: F401
     models,
     photos,
     processes,
+    tracks,
     vocabularies,
     webhooks,
 )

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-OUT_OF_MAP_SHARE = 0.05
-"""Prior probability that a photo was taken outside the map, as in the place model"""
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+
 RANK_EXPONENT = 0.25
 """a: the photo of the right place comes first in 3,000 photos with 3000**-0.25 = 14 %"""
 MAX_EXCESS = 8.0

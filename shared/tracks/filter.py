@@ -33,9 +33,10 @@ from datetime import datetime
 import numpy as np
 
 from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, Odometry, PositionFix
+from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel
 from shared.tracks.photo_graph import (
     FloatArray,
@@ -74,6 +75,9 @@ FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
 """Weight of photos that look in a direction which the odometry excludes"""
+SMOOTHED_AT_ONCE = 200
+LATER_FRAMES = 100
+"""Frames after those that are smoothed at once"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,20 +139,26 @@ class TrackFilter:
             belief, self._graph.photos(belief.photos), self._scheme, self._motion.typical_speed_mps
         )
 
-    def smooth(self, frames: Sequence[FrameEvidence]) -> list[Belief]:
+    def smooth(self, frames: Sequence[FrameEvidence], start: Belief | None = None) -> list[Belief]:
         """Return the belief at each frame given all frames, earlier and later.
 
         This is the forward-backward algorithm (Rabiner 1989) on the sparse beliefs of the forward
-        pass; a photo that the forward pass gave up stays given up.
+        pass; a photo that the forward pass gave up stays given up. In a long track, at least
+        LATER_FRAMES later frames count, so that memory does not grow with its length.
 
         Args:
             frames: In the order of time.
+            start: The belief before the first frame; None if nothing is known.
         """
         steps: list[_Step] = []
+        smoothed: list[Belief] = []
         for frame in frames:
-            before = steps[-1].belief if steps else _start(frame.time)
+            before = steps[-1].belief if steps else start or _start(frame.time)
             steps.append(self._step(before, frame))
-        return _backward(steps, self._graph.photo_count)
+            if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
+                smoothed += _backward(steps, self._graph.photo_count)[:SMOOTHED_AT_ONCE]
+                del steps[:SMOOTHED_AT_ONCE]
+        return smoothed + _backward(steps, self._graph.photo_count)
 
     def _step(self, before: Belief, evidence: FrameEvidence) -> _Step:
         seconds = (evidence.time - before.time).total_seconds()

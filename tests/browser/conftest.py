@@ -87,6 +87,26 @@ class Town:
         assert answer.status_code == 200, answer.text
         return answer.json()
 
+    def ride(self) -> str:
+        """A track past the first photos of the map, one every ten seconds."""
+        images = self.get("/search", role="database", limit=3)["images"]
+        begun = self.server.client.post(
+            "/api/v1/tracks", params={"map": MAP}, json={"motion": "train"}
+        )
+        assert begun.status_code == 201, begun.text
+        path = f"/api/v1/tracks/{begun.json()['track_id']}"
+        for number, image in enumerate(images):
+            photo = self.server.client.get(image["image_url"]).content
+            answer = self.server.client.post(
+                f"{path}/frames",
+                params={"map": MAP},
+                files={"file": (f"frame-{number}.jpg", photo)},
+                data={"captured_at": f"2026-05-01T12:00:{number}0Z"},
+                headers={"Prefer": "wait=60"},
+            )
+            assert answer.status_code == 200, answer.text
+        return str(begun.json()["track_id"])
+
     def work(self, path: str, **params: Any) -> None:
         """Start the map's job and see it through."""
         started = self.server.client.post(f"/api/v1{path}", params={"map": MAP}, json=params)
@@ -122,7 +142,7 @@ class Visitor:
             self.foreign.append(request.url)
 
     def visit(self, view: str) -> Page:
-        """Open the view anew: `ask`, `photos`, `photo/ID`, `add`, `model` or `status`."""
+        """Open the view anew: `ask`, `photos`, `photo/ID`, `tracks`, `tracks/ID`, `add`, ..."""
         self.page.goto("about:blank")
         self.page.goto(f"{self.url}/#/{view}")
         expect(self.page.locator("h1")).to_be_visible()

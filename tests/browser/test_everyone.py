@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Town, Visitor
 
-VIEWS = ["ask", "answer", "compare", "photos", "photo", "add", "model", "status"]
+VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track", "add", "model", "status"]
 SERIOUS = {"serious", "critical"}
 
 
@@ -19,6 +19,9 @@ def open_view(visitor: Visitor, town: Town, view: str) -> Page:
         stored = town.get("/search", role="database", limit=1)["images"][0]
         page = visitor.visit(f"photo/{stored['image_id']}")
         expect(page.locator("path.point")).to_be_attached()
+    elif view == "track":
+        page = visitor.visit(f"tracks/{town.ride()}")
+        expect(page.locator("path.point.tracking").first).to_be_attached()
     elif view in ("answer", "compare"):
         page = visitor.visit("ask")
         page.locator("input[data-use=ask]").set_input_files(town.queries[0])

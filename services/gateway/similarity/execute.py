@@ -41,7 +41,7 @@ from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.calibration import Calibration
 from shared.evaluation.place_evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.place_levels import LevelScheme
-from shared.evaluation.place_probability import PlaceModel
+from shared.evaluation.place_probability import PlaceEstimate, PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse
@@ -107,6 +107,8 @@ class SimilarityResult:
     hits: list[SearchHit]
     """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
     photos: dict[UUID, Photo]
+    places: PlaceEstimate | None
+    """The levels and their probabilities; None if no photo has a location."""
     match_probabilities: dict[UUID, float]
     """Probability of each of the best photos that it shows the query's place."""
     word_weights: tuple[float, ...]
@@ -276,6 +278,7 @@ def run_similarity_search(
         response_without_photos,
         similar,
         photos,
+        places,
         match_probabilities,
         weights.values if weighted else (),
         history,

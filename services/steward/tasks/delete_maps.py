@@ -23,6 +23,7 @@ from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.jobs.transitions import cancel_jobs
 from shared.storage import ObjectStore
@@ -74,6 +75,7 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(CachedMapStatistics).where(CachedMapStatistics.map_id == map_id))
         session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
         session.execute(delete(Search).where(Search.map_id == map_id))
+        delete_tracks(session, Track.map_id == map_id)
         session.execute(delete(Job).where(Job.map_id == map_id))
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))

@@ -27,6 +27,7 @@ from shared.catalog.jobs import (
 )
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.tracks import TrackFrame, is_pending
 from shared.catalog.vocabularies import StoredWhitening
 from shared.config.settings import Settings
 from shared.storage import ObjectStore
@@ -196,11 +197,19 @@ def _delete_photo_rows(session: Session, grace_seconds: float) -> None:
 
 
 def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
-    """Delete query and comparison jobs with their photos and descriptors after QUERY_TTL."""
+    """Delete query and comparison jobs with their photos and descriptors after QUERY_TTL.
+
+    Jobs of pending frames stay until their frame is applied, or the track is deleted.
+    """
+    awaited_by_frame = exists().where(TrackFrame.job_id == Job.id, is_pending())
     with catalog.read() as session:
         job_ids = session.scalars(
             select(Job.id)
-            .where(Job.kind.in_(QUERY_JOBS), Job.created_at < db_now_plus(-ttl_seconds))
+            .where(
+                Job.kind.in_(QUERY_JOBS),
+                Job.created_at < db_now_plus(-ttl_seconds),
+                ~awaited_by_frame,
+            )
             .limit(ROWS_PER_TRANSACTION)
         ).all()
     for job_id in job_ids:

@@ -1,6 +1,6 @@
 """Short maintenance tasks: expired leases, lost wakeups, retention, cached map statistics.
 
-Retention covers finished jobs, the search history, webhook deliveries and idempotency keys.
+Retention covers finished jobs, the search history, tracks, webhook deliveries and idempotency keys.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from shared.catalog.maps import (
     list_maps,
 )
 from shared.catalog.photos import Photo
+from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.webhooks import Delivery
 from shared.jobs import Wakeups, reclaim_expired_leases
 from shared.jobs.wakeups import WakeupQueue
@@ -58,6 +59,7 @@ def resend_wakeups(catalog: Catalog, wakeups: Wakeups) -> int:
 
 
 RETENTION_ROWS_PER_TRANSACTION = 1000  # rows deleted in one transaction
+TRACKS_PER_TRANSACTION = 10  # each has up to MAX_TRACK_FRAMES rows
 DAY_SECONDS = 86_400.0
 
 
@@ -90,6 +92,18 @@ def delete_old_searches(catalog: Catalog, history_days: float) -> None:
     )
     with catalog.write() as session:
         session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))
+
+
+def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
+    """Delete tracks without a new frame for `retention_days`."""
+    old = (
+        select(Track.id)
+        .where(Track.updated_at < db_now_plus(-retention_days * DAY_SECONDS))
+        .limit(TRACKS_PER_TRANSACTION)
+        .with_for_update(skip_locked=True)
+    )
+    with catalog.write() as session:
+        delete_tracks(session, Track.id.in_(session.scalars(old).all()))
 
 
 def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:

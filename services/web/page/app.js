@@ -9,6 +9,7 @@ const VIEWS = {
   ask: { title: "Ask", show: showAsk },
   photos: { title: "Photos", show: async (...view) => (await import("./views/photos.js")).showPhotos(...view) },
   photo: { title: "Photo", show: async (...view) => (await import("./views/photo.js")).showPhoto(...view) },
+  tracks: { title: "Tracks", show: async (...view) => (await import("./views/tracks.js")).showTracks(...view) },
   add: { title: "Add", show: async (...view) => (await import("./views/add.js")).showAdd(...view) },
   model: { title: "Model", show: async (...view) => (await import("./views/model.js")).showModel(...view) },
   status: { title: "Status", show: async (...view) => (await import("./views/status.js")).showStatus(...view) },
@@ -75,7 +76,8 @@ choice.addEventListener("change", async () => {
     choice.value = currentMap();
     noteError(error);
   }
-  if (/^#\/(photo|ask)\//.test(location.hash)) location.hash = location.hash.startsWith("#/photo/") ? "#/photos" : "#/ask";
+  const [, name, id] = location.hash.split("/");
+  if (id) location.hash = name === "photo" ? "#/photos" : `#/${name}`; // what it names is in the other map
   else route();
 });
 // Its address is no view's.

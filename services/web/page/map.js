@@ -144,6 +144,12 @@ class PlaceMap {
     return drawn;
   }
 
+  /** A line through points of latitude and longitude. */
+  line(points, kind) {
+    L.polyline(points, { className: kind, interactive: false }).addTo(this.things);
+    this.bounds.push(...points);
+  }
+
   /** Show all that was drawn. */
   fit() {
     this.map.invalidateSize({ pan: false });

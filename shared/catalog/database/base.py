@@ -8,6 +8,7 @@ convert column values, with the same result from SQLite and PostgreSQL.
 
 from __future__ import annotations
 
+import base64
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 from uuid import UUID
@@ -270,9 +271,11 @@ def is_journaled(table: type[Journaled]) -> Condition:
 
 
 def to_json(value: Any) -> Any:
-    """Convert a column's value to JSON: UUIDs and times become text."""
+    """Convert a column's value to JSON: UUIDs, times and bytes (base64) become text."""
     if isinstance(value, UUID):
         return str(value)
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
     if isinstance(value, datetime):
         return value.isoformat()
     return value
@@ -286,4 +289,6 @@ def from_json(column: sa.Column[Any], value: Any) -> Any:
         return UUID(value)
     if isinstance(column.type, UtcDateTime):
         return datetime.fromisoformat(value)
+    if isinstance(column.type, sa.LargeBinary):
+        return base64.b64decode(value)
     return value

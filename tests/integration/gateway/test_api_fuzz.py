@@ -30,6 +30,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
+from tests.support.photos import photo_bytes
 
 pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
 
@@ -114,17 +115,32 @@ def test_whoever_has_the_key_gets_what_is_described_and_no_fault(fuzzed: Door) -
     each_call(fuzzed, check, EXAMPLES)
 
 
+def followed(door: Door) -> dict[str, str]:
+    """A new track with a frame; their ids."""
+    track = door(ADMIN, "POST", "/tracks", json={}).json()
+    frame = door(
+        ADMIN,
+        "POST",
+        f"/tracks/{track['track_id']}/frames",
+        data={"captured_at": "2026-05-01T12:00:00Z"},
+        files={"file": ("frame.jpg", photo_bytes(1))},
+    ).json()
+    return {"track_id": track["track_id"], "frame_id": frame["frame_id"]}
+
+
 def test_calls_about_what_is_there_get_what_is_described(fuzzed: Door) -> None:
     def check(case: Any) -> None:
         there = fuzzed.put(ADMIN, 1).json()  # the same one again, unless a call has deleted it
-        known = case.path_parameters.keys() & {"file_id", "job_id"}
+        if "track_id" in case.path_parameters:
+            there |= followed(fuzzed)
+        known = case.path_parameters.keys() & there.keys()
         case.path_parameters.update({name: there[name] for name in known})
         case.query = {**case.query, "map": "default"}
         case.call_and_validate(headers=KEY, checks=PROMISED)
 
     def is_about_one(operation: Any) -> bool:
-        return operation.label != ENDLESS and (
-            "{file_id}" in operation.path or "{job_id}" in operation.path
+        return operation.label != ENDLESS and any(
+            name in operation.path for name in ("{file_id}", "{job_id}", "{track_id}")
         )
 
     each_call(fuzzed, check, EXAMPLES, is_about_one)

@@ -93,7 +93,7 @@ def remove_all(catalog: Catalog, store: FolderStore) -> None:
 
 def live_in(service: Service, name: str) -> None:
     """Everything that can belong to a map: photos, found and failed and asking ones, a vocabulary
-    and an import under way, generations, a whitening, searches, queries, evaluations."""
+    and an import under way, generations, a whitening, searches, queries, tracks, evaluations."""
     settings = Settings().model_copy(update={"auto_fit_photos": 10_000})
     service.json("POST", "/maps", 201, json={"name": name, "extractor": "test-tiny-vlad"})
     params = {"map": name}
@@ -125,6 +125,9 @@ def live_in(service: Service, name: str) -> None:
     files = {"file": ("centres.npy", buffer.getvalue())}
     service.json("POST", "/vocabularies/import", 202, params=params, files=files)
     service.ask(near_copy(3), name)
+    track_id = service.json("POST", "/tracks", 201, params=params, json={})["track_id"]
+    frame = {"data": {"captured_at": "2026-05-01T12:00Z"}, "files": {"file": near_copy(1)}}
+    service.json("POST", f"/tracks/{track_id}/frames", 202, params=params, **frame)
     service.upload(photo_bytes(6), name)
     files = {"file": ("batch.jpg", photo_bytes(7))}
     service.json("POST", "/upload/batch", 202, params=params, files=files)

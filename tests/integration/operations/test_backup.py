@@ -89,6 +89,11 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     tmp_path: Path,
 ) -> None:
     known = service.indexed(1, 2, 3, 4, latitude=45.1, longitude=7.6, tags="a,b", place="here")
+    track = service.json("POST", "/tracks", 201, json={})["track_id"]
+    frame = {"data": {"captured_at": "2026-05-01T12:00Z"}, "files": {"file": photo_bytes(1)}}
+    service.json("POST", f"/tracks/{track}/frames", 202, **frame)
+    service.drain()
+    assert service.json("GET", f"/tracks/{track}")["pending"] == 0
     # Work of all kinds under way: queued, held by a worker, a query.
     queued = [service.upload(photo_bytes(number))["job_id"] for number in (5, 6)]
     query = service.ask(photo_bytes(7))

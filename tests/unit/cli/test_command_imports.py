@@ -20,6 +20,7 @@ CLIENT_COMMANDS = (
     "models",
     "pca",
     "query",
+    "track",
     "vocabulary",
 )
 

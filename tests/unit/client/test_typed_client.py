@@ -18,9 +18,10 @@ from pydantic import BaseModel
 import placewise
 from placewise import answers
 from services.gateway import schemas
-from services.gateway.routes import batches, evaluations, keys, maps, models
+from services.gateway.routes import batches, evaluations, keys, maps, models, tracks
 from services.gateway.routes import stats as figures
 from services.gateway.routes import stats as history
+from services.gateway.tracks.schemas import TrackStateResponse
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
@@ -34,6 +35,11 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Estimate, schemas.EstimateResponse),
     (answers.Explanation, schemas.ExplanationResponse),
     (answers.ClusterShare, schemas.ClusterShareResponse),
+    (answers.TrackState, TrackStateResponse),
+    (answers.Track, tracks.TrackResponse),
+    (answers.OneTrack, tracks.TrackDetailResponse),
+    (answers.TrackFrame, tracks.TrackFrameResponse),
+    (answers.DeletedTrack, tracks.DeletedTrackResponse),
     (answers.Progress, schemas.JobProgress),
     (answers.Job, schemas.JobResponse),
     (answers.Started, schemas.JobAcceptedResponse),

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import OUT_OF_MAP_SHARE, FrameEvidence, Hit, Odometry, PositionFix
+from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
 from shared.tracks.filter import CARRIED_AWAY, ENTERING, LEAVING, SPACING_M, TrackFilter
 from shared.tracks.motion import MOTION_MODELS, motion_model
 from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_map

@@ -1,0 +1,245 @@
+"""`placewise track`: follow a folder of photos or a video through a map."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import deque
+from collections.abc import Iterable, Sequence, Sized
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import UUID
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Column
+
+from placewise.answers import OneTrack, TrackFrame
+from placewise.client import Client
+from services.cli.client import connect
+from services.cli.output import (
+    JsonOption,
+    KeyOption,
+    MapOption,
+    ServerOption,
+    Table,
+    err_console,
+    print_json,
+    print_table,
+    printable_path,
+    progress_bar,
+    report_errors,
+)
+from services.cli.track.frame_sources import (
+    FrameTiming,
+    Order,
+    SourceFrame,
+    read_photo_frames,
+    read_video_frames,
+)
+from services.cli.track.track_files import (
+    PICTURE_SUFFIXES,
+    WRITERS,
+    check_track_files,
+    track_row,
+    write_track_file,
+)
+from shared.errors import Conflict, InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
+from shared.tracks.motion import MOTION_MODELS
+
+FRAMES_AHEAD = 8  # stored before the first of them must be applied: they are described as a batch
+WAIT_SECONDS = 20.0
+MAX_PHOTOS_DRAWN = 20_000
+
+
+def track(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PHOTOS_OR_VIDEO", exists=True, help="A folder of photos, or a video."
+        ),
+    ],
+    out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help=f"Write the track; the format follows from the extension: {', '.join(WRITERS)}. "
+            "May be repeated.",
+        ),
+    ] = None,
+    motion: Annotated[
+        str | None,
+        typer.Option(help=f"How the camera moves: {', '.join(MOTION_MODELS)}. Default: car."),
+    ] = None,
+    max_speed: Annotated[
+        float | None, typer.Option(min=0, help="Maximum speed in m/s, instead of --motion.")
+    ] = None,
+    every: Annotated[
+        float,
+        typer.Option(
+            min=0.001,
+            help="Seconds between two frames of a video, and between photos without a time.",
+        ),
+    ] = 1.0,
+    order: Annotated[
+        Order | None,
+        typer.Option(
+            help="Order of the photos. Default: by their EXIF times if all have one, otherwise by "
+            "their names."
+        ),
+    ] = None,
+    begin: Annotated[
+        datetime | None,
+        typer.Option(
+            help="Time of the first frame, UTC, for videos and photos in the order of their names. "
+            "Default: the time of the file."
+        ),
+    ] = None,
+    gps_accuracy: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Use the positions in the EXIF, with this accuracy (68 %). Without it they "
+            "are ignored.",
+        ),
+    ] = None,
+    smoothed: Annotated[
+        bool,
+        typer.Option(
+            "--smoothed/--live",
+            help="States given all frames, or as they were known at each frame.",
+        ),
+    ] = True,
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Follow the camera that took PHOTOS_OR_VIDEO through a map, frame by frame.
+
+    The photos are not added to the map. The track stays on the server for some time, where the page
+    shows it.
+    """
+    files = out or []
+    with report_errors(as_json):
+        check_track_files(files)
+        timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
+        with (
+            connect(server, map_name, key) as client,
+            progress_bar() as progress,
+            tempfile.TemporaryDirectory() as folder,
+        ):
+            frames = (
+                read_photo_frames(source, timing)
+                if source.is_dir()
+                else read_video_frames(source, timing, Path(folder))
+            )
+            begun = client.begin_track(motion=motion, max_speed_mps=max_speed)
+            _send_frames(client, begun.track_id, frames, gps_accuracy, progress)
+            try:
+                result = client.track(begun.track_id, smoothed=smoothed)
+            except Conflict as error:
+                if error.code != "track_too_long":
+                    raise
+                err_console.print(error.detail, soft_wrap=True, markup=False)
+                result = client.track(begun.track_id)
+            draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
+            photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
+        for file in files:
+            write_track_file(file, result, photos)
+        if as_json:
+            print_json(result)
+        else:
+            _print_track(result, files)
+
+
+def _send_frames(
+    client: Client,
+    track_id: UUID,
+    frames: Iterable[SourceFrame],
+    gps_accuracy_m: float | None,
+    progress: Progress,
+) -> None:
+    """Send frames, up to FRAMES_AHEAD before the first of them is applied, and wait for all."""
+    total = len(frames) if isinstance(frames, Sized) else None
+    bar = progress.add_task("frames", total=total)
+    ahead: deque[TrackFrame] = deque()
+    version = 0
+    for frame in frames:
+        has_fix = gps_accuracy_m is not None and frame.latitude is not None
+        try:
+            sent = client.add_frame(
+                track_id,
+                frame.path,
+                frame.captured_at,
+                wait=False,
+                expected_version=version,
+                latitude=frame.latitude if has_fix else None,
+                longitude=frame.longitude if has_fix else None,
+                accuracy_m=gps_accuracy_m if has_fix else None,
+            )
+        except (Unprocessable, UnsupportedMedia, TooLarge) as error:
+            if error.code == "invalid_field":
+                raise
+            _print_failure(progress, frame.name, error.as_problem())
+            progress.advance(bar)
+            continue
+        version = sent.version
+        ahead.append(sent)
+        if len(ahead) > FRAMES_AHEAD:
+            _wait_for_frame(client, track_id, ahead.popleft(), progress)
+            progress.advance(bar)
+    for sent in ahead:
+        _wait_for_frame(client, track_id, sent, progress)
+        progress.advance(bar)
+    if not version:
+        raise InvalidRequest("no_frames", "No frame could be sent.")
+
+
+def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame, progress: Progress) -> None:
+    while frame.status == "pending":
+        frame = client.track_frame(track_id, frame.frame_id, wait_seconds=WAIT_SECONDS)
+    if frame.error is not None:
+        _print_failure(progress, frame.filename, frame.error)
+
+
+def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> None:
+    progress.console.print(
+        f"[red]{problem['code']}[/red] {escape(name)}: {escape(str(problem['detail']))}",
+        soft_wrap=True,
+    )
+
+
+def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
+    table = Table(
+        "time",
+        "photo",
+        "status",
+        Column("probability", justify="right"),
+        Column("latitude", no_wrap=True),
+        Column("longitude", no_wrap=True),
+        "place",
+    )
+    for frame in track.frames:
+        row = track_row(frame)
+        table.add_row(
+            f"{frame.captured_at:%H:%M:%S}",
+            escape(frame.filename),
+            row["status"],
+            "" if row["probability"] is None else f"{100 * row['probability']:.1f} %",
+            "" if row["latitude"] is None else f"{row['latitude']:.6f}",
+            "" if row["longitude"] is None else f"{row['longitude']:.6f}",
+            escape(row["place"] or ""),
+        )
+    print_table(table)
+    states = [frame.state for frame in track.frames if frame.state is not None]
+    tracked = sum(state.status == "tracking" for state in states)
+    err_console.print(
+        f"{tracked} of {len(track.frames)} frames are tracked. Track {track.track_id}"
+        f"{''.join(f', {printable_path(file)}' for file in files)}",
+        soft_wrap=True,
+        markup=False,
+    )

@@ -1,0 +1,150 @@
+"""Frames of a track from a folder of photos or a video, each with its time."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+
+from PIL import Image
+
+from services.cli.ingest.geotags import list_photos
+from services.cli.output import printable_path
+from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
+from shared.imaging.photo_header import PhotoHeader, read_photo_header
+
+MAX_HEADER_PIXELS = 2**31  # only headers are read here; the server has a limit of its own
+MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
+JPEG_QUALITY = 92  # of the frames of a video
+
+
+class Order(StrEnum):
+    TIME = "time"
+    NAME = "name"
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFrame:
+    """A photo to send, and what is known about it."""
+
+    path: Path
+    name: str
+    captured_at: datetime
+    """UTC"""
+    latitude: float | None = None
+    longitude: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTiming:
+    """How frames get their times."""
+
+    every_seconds: float
+    """between two frames of a video, and between photos in the order of their names"""
+    order: Order | None
+    """of photos; None: by their times if all have one, otherwise by their names"""
+    begin: datetime | None
+    """time of the first frame; None: that of the file"""
+
+
+def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
+    """List the photos below a folder in the order of their times or names.
+
+    Raises:
+        InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
+    """
+    photos = [(path, _header_of(path)) for path in list_photos(folder)]
+    first = timing.begin or _modified_at(photos[0][0])
+    without_time = next((path for path, header in photos if header.captured_at is None), None)
+    if timing.order == Order.TIME and without_time is not None:
+        raise InvalidRequest(
+            "no_times",
+            f"{printable_path(without_time)} has no capture time in its EXIF. Use --order name, "
+            "and --every with the seconds between two photos.",
+        )
+    by_name = timing.order == Order.NAME or without_time is not None
+    frames = [
+        SourceFrame(
+            path,
+            printable_path(path.relative_to(folder)),
+            first + timedelta(seconds=number * timing.every_seconds)
+            if by_name or header.captured_at is None
+            else header.captured_at,
+            header.latitude,
+            header.longitude,
+        )
+        for number, (path, header) in enumerate(photos)
+    ]
+    return _with_distinct_times(sorted(frames, key=lambda frame: frame.captured_at))
+
+
+def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterator[SourceFrame]:
+    """Decode a frame of a video every `timing.every_seconds` and write it to a folder as JPEG.
+
+    Raises:
+        Misconfigured: `no_video_decoder`.
+        InvalidRequest: `unreadable_video`.
+    """
+    try:
+        import av  # optional: its wheels include FFmpeg
+    except ImportError as error:
+        raise Misconfigured(
+            "no_video_decoder",
+            f"Reading the video {printable_path(video)} needs PyAV. Install the extra "
+            "`tracks` (uv pip install '.[tracks]' in the repository), or extract photos from the "
+            "video and pass their folder.",
+        ) from error
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise InvalidRequest(
+                    "unreadable_video",
+                    f"{printable_path(video)} is neither a folder of photos nor a video.",
+                )
+            created = container.metadata.get("creation_time")
+            first = timing.begin or _parse_created(created) or _modified_at(video)
+            begin = due = 0.0
+            for number, frame in enumerate(container.decode(video=0)):
+                if number == 0:
+                    begin = frame.time or 0.0
+                seconds = (frame.time or 0.0) - begin
+                if seconds < due - 1e-6:
+                    continue
+                due += timing.every_seconds * (1 + (seconds - due) // timing.every_seconds)
+                path = folder / f"frame-{seconds:010.3f}.jpg"
+                Image.fromarray(frame.to_ndarray(format="rgb24")).save(path, quality=JPEG_QUALITY)
+                yield SourceFrame(path, path.name, first + timedelta(seconds=seconds))
+    except av.FFmpegError as error:
+        raise InvalidRequest(
+            "unreadable_video", f"Can't read the video {printable_path(video)}: {error}"
+        ) from error
+
+
+def _header_of(path: Path) -> PhotoHeader:
+    # The server names what is wrong with a photo that can't be read.
+    with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
+        return read_photo_header(file, MAX_HEADER_PIXELS)
+    return PhotoHeader(0, 0)
+
+
+def _with_distinct_times(frames: list[SourceFrame]) -> list[SourceFrame]:
+    """Delay frames that have the time of the one before: times are unique in a track."""
+    distinct: list[SourceFrame] = []
+    for frame in frames:
+        earliest = distinct[-1].captured_at + MIN_STEP if distinct else frame.captured_at
+        distinct.append(replace(frame, captured_at=max(frame.captured_at, earliest)))
+    return distinct
+
+
+def _modified_at(path: Path) -> datetime:
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC)
+
+
+def _parse_created(text: str | None) -> datetime | None:
+    with contextlib.suppress(ValueError):
+        created = datetime.fromisoformat(text or "")
+        return created if created.tzinfo else created.replace(tzinfo=UTC)
+    return None

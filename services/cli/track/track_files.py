@@ -1,0 +1,154 @@
+"""Files of a track: JSON, CSV, GPX, GeoJSON and pictures, by the extension of their names."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from placewise.answers import OneTrack, Photo, TrackFrame
+from services.cli.output import Json, atomic_write, check_output_path, printable_path
+from services.cli.track.track_picture import draw_track, located_segments
+from shared.errors import InvalidRequest, Misconfigured
+
+GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
+COLUMNS = (
+    "captured_at",
+    "filename",
+    "status",
+    "latitude",
+    "longitude",
+    "place",
+    "heading",
+    "probability",
+    "radius_68_m",
+    "radius_95_m",
+    "not_in_map_probability",
+    "image_id",
+)
+STATE_COLUMNS = COLUMNS[3:]
+PICTURE_SUFFIXES = (".png", ".jpg")
+
+
+def check_track_files(files: Sequence[Path]) -> None:
+    """Check the output paths before the track is computed.
+
+    Raises:
+        InvalidRequest: `bad_out`.
+        Misconfigured: `no_matplotlib`.
+    """
+    for file in files:
+        if file.suffix.lower() not in WRITERS:
+            raise InvalidRequest(
+                "bad_out",
+                f"{printable_path(file)}: the file name must end in one of {', '.join(WRITERS)}.",
+            )
+        check_output_path(file, file.suffix, "a track")
+        if file.suffix.lower() in PICTURE_SUFFIXES and find_spec("matplotlib") is None:
+            raise Misconfigured(
+                "no_matplotlib",
+                f"Drawing {printable_path(file)} needs matplotlib. Install the extra "
+                "`tracks`: uv pip install '.[tracks]' in the repository.",
+            )
+
+
+def write_track_file(file: Path, track: OneTrack, photos: Sequence[Photo]) -> None:
+    """Write a track in the format of the file's extension.
+
+    Args:
+        file: The output file.
+        track: The track.
+        photos: The photos of the map, for a picture.
+    """
+    content = WRITERS[file.suffix.lower()](track, photos)
+    with atomic_write(file) as out:
+        out.write(content)
+
+
+def track_row(frame: TrackFrame) -> dict[str, Any]:
+    """Return the values of COLUMNS of a frame; None for unknown ones."""
+    row: dict[str, Any] = {
+        "captured_at": frame.captured_at.isoformat(),
+        "filename": frame.filename,
+        "status": frame.status if frame.state is None else frame.state.status,
+    }
+    return row | {name: getattr(frame.state, name, None) for name in STATE_COLUMNS}
+
+
+def _to_json(track: OneTrack, photos: Sequence[Photo]) -> bytes:
+    return json.dumps(track.as_json(), ensure_ascii=False, indent=2).encode()
+
+
+def _to_csv(track: OneTrack, photos: Sequence[Photo]) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(track_row(frame) for frame in track.frames)
+    return text.getvalue().encode()
+
+
+def _to_gpx(track: OneTrack, photos: Sequence[Photo]) -> bytes:
+    """One GPX 1.1 track with a segment for each part that is not lost."""
+    root = ElementTree.Element(
+        "gpx", {"xmlns": GPX_NAMESPACE, "version": "1.1", "creator": "Placewise"}
+    )
+    element = ElementTree.SubElement(root, "trk")
+    ElementTree.SubElement(element, "name").text = str(track.track_id)
+    for segment in located_segments(track):
+        points = ElementTree.SubElement(element, "trkseg")
+        for frame, state in segment:
+            position = {"lat": f"{state.latitude:.7f}", "lon": f"{state.longitude:.7f}"}
+            point = ElementTree.SubElement(points, "trkpt", position)
+            time = frame.captured_at.isoformat().replace("+00:00", "Z")
+            ElementTree.SubElement(point, "time").text = time
+    ElementTree.indent(root)
+    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+
+
+def _to_geojson(track: OneTrack, photos: Sequence[Photo]) -> bytes:
+    """A line for each part that is not lost, and a point for each frame."""
+    features: list[Json] = [
+        _feature(
+            "LineString",
+            [[state.longitude, state.latitude] for _, state in segment],
+            {"kind": "track", "track_id": str(track.track_id)},
+        )
+        for segment in located_segments(track)
+        if len(segment) > 1
+    ]
+    for frame in track.frames:
+        row = track_row(frame)
+        position = [row["longitude"], row["latitude"]]
+        properties = {name: _plain(value) for name, value in row.items()}
+        features.append(
+            _feature(
+                "Point", None if None in position else position, {"kind": "frame", **properties}
+            )
+        )
+    collection = {"type": "FeatureCollection", "features": features}
+    return json.dumps(collection, ensure_ascii=False, indent=1).encode()
+
+
+def _feature(kind: str, coordinates: list[Any] | None, properties: Json) -> Json:
+    geometry = None if coordinates is None else {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, (int, float)) or value is None else str(value)
+
+
+WRITERS: dict[str, Callable[[OneTrack, Sequence[Photo]], bytes]] = {
+    ".json": _to_json,
+    ".csv": _to_csv,
+    ".gpx": _to_gpx,
+    ".geojson": _to_geojson,
+    ".png": partial(draw_track, image_format="png"),
+    ".jpg": partial(draw_track, image_format="jpeg"),
+}

@@ -1,0 +1,408 @@
+"""Routes of tracks: begin one, add its frames, read its states, delete it."""
+
+from __future__ import annotations
+
+import time
+from datetime import datetime, timedelta
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.admission import ADMIT_QUERY, AdmissionDep, UploadKind
+from services.gateway.authentication import READ, WRITE
+from services.gateway.dependencies import (
+    FrameId,
+    GatewayContext,
+    GatewayDep,
+    MapParams,
+    MapQuery,
+    PageQuery,
+    TrackId,
+    parse_prefer_wait,
+    wait_for_job,
+)
+from services.gateway.idempotency import (
+    IdempotentDep,
+    IdempotentFormDep,
+    IdempotentRequest,
+    delete_if_refused,
+)
+from services.gateway.schemas import ResponseModel, accepted_headers, job_url, url_in_map
+from services.gateway.similarity.search_params import SearchParams
+from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
+from services.gateway.tracks.schemas import (
+    FRAME_FIELDS,
+    TrackParams,
+    TrackStateResponse,
+    parse_frame_form,
+)
+from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from shared.catalog.database.session import Catalog
+from shared.catalog.maps import get_map
+from shared.catalog.tracks import (
+    MAX_SMOOTHED_FRAMES,
+    Track,
+    TrackFrame,
+    add_frame,
+    delete_tracks,
+    get_frame,
+    get_track,
+    latest_states,
+    list_tracks,
+    select_frames,
+)
+from shared.errors import Conflict
+from shared.ids import new_id
+from shared.imaging.photo_header import read_photo_header
+from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import WakeupQueue
+from shared.storage.keys import query_key
+
+router = APIRouter(tags=["tracks"])
+
+APPLY_SECONDS = 5.0  # of one read; frames that remain pending are applied by the next one
+
+
+class TrackResponse(ResponseModel):
+    """A track with its last state."""
+
+    track_id: UUID
+    motion: str | None
+    max_speed_mps: float | None
+    version: int = Field(
+        description="number of accepted frames; a frame with this `expected_version` is accepted "
+        "only if no other client has added one"
+    )
+    pending: int = Field(description="accepted frames that are not applied yet")
+    state: TrackStateResponse | None = Field(description="after the last applied frame")
+    created_at: datetime
+    updated_at: datetime = Field(description="when the last frame was accepted")
+    expires_at: datetime = Field(description="the track is deleted then, unless a frame is added")
+
+
+class TracksResponse(ResponseModel):
+    tracks: list[TrackResponse]
+    next_cursor: str | None
+
+
+class TrackFrameResponse(ResponseModel):
+    """A frame of a track."""
+
+    frame_id: UUID
+    captured_at: datetime
+    filename: str
+    status: Literal["pending", "applied", "failed"] = Field(
+        description="`pending` until the photo is described and all earlier frames are applied; "
+        "`failed`: the photo could not be described, and the track continues without it"
+    )
+    state: TrackStateResponse | None = Field(
+        description="the state of the track after this frame; frames that arrive late change it"
+    )
+    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
+    job_id: UUID
+    job_url: str
+    frame_url: str
+    version: int = Field(description="of the track when the frame was accepted")
+
+
+class TrackDetailResponse(TrackResponse):
+    """A track with all frames, in the order of their times."""
+
+    smoothed: bool
+    frames: list[TrackFrameResponse]
+
+
+class DeletedTrackResponse(ResponseModel):
+    success: bool
+    message: str
+    deleted_track_id: UUID
+
+
+class TrackReadParams(MapParams):
+    smoothed: bool = Field(
+        False,
+        description="Return the states given all frames, also the later ones (forward-backward), "
+        "instead of the states that were known at each frame.",
+    )
+
+
+FRAME_PENDING: dict[int | str, dict[str, Any]] = {
+    202: {
+        "model": TrackFrameResponse,
+        "description": "The frame is stored, but not applied yet. Poll `frame_url`.",
+    }
+}
+
+
+@router.post("/tracks", operation_id="begin_track", status_code=201, dependencies=[READ])
+def begin_track(
+    gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, body: TrackParams
+) -> TrackResponse:
+    """Begin a track in the map. Then add frames in the order of their times."""
+    with gateway.catalog.write() as session:
+        track = Track(
+            id=new_id(),
+            map_id=get_map(session, query.map).id,
+            params=body.model_dump(mode="json", exclude_none=True),
+        )
+        session.add(track)
+        session.flush()
+        session.refresh(track)
+        response = TrackResponse(**_track_fields(gateway, track, None))
+        idempotent.store_response(session, 201, response)
+    return response
+
+
+@router.get("/tracks", operation_id="list_tracks", dependencies=[READ])
+def read_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
+    """List the tracks of the map, newest first, each with the state of its last applied frame."""
+    with gateway.catalog.read() as session:
+        map_id = get_map(session, page.map).id
+        tracks, next_cursor = page.split(list_tracks(session, map_id, page.limit + 1, page.before))
+        last = latest_states(session, [track.id for track in tracks])
+    return TracksResponse(
+        tracks=[
+            TrackResponse(**_track_fields(gateway, track, last.get(track.id))) for track in tracks
+        ],
+        next_cursor=next_cursor,
+    )
+
+
+@router.get("/tracks/{track_id}", operation_id="get_track", dependencies=[READ])
+def read_track(
+    gateway: GatewayDep, track_id: TrackId, query: Annotated[TrackReadParams, Query()]
+) -> TrackDetailResponse:
+    """Get a track with all frames; `smoothed=true` also uses the later frames for each state.
+
+    Frames whose photos have been described since are applied first. `pending` counts those that
+    remain. 409 (`track_too_long`) if more than 3,000 frames are to be smoothed.
+    """
+    with gateway.catalog.read() as session:
+        get_track(session, get_map(session, query.map).id, track_id)
+    apply_pending_frames(gateway, track_id, APPLY_SECONDS)
+    with gateway.catalog.read() as session:
+        track = get_track(session, get_map(session, query.map).id, track_id)
+        if query.smoothed and track.version > MAX_SMOOTHED_FRAMES:
+            raise Conflict(
+                "track_too_long",
+                f"The track has {track.version} frames; up to {MAX_SMOOTHED_FRAMES} can be "
+                "smoothed. Read it without `smoothed`.",
+            )
+        frames = list(session.scalars(select_frames(track_id, with_evidence=query.smoothed)))
+    last = next((frame for frame in reversed(frames) if frame.state is not None), None)
+    smoothed = smooth_states(gateway, track, frames) if query.smoothed else {}
+    return TrackDetailResponse(
+        **_track_fields(gateway, track, last),
+        smoothed=query.smoothed,
+        frames=[_frame_response(frame, query.map, smoothed.get(frame.id)) for frame in frames],
+    )
+
+
+@router.delete("/tracks/{track_id}", operation_id="delete_track", dependencies=[WRITE])
+def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> DeletedTrackResponse:
+    """Delete a track with its frames."""
+    with gateway.catalog.write() as session:
+        get_track(session, get_map(session, query.map).id, track_id, lock=True)
+        delete_tracks(session, Track.id == track_id)
+    return DeletedTrackResponse(
+        success=True, message="The track is deleted.", deleted_track_id=track_id
+    )
+
+
+@router.post(
+    "/tracks/{track_id}/frames",
+    operation_id="add_track_frame",
+    response_model=TrackFrameResponse,
+    responses=FRAME_PENDING,
+    openapi_extra=multipart_schema("the frame's photo", ["captured_at"], **FRAME_FIELDS),
+    dependencies=[READ, ADMIT_QUERY],
+)
+async def add_track_frame(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    track_id: TrackId,
+    query: MapQuery,
+) -> Any:
+    """Add a frame to a track: a photo with its time, and optionally odometry or a GPS fix.
+
+    The response is 202 once the frame is stored: poll `frame_url`. With `Prefer: wait=N` it is 200
+    with the state if that takes at most N seconds. The same photo with the same time again is the
+    same frame. The photo is not added to the map, and is deleted once it is described.
+
+    A frame may arrive late: it is inserted by its time, and the states of up to 50 later frames
+    are computed again (409, `frame_too_late`, beyond).
+    """
+    await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
+    job_id = new_id()
+    with admission.admit_upload(UploadKind.QUERY, request):
+        received = await store_form_file(
+            request,
+            gateway.store,
+            query_key(job_id),
+            gateway.settings.max_file_size,
+            check_photo_signature,
+        )
+    await idempotent.claim_form(
+        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
+    )
+    frame = await run_in_threadpool(
+        _accept_frame, gateway, query.map, track_id, job_id, received, idempotent
+    )
+    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    if wait:
+        response.headers["Preference-Applied"] = f"wait={wait:g}"
+    return await _wait_until_applied(gateway, response, query.map, track_id, frame.id, wait)
+
+
+@router.get(
+    "/tracks/{track_id}/frames/{frame_id}",
+    operation_id="get_track_frame",
+    response_model=TrackFrameResponse,
+    responses=FRAME_PENDING,
+    dependencies=[READ],
+)
+async def read_track_frame(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    track_id: TrackId,
+    frame_id: FrameId,
+    query: MapQuery,
+) -> Any:
+    """Get a frame; 202 while it is pending. `Prefer: wait=N` waits until it is applied."""
+    await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
+    await run_in_threadpool(apply_pending_frames, gateway, track_id, APPLY_SECONDS)
+    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    return await _wait_until_applied(gateway, response, query.map, track_id, frame_id, wait)
+
+
+def _check_track(catalog: Catalog, map_name: str, track_id: UUID) -> None:
+    """Raise NotFound before the body of a request is read."""
+    with catalog.read() as session:
+        get_track(session, get_map(session, map_name).id, track_id)
+
+
+def _accept_frame(
+    gateway: GatewayContext,
+    map_name: str,
+    track_id: UUID,
+    job_id: UUID,
+    received: StoredUpload,
+    idempotent: IdempotentRequest,
+) -> TrackFrame:
+    """Store the frame with its job, or return the frame that it repeats."""
+    with delete_if_refused(gateway.store, received.key):
+        check_photo_signature(received.first_bytes)
+        form = parse_frame_form(received.fields)
+        with received.open(gateway.store) as file:
+            read_photo_header(file, gateway.settings.max_image_pixels)
+        with gateway.catalog.write() as session:
+            track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
+            frame = TrackFrame(
+                id=new_id(),
+                track_id=track.id,
+                captured_at=form.captured_at,
+                job_id=job_id,
+                filename=received.filename,
+                sha256=received.sha256,
+                measurements=form.model_dump(
+                    mode="json", exclude={"expected_version"}, exclude_none=True
+                ),
+            )
+            stored = add_frame(session, track, frame, form.expected_version)
+            if stored is frame:
+                session.add(
+                    Job(
+                        id=job_id,
+                        map_id=track.map_id,
+                        kind=JobKind.DESCRIBE,
+                        priority=Priority.QUERY,
+                        params={
+                            "filename": received.filename,
+                            "wanted": SearchParams().model_dump(mode="json"),
+                        },
+                    )
+                )
+            response = _frame_response(stored, map_name)
+            headers = accepted_headers(response.frame_url)
+            idempotent.store_response(session, 202, response, headers)
+    if stored is not frame:
+        gateway.store.delete(received.key)
+    gateway.wakeups.send(WakeupQueue.QUERY)
+    return stored
+
+
+async def _wait_until_applied(
+    gateway: GatewayContext,
+    response: Response,
+    map_name: str,
+    track_id: UUID,
+    frame_id: UUID,
+    wait_seconds: float,
+) -> TrackFrameResponse | JSONResponse:
+    """Apply frames until this one is applied; 202 when time is up."""
+
+    def load() -> TrackFrame:
+        with gateway.catalog.read() as session:
+            return get_frame(session, track_id, frame_id)
+
+    deadline = time.monotonic() + wait_seconds
+    while True:
+        frame = await run_in_threadpool(load)
+        remaining = deadline - time.monotonic()
+        body = _frame_response(frame, map_name)
+        if not frame.pending:
+            return body
+        if remaining <= 0:
+            headers = {**response.headers, **accepted_headers(body.frame_url)}
+            # An explicit response, because the response model of the route is that of the 200.
+            return JSONResponse(body.model_dump(mode="json"), 202, headers)
+        job_id = await run_in_threadpool(apply_pending_frames, gateway, track_id, remaining)
+        remaining = deadline - time.monotonic()
+        if job_id is not None and remaining > 0:
+            await wait_for_job(gateway, job_id, remaining)
+
+
+def _track_fields(gateway: GatewayContext, track: Track, last: TrackFrame | None) -> dict[str, Any]:
+    """Return the fields of `TrackResponse`; `last` is the last applied frame."""
+    params = TrackParams.model_validate(track.params)
+    life = timedelta(days=gateway.settings.track_retention_days)
+    return {
+        "track_id": track.id,
+        "motion": params.motion,
+        "max_speed_mps": params.max_speed_mps,
+        "version": track.version,
+        "pending": track.version - track.revision,
+        "state": None if last is None else last.state,
+        "created_at": track.created_at,
+        "updated_at": track.updated_at,
+        "expires_at": track.updated_at + life,
+    }
+
+
+def _frame_response(
+    frame: TrackFrame, map_name: str, smoothed: TrackStateResponse | None = None
+) -> TrackFrameResponse:
+    status: Literal["pending", "applied", "failed"] = (
+        "pending" if frame.pending else "failed" if frame.state is None else "applied"
+    )
+    return TrackFrameResponse(
+        frame_id=frame.id,
+        captured_at=frame.captured_at,
+        filename=frame.filename,
+        status=status,
+        state=smoothed or frame.state,
+        error=frame.error,
+        job_id=frame.job_id,
+        job_url=job_url(frame.job_id, map_name),
+        frame_url=url_in_map(f"/tracks/{frame.track_id}/frames/{frame.id}", map_name),
+        version=frame.version,
+    )

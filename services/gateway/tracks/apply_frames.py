@@ -1,0 +1,263 @@
+"""Applies the frames of a track: searches for each described photo and advances the filter.
+
+A frame is applied once all earlier ones are, by whichever request reads the track first. Search and
+filter run outside of a transaction; the result is committed if no other gateway has applied a frame
+meanwhile (`Track.revision`), and is otherwise computed again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import update
+from sqlalchemy.orm import Session
+
+from services.gateway.dependencies import GatewayContext
+from services.gateway.similarity.estimate import locate_hits
+from services.gateway.similarity.execute import query_from_job, run_similarity_search
+from services.gateway.similarity.search_params import SearchParams
+from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
+from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
+from shared.catalog.jobs import UNFINISHED_STATES
+from shared.catalog.maps import Map
+from shared.catalog.tracks import (
+    Track,
+    TrackFrame,
+    drop_old_beliefs,
+    first_pending_frame,
+    last_belief,
+    select_frames,
+)
+from shared.errors import Conflict, Gone, PlacewiseError
+from shared.evaluation.place_evidence import EVIDENCE_DEPTH
+from shared.evaluation.place_levels import LevelScheme, photos_inside
+from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.jobs import Job, JobState
+from shared.jobs.transitions import requeue_job
+from shared.jobs.wakeups import WakeupQueue
+from shared.search_api.comparison import query_expired_error
+from shared.tracks.belief import Belief
+from shared.tracks.evidence import FrameEvidence, frame_evidence
+from shared.tracks.filter import TrackFilter
+
+START_ACCURACY_M = 50.0
+START_PROBABILITY = 0.9  # of the photos at a stated start, together
+
+
+@dataclass(frozen=True, slots=True)
+class _PendingFrame:
+    track: Track
+    frame: TrackFrame
+    job: Job | None
+
+
+def apply_pending_frames(gateway: GatewayContext, track_id: UUID, seconds: float) -> UUID | None:
+    """Apply the pending frames whose photos are described, for about `seconds`.
+
+    Returns:
+        The job that the next pending frame waits for; None if no frame is pending, or time is up.
+
+    Raises:
+        PlacewiseError: Of the search; the frame stays pending.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        pending = _read_pending(gateway, track_id)
+        if pending is None:
+            return None
+        job = pending.job
+        if job is not None and job.state in UNFINISHED_STATES:
+            return job.id
+        try:
+            evidence = _search_evidence(gateway, pending)
+        except Gone:
+            assert job is not None
+            _describe_again(gateway, job.id)
+            continue
+        except _FrameFailed as failed:
+            _commit(gateway, pending, {pending.frame.id: {"error": failed.problem}})
+        else:
+            _commit(gateway, pending, _advance(gateway, pending, evidence))
+        if time.monotonic() > deadline:
+            return None
+
+
+class _FrameFailed(Exception):
+    """The photo of a frame could not be described."""
+
+    def __init__(self, problem: dict[str, Any]) -> None:
+        super().__init__(problem["code"])
+        self.problem = problem
+
+
+def _read_pending(gateway: GatewayContext, track_id: UUID) -> _PendingFrame | None:
+    with gateway.catalog.read() as session:
+        track = session.get(Track, track_id)
+        frame = first_pending_frame(session, track_id) if track else None
+        if track is None or frame is None:
+            return None
+        return _PendingFrame(track, frame, session.get(Job, frame.job_id))
+
+
+def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEvidence:
+    """Search with the frame's photo.
+
+    Raises:
+        Gone: The descriptor belongs to a generation that no longer exists.
+        _FrameFailed: The job did not succeed.
+    """
+    job = pending.job
+    if job is None:
+        raise _FrameFailed(query_expired_error().as_problem())
+    if job.state == JobState.FAILED and job.error is not None:
+        raise _FrameFailed(job.error)
+    if job.state != JobState.SUCCEEDED:
+        error: PlacewiseError = Conflict("job_cancelled", f"The job {job.id} was cancelled.")
+        raise _FrameFailed(error.as_problem())
+    result = run_similarity_search(
+        gateway, query_from_job(gateway, job), SearchParams(top_k=EVIDENCE_DEPTH)
+    )
+    places = result.places
+    best_place = None
+    if places is not None:
+        ranking = locate_hits(result.hits, result.photos)
+        inside = photos_inside(places.levels[0], ranking)
+        best_place = (inside.tolist(), places.probabilities[0])
+    measured = FrameForm.model_validate(pending.frame.measurements)
+    with gateway.catalog.read() as session:
+        photo_count = CatalogPhotoGraph(session, pending.track.map_id).photo_count
+    return frame_evidence(
+        pending.frame.captured_at,
+        [str(hit.photo_id) for hit in result.hits],
+        [hit.ranked_by for hit in result.hits],
+        photo_count,
+        not_in_map=None if places is None else places.not_in_map,
+        best_place=best_place,
+        fix=measured.fix(),
+        odometry=measured.odometry(),
+    )
+
+
+def _advance(
+    gateway: GatewayContext, pending: _PendingFrame, evidence: FrameEvidence
+) -> dict[UUID, dict[str, Any]]:
+    """Compute the new values of the frame, and of the applied ones that were taken after it."""
+    frame = pending.frame
+    with gateway.catalog.read() as session:
+        before = last_belief(session, frame.track_id, frame.captured_at)
+        later = session.scalars(
+            select_frames(frame.track_id, with_evidence=True).where(
+                TrackFrame.captured_at > frame.captured_at, TrackFrame.evidence.is_not(None)
+            )
+        ).all()
+        track_filter, graph = _open_filter(gateway, session, pending.track)
+        belief = (
+            _start_belief(graph, pending.track, frame.captured_at)
+            if before is None
+            else Belief.from_bytes(before)
+        )
+        changed: dict[UUID, dict[str, Any]] = {}
+        for frame_id, each in [(frame.id, evidence), *((f.id, _evidence_of(f)) for f in later)]:
+            belief = track_filter.advance(belief, each)
+            state = TrackStateResponse.of(track_filter.state(belief))
+            changed[frame_id] = {
+                "state": state.model_dump(mode="json"),
+                "belief": belief.to_bytes(),
+            }
+    changed[frame.id]["evidence"] = evidence.model_dump(mode="json")
+    return changed
+
+
+def _commit(
+    gateway: GatewayContext, pending: _PendingFrame, changed: dict[UUID, dict[str, Any]]
+) -> None:
+    """Store the new values of frames, unless the track was deleted or advanced meanwhile."""
+    with gateway.catalog.write() as session:
+        track = session.get(Track, pending.track.id, with_for_update=True)
+        if track is None or track.revision != pending.track.revision:
+            return
+        for frame_id, values in changed.items():
+            session.execute(update(TrackFrame).where(TrackFrame.id == frame_id).values(**values))
+        drop_old_beliefs(session, track.id)
+        track.revision += 1
+    for status in (
+        "failed" if "error" in values else values["state"]["status"] for values in changed.values()
+    ):
+        gateway.track_frames.labels(status).inc()
+
+
+def _describe_again(gateway: GatewayContext, job_id: UUID) -> None:
+    with gateway.catalog.write() as session:
+        job = session.get(Job, job_id, with_for_update=True)
+        if job is not None and job.state == JobState.SUCCEEDED:
+            requeue_job(job)
+    gateway.wakeups.send(WakeupQueue.QUERY)
+
+
+def smooth_states(
+    gateway: GatewayContext, track: Track, frames: Sequence[TrackFrame]
+) -> dict[UUID, TrackStateResponse]:
+    """Compute the states of the applied frames given all of them, earlier and later.
+
+    Args:
+        gateway: The gateway.
+        track: The track.
+        frames: Its frames with their evidence, in the order of their times.
+    """
+    applied = [frame for frame in frames if frame.state is not None]
+    if not applied:
+        return {}
+    with gateway.catalog.read() as session:
+        track_filter, graph = _open_filter(gateway, session, track)
+        beliefs = track_filter.smooth(
+            [_evidence_of(frame) for frame in applied],
+            _start_belief(graph, track, applied[0].captured_at),
+        )
+        return {
+            frame.id: TrackStateResponse.of(track_filter.state(belief))
+            for frame, belief in zip(applied, beliefs, strict=True)
+        }
+
+
+def _evidence_of(frame: TrackFrame) -> FrameEvidence:
+    return FrameEvidence.model_validate(frame.evidence)
+
+
+def _open_filter(
+    gateway: GatewayContext, session: Session, track: Track
+) -> tuple[TrackFilter, CatalogPhotoGraph]:
+    map_ = session.get_one(Map, track.map_id)
+    scheme = LevelScheme(
+        labels_are_paths=map_.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
+    )
+    graph = CatalogPhotoGraph(session, track.map_id)
+    motion = TrackParams.model_validate(track.params).motion_model()
+    return TrackFilter(graph, motion, scheme), graph
+
+
+def _start_belief(graph: CatalogPhotoGraph, track: Track, first_time: datetime) -> Belief | None:
+    """Return the belief before the first frame; None if no photo is at the stated start, if any."""
+    params = TrackParams.model_validate(track.params)
+    if params.place is not None:
+        start = graph.labelled(params.place)
+    elif params.latitude is not None and params.longitude is not None:
+        accuracy_m = params.accuracy_m or START_ACCURACY_M
+        start = graph.near(params.latitude, params.longitude, accuracy_m)
+    else:
+        return None
+    if not len(start):
+        return None
+    return Belief(
+        time=first_time,
+        photos=tuple(start.ids.tolist()),
+        probabilities=np.full(len(start), START_PROBABILITY / len(start)),
+        elsewhere=(1 - START_PROBABILITY) * (1 - OUT_OF_MAP_SHARE),
+        outside=(1 - START_PROBABILITY) * OUT_OF_MAP_SHARE,
+        seen={},
+    )

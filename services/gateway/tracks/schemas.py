@@ -1,0 +1,194 @@
+"""Schemas of tracks: how one begins, the form fields of a frame, and the state after a frame."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, Self
+from uuid import UUID
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from services.gateway.dependencies import NO_NUL_PATTERN
+from services.gateway.schemas import EstimateLevelResponse, RequestModel, ResponseModel
+from shared.errors import invalid_field_error
+from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
+from shared.tracks.evidence import Odometry, PositionFix
+from shared.tracks.motion import DEFAULT_MOTION, MotionModel, motion_model
+from shared.tracks.state import TrackState
+
+Latitude = Annotated[float | None, Field(ge=-90, le=90)]
+Longitude = Annotated[float | None, Field(ge=-180, le=180)]
+AccuracyM = Annotated[float | None, Field(gt=0, le=100_000)]
+OdometryM = Annotated[float | None, Field(ge=0, le=1_000_000)]
+
+
+class TrackParams(RequestModel):
+    """How a track begins. Stored as JSON with it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    motion: Literal["walk", "bicycle", "car", "train"] | None = Field(
+        None, description="how the camera moves; without it and `max_speed_mps`, as a car"
+    )
+    max_speed_mps: float | None = Field(
+        None, gt=0, le=1000, description="maximum speed in m/s, instead of `motion`"
+    )
+    latitude: Latitude = Field(None, description="where the track begins, if it is known")
+    longitude: Longitude = None
+    accuracy_m: AccuracyM = Field(None, description="radius around that position; 50 if omitted")
+    place: str | None = Field(
+        None,
+        min_length=1,
+        max_length=MAX_TEXT_CHARACTERS,
+        pattern=NO_NUL_PATTERN,
+        description="place label where the track begins, instead of a position",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.motion is not None and self.max_speed_mps is not None:
+            raise ValueError("send `motion` or `max_speed_mps`, not both")
+        if (self.latitude is None) != (self.longitude is None):
+            raise ValueError("send both `latitude` and `longitude`, or neither")
+        if self.latitude is None and self.accuracy_m is not None:
+            raise ValueError("`accuracy_m` needs `latitude` and `longitude`")
+        if self.latitude is not None and self.place is not None:
+            raise ValueError("send a position or a `place`, not both")
+        return self
+
+    def motion_model(self) -> MotionModel:
+        """Return the motion model of the track."""
+        motion = self.max_speed_mps or self.motion
+        return DEFAULT_MOTION if motion is None else motion_model(motion)
+
+
+def _parse_captured_at(text: Any) -> datetime:
+    return parse_time("captured_at", str(text))
+
+
+class FrameForm(BaseModel):
+    """The text fields of a frame's form. Position and odometry are stored as JSON with it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    captured_at: Annotated[datetime, BeforeValidator(_parse_captured_at)] = Field(
+        description="when the photo was taken, ISO 8601; no offset means UTC; unique in a track"
+    )
+    expected_version: int | None = Field(
+        None,
+        ge=0,
+        le=2**31,
+        description="`version` that the track must have (409, `track_changed`): protects from a "
+        "second client",
+    )
+    latitude: Latitude = Field(None, description="measured position, such as of GPS, in degrees")
+    longitude: Longitude = None
+    accuracy_m: AccuracyM = Field(
+        None, description="radius that contains the true position with a probability of 68 %"
+    )
+    distance_m: OdometryM = Field(None, description="odometry: way since the frame before")
+    distance_accuracy_m: Annotated[float | None, Field(gt=0, le=1_000_000)] = Field(
+        None, description="standard deviation of `distance_m`"
+    )
+    turn_degrees: float | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description="odometry: change of the heading since the frame before, clockwise",
+    )
+    turn_accuracy_degrees: float | None = Field(
+        None, gt=0, le=180, description="standard deviation of `turn_degrees`; 10 if omitted"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        position = (self.latitude, self.longitude, self.accuracy_m)
+        if None in position and any(value is not None for value in position):
+            raise ValueError("`latitude`, `longitude` and `accuracy_m` are sent together")
+        if (self.distance_m is None) != (self.distance_accuracy_m is None):
+            raise ValueError("`distance_m` and `distance_accuracy_m` are sent together")
+        if self.turn_degrees is not None and self.distance_m is None:
+            raise ValueError("`turn_degrees` needs `distance_m`")
+        if self.turn_accuracy_degrees is not None and self.turn_degrees is None:
+            raise ValueError("`turn_accuracy_degrees` needs `turn_degrees`")
+        return self
+
+    def fix(self) -> PositionFix | None:
+        """Return the measured position, if any."""
+        if self.latitude is None or self.longitude is None or self.accuracy_m is None:
+            return None
+        return PositionFix(
+            latitude=self.latitude, longitude=self.longitude, accuracy_m=self.accuracy_m
+        )
+
+    def odometry(self) -> Odometry | None:
+        """Return the odometry, if any."""
+        if self.distance_m is None or self.distance_accuracy_m is None:
+            return None
+        turn_accuracy = self.turn_accuracy_degrees
+        return Odometry(
+            distance_m=self.distance_m,
+            distance_accuracy_m=self.distance_accuracy_m,
+            heading_change_degrees=self.turn_degrees,
+            **({} if turn_accuracy is None else {"heading_accuracy_degrees": turn_accuracy}),
+        )
+
+
+FRAME_FIELDS: dict[str, dict[str, Any]] = FrameForm.model_json_schema()["properties"]
+
+
+def parse_frame_form(fields: dict[str, str]) -> FrameForm:
+    """Parse the text fields of a frame's form; an empty field counts as missing.
+
+    Raises:
+        Unprocessable: `invalid_field`.
+    """
+    values = {name: value.strip() for name, value in fields.items() if value.strip()}
+    try:
+        return FrameForm.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else "form"
+        raise invalid_field_error(name, first["msg"].removeprefix("Value error, ")) from None
+
+
+class TrackStateResponse(ResponseModel):
+    """Where the camera of a track is."""
+
+    status: Literal["converging", "tracking", "lost"] = Field(
+        description="`tracking`: the position or place is probable; `lost`: it was, or the camera "
+        "is probably outside the map; `converging`: not yet"
+    )
+    image_id: UUID | None = Field(description="the nearest photo of the map; null if unknown")
+    latitude: float | None
+    longitude: float | None
+    place: str | None
+    heading: float | None = Field(
+        description="of the nearest photo, degrees clockwise from north; null if the map has none"
+    )
+    probability: float = Field(description="that the camera is at the finest level")
+    levels: list[EstimateLevelResponse] = Field(
+        description="finest first, as in the estimate of a single photo"
+    )
+    radius_68_m: float | None = Field(
+        description="radius in metres around the position that contains the true one with a "
+        "probability of 68 %; null without coordinates, or if it exceeds the largest level"
+    )
+    radius_95_m: float | None = Field(description="the same with 95 %")
+    not_in_map_probability: float = Field(description="that the camera is outside the map")
+
+    @classmethod
+    def of(cls, state: TrackState) -> TrackStateResponse:
+        return cls(
+            status=state.status,
+            image_id=None if state.photo is None else UUID(state.photo),
+            latitude=state.latitude,
+            longitude=state.longitude,
+            place=state.place,
+            heading=state.heading,
+            probability=state.probability,
+            levels=[EstimateLevelResponse.model_validate(level) for level in state.levels],
+            radius_68_m=state.radius_68_m,
+            radius_95_m=state.radius_95_m,
+            not_in_map_probability=state.outside,
+        )

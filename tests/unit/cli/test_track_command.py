@@ -1,0 +1,215 @@
+"""`placewise track` without a server: times of frames, videos, and the files of a track."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+from xml.etree import ElementTree
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from placewise.answers import OneTrack, Photo
+from services.cli.track.frame_sources import (
+    FrameTiming,
+    Order,
+    read_photo_frames,
+    read_video_frames,
+)
+from services.cli.track.track_files import COLUMNS, check_track_files, write_track_file
+from services.cli.track.track_picture import located_segments
+from shared.errors import InvalidRequest, Misconfigured
+from tests.support.api_responses import PHOTO
+from tests.support.photos import photo_bytes, photo_image
+
+NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
+BY_FILE = FrameTiming(every_seconds=2.0, order=None, begin=None)
+
+
+def taken_at(number: int, time: datetime | None) -> bytes:
+    exif = Image.Exif()
+    if time is not None:
+        exif.get_ifd(IFD.Exif)[0x9003] = f"{time:%Y:%m:%d %H:%M:%S}"  # DateTimeOriginal
+        exif.get_ifd(IFD.Exif)[0x9011] = "+00:00"  # OffsetTimeOriginal
+        exif[Base.Software] = "test"
+    buffer = io.BytesIO()
+    photo_image(number).save(buffer, "JPEG", exif=exif)
+    return buffer.getvalue()
+
+
+def test_photos_are_in_the_order_of_their_times_and_no_two_times_are_equal(tmp_path: Path) -> None:
+    times = {"c.jpg": 0, "a.jpg": 5, "b.jpg": 5, "sub/d.jpg": 9}
+    (tmp_path / "sub").mkdir()
+    for number, (name, seconds) in enumerate(times.items()):
+        photo = taken_at(number, NOON + timedelta(seconds=seconds))
+        (tmp_path / name).write_bytes(photo)
+    frames = read_photo_frames(tmp_path, BY_FILE)
+    assert [frame.name for frame in frames] == ["c.jpg", "a.jpg", "b.jpg", "sub/d.jpg"]
+    assert [(frame.captured_at - NOON).total_seconds() for frame in frames] == [0, 5, 5.001, 9]
+
+
+def test_photos_without_a_time_are_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for number, name in enumerate(("b.jpg", "a.jpg")):
+        (tmp_path / name).write_bytes(photo_bytes(number))
+    (tmp_path / "c.jpg").write_bytes(b"no photo")
+    os.utime(tmp_path / "a.jpg", (NOON.timestamp(), NOON.timestamp()))
+    frames = read_photo_frames(tmp_path, BY_FILE)
+    assert [frame.name for frame in frames] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert [(frame.captured_at - NOON).total_seconds() for frame in frames] == [0, 2, 4]
+    later = FrameTiming(1.0, Order.NAME, NOON + timedelta(days=1))
+    assert read_photo_frames(tmp_path, later)[1].captured_at == NOON + timedelta(days=1, seconds=1)
+    with pytest.raises(InvalidRequest, match=r"a\.jpg has no capture time") as refusal:
+        read_photo_frames(tmp_path, FrameTiming(1.0, Order.TIME, None))
+    assert refusal.value.code == "no_times"
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Three seconds with ten frames each, brighter from second to second."""
+    path = tmp_path / "ride.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number in range(30):
+            picture = np.full((48, 64, 3), 40 + 60 * (number // 10), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(("every", "seconds"), [(1.0, [0, 1, 2]), (1.25, [0, 1.3, 2.5])])
+def test_a_video_gives_a_frame_every_so_many_seconds(
+    video: Path, tmp_path: Path, every: float, seconds: list[float]
+) -> None:
+    frames = list(read_video_frames(video, FrameTiming(every, None, NOON), tmp_path))
+    assert [(f.captured_at - NOON).total_seconds() for f in frames] == pytest.approx(seconds)
+    shades = [np.asarray(Image.open(frame.path)).mean() for frame in frames]
+    assert shades == pytest.approx([40, 100, 160], abs=8)
+
+
+def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("no video")
+    with pytest.raises(InvalidRequest, match=r"notes\.txt") as refusal:
+        list(read_video_frames(text, BY_FILE, tmp_path))
+    assert refusal.value.code == "unreadable_video"
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(Misconfigured, match=r"uv pip install '\.\[tracks\]'"):
+        list(read_video_frames(text, BY_FILE, tmp_path))
+
+
+def state(status: str, latitude: float | None, place: str | None = None) -> dict[str, Any]:
+    return {
+        "status": status,
+        "image_id": UUID(int=1),
+        "latitude": latitude,
+        "longitude": None if latitude is None else 7.0,
+        "place": place,
+        "heading": 90.0,
+        "probability": 0.9,
+        "levels": [],
+        "radius_68_m": None if latitude is None else 12.0,
+        "radius_95_m": None,
+        "not_in_map_probability": 0.01,
+    }
+
+
+def track_of(*states: dict[str, Any] | None) -> OneTrack:
+    frames = [
+        {
+            "frame_id": UUID(int=number),
+            "captured_at": NOON + timedelta(seconds=number),
+            "filename": f"{number}.jpg",
+            "status": "failed" if one is None else "applied",
+            "state": one,
+            "error": None,
+            "job_id": UUID(int=number),
+            "job_url": "",
+            "frame_url": "",
+            "version": number,
+        }
+        for number, one in enumerate(states)
+    ]
+    about = {"track_id": UUID(int=9), "motion": "walk", "max_speed_mps": None, "version": 1}
+    times = dict.fromkeys(("created_at", "updated_at", "expires_at"), NOON)
+    return OneTrack(**about, **times, pending=0, state=states[-1], smoothed=True, frames=frames)
+
+
+RIDE = track_of(
+    state("converging", 45.0),
+    state("tracking", 45.001),
+    state("lost", 45.9),
+    None,
+    state("tracking", 45.002),
+)
+
+
+def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
+    photos = [Photo(**{**PHOTO, "latitude": 45.0, "longitude": 7.0})]
+    names = ("json", "csv", "gpx", "geojson", "png", "jpg")
+    files = {name: tmp_path / f"ride.{name}" for name in names}
+    check_track_files(list(files.values()))
+    for file in files.values():
+        write_track_file(file, RIDE, photos)
+    assert json.loads(files["json"].read_text()) == json.loads(RIDE.model_dump_json())
+    rows = list(csv.DictReader(files["csv"].read_text().splitlines()))
+    assert tuple(rows[0]) == COLUMNS
+    statuses = [row["status"] for row in rows]
+    assert statuses == ["converging", "tracking", "lost", "failed", "tracking"]
+    assert (rows[3]["latitude"], rows[4]["latitude"]) == ("", "45.002")
+    gpx = ElementTree.parse(files["gpx"]).getroot()
+    space = {"g": "http://www.topografix.com/GPX/1/1"}
+    segments = gpx.findall("g:trk/g:trkseg", space)
+    assert [len(segment) for segment in segments] == [2, 1]
+    first = segments[0].find("g:trkpt", space)
+    assert first is not None
+    assert first.attrib == {"lat": "45.0000000", "lon": "7.0000000"}
+    assert first.findtext("g:time", namespaces=space) == "2026-05-01T12:00:00Z"
+    features = json.loads(files["geojson"].read_text())["features"]
+    lines = [f for f in features if f["properties"]["kind"] == "track"]
+    assert [line["geometry"]["coordinates"] for line in lines] == [[[7.0, 45.0], [7.0, 45.001]]]
+    points = [f["geometry"] for f in features if f["properties"]["kind"] == "frame"]
+    assert [point and point["coordinates"] for point in points] == [
+        [7.0, 45.0],
+        [7.0, 45.001],
+        [7.0, 45.9],
+        None,
+        [7.0, 45.002],
+    ]
+    for name, kind in (("png", "PNG"), ("jpg", "JPEG")):
+        with Image.open(files[name]) as picture:
+            assert (picture.format, picture.size) == (kind, (1200, 1200))
+            assert len(picture.convert("RGB").getcolors(1_000_000) or []) > 10
+
+
+def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
+    file = tmp_path / "walk.png"
+    write_track_file(file, track_of(state("tracking", None, "hall"), state("lost", None)), [])
+    with Image.open(file) as picture:
+        assert picture.size == (1200, 1200)
+    assert located_segments(track_of(None)) == []
+
+
+def test_files_that_can_not_be_written_are_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for bad in (tmp_path / "ride.txt", tmp_path / "missing" / "ride.csv"):
+        with pytest.raises(InvalidRequest) as refusal:
+            check_track_files([bad])
+        assert refusal.value.code == "bad_out"
+    monkeypatch.setattr("services.cli.track.track_files.find_spec", lambda name: None)
+    check_track_files([tmp_path / "ride.csv"])
+    with pytest.raises(Misconfigured, match="matplotlib"):
+        check_track_files([tmp_path / "ride.png"])
