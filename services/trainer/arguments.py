@@ -122,7 +122,10 @@ class TrainingArguments(BaseModel):
     backbone_arch: str = _argument(MODEL, "resnet18", "Name of the backbone.")
     pretrained: bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
     weights: Path | None = _argument(
-        MODEL, None, "File with the backbone's weights. If omitted: the torch.hub cache."
+        MODEL,
+        None,
+        "File with the backbone's weights, or a checkpoint of the whole network to fine-tune. "
+        "If omitted: the torch.hub cache.",
     )
     layers_to_freeze: int = _argument(
         MODEL, 2, "Freeze layers up to and including this one. -1: freeze none.", ge=-1

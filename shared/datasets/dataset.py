@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
 
+PHOTO_TABLE_HEADER = "path,latitude,longitude,heading,place,frame,sequence"
+"""First line of a CSV list of photos; all columns but `path` are optional"""
+
 MISSING_FILE_BYTES = -1
 """Size of a missing photo in a fingerprint."""
 

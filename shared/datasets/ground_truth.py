@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from shared.datasets.dataset import DatasetPhoto, Indices
+from shared.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto, Indices
 from shared.datasets.utm_coordinates import group_by_utm_plane, utm_positions
 from shared.errors import InvalidRequest
 from shared.evaluation.recall import positives_within
@@ -193,5 +193,5 @@ def _missing_values_error(what: str, code: str, photos: Sequence[DatasetPhoto]) 
     return InvalidRequest(
         code,
         f"{len(photos)} photos have no {what} (first: {photos[0].name}), which this rule needs. "
-        "Add it in a CSV, or use another rule.",
+        f"Add it in a CSV with the header {PHOTO_TABLE_HEADER}, or use another rule.",
     )

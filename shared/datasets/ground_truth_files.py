@@ -11,10 +11,11 @@ arguments. The result is lists of integers, or an error.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import pickle
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -46,15 +47,41 @@ def read_integer_lists(path: Path) -> list[Indices]:
 
     Raises InvalidRequest (`bad_ground_truth`) for anything else.
     """
+    with _refusing_bad_files(path):
+        return [_row(value, path) for value in _stored_rows(path)]
+
+
+def read_numbered_ground_truth(
+    path: Path, *, database: Sequence[str], queries: Sequence[str]
+) -> list[Indices]:
+    """Read a ground truth of VPR-Bench: rows of a query's number and its database indices.
+
+    Args:
+        path: The `.npy` file, an object array (n, 2).
+        database: Names of the database photos, in order.
+        queries: Names of the queries, in order; those without a row have no positives.
+
+    Raises:
+        InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
+    """
+    positives = [np.empty(0, np.int64) for _ in queries]
+    with _refusing_bad_files(path):
+        for number, indices in _stored_rows(path):
+            (query,), rows = _row(number, path).tolist(), _row(indices, path)
+            if query >= len(queries):
+                raise _mismatch_error(
+                    path, f"it has a row for query {query} of {len(queries)}, counted from 0"
+                )
+            positives[query] = rows
+    _check_indices(path, positives, database)
+    return positives
+
+
+@contextlib.contextmanager
+def _refusing_bad_files(path: Path) -> Iterator[None]:
+    """Convert the errors of damaged and malicious files to `bad_ground_truth`."""
     try:
-        with path.open("rb") as file:
-            dtype, shape = _header(file)
-            if dtype.kind in INTEGER_KINDS:
-                file.seek(0)
-                return [_row(row, path) for row in _table(np.load(file, allow_pickle=False))]
-            if dtype != np.dtype(object):
-                raise ValueError(f"it contains {dtype}, expected lists of integers")
-            return [_row(value, path) for value in _unpickle(file, shape)]
+        yield
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise _bad_ground_truth_error(path, str(error)) from error
     except (
@@ -69,6 +96,17 @@ def read_integer_lists(path: Path) -> list[Indices]:
         raise _bad_ground_truth_error(
             path, f"its pickle is broken ({type(error).__name__})"
         ) from error
+
+
+def _stored_rows(path: Path) -> list[Any]:
+    with path.open("rb") as file:
+        dtype, shape = _header(file)
+        if dtype.kind in INTEGER_KINDS:
+            file.seek(0)
+            return _table(np.load(file, allow_pickle=False))
+        if dtype != np.dtype(object):
+            raise ValueError(f"it contains {dtype}, expected lists of integers")
+        return _unpickle(file, shape)
 
 
 def read_names(path: Path) -> list[str]:
@@ -277,12 +315,16 @@ def read_ground_truth(
     rule = _check_sidecar(path, database, queries)
     if len(positives) != len(queries):
         raise _mismatch_error(path, f"it has {len(positives)} rows for {len(queries)} queries")
+    _check_indices(path, positives, database)
+    return positives, rule
+
+
+def _check_indices(path: Path, positives: Sequence[Indices], database: Sequence[str]) -> None:
     largest = max((int(row[-1]) for row in positives if len(row)), default=-1)
     if largest >= len(database):
         raise _mismatch_error(
             path, f"it contains the index {largest}, but the database has {len(database)} photos"
         )
-    return positives, rule
 
 
 def sidecar_path(path: Path) -> Path:

@@ -14,7 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.datasets.dataset import DatasetPhoto, EvaluationSet, TrainingPlace, TrainingSet
+from shared.datasets.dataset import (
+    PHOTO_TABLE_HEADER,
+    DatasetPhoto,
+    EvaluationSet,
+    TrainingPlace,
+    TrainingSet,
+)
 from shared.datasets.ground_truth import find_positives, parse_rule
 from shared.datasets.layouts import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
 from shared.datasets.layouts.base import EvaluationLayout, ListedSet, TrainingLayout
@@ -37,6 +43,7 @@ __all__ = [
 PART_FOLDERS = frozenset(
     {
         *("database", "queries", "queries_v1", "queries_v2"),
+        *("ref", "query"),
         *("train", "val", "test", "train_val", "images"),
         *(RIDES, *SEASONS),
     }
@@ -193,8 +200,9 @@ def _choose_set(root: Path, sets: Sequence[DiscoveredSet], name: str | None) -> 
     if not sets:
         raise NotFound(
             "no_evaluation_set",
-            f"{root} contains no evaluation set: neither database/ and queries/ nor .npy lists "
-            f"nor another known layout. {LAYOUTS_HELP}",
+            f"{root} contains no evaluation set: neither database/ and queries/ nor ref/, "
+            "query/ and ground_truth_new.npy nor .npy lists nor database.csv and queries.csv "
+            f"({PHOTO_TABLE_HEADER}) nor another known layout. {LAYOUTS_HELP}",
         )
     if name is None:
         if len(sets) > 1:

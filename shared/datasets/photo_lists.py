@@ -7,27 +7,31 @@ that name file and line.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto
 from shared.datasets.ground_truth_files import read_names
 from shared.datasets.utm_coordinates import add_utm_positions
 from shared.datasets.utm_filenames import parse_utm_file_name
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.imaging.photo_header import read_photo_header
 
+NUMBERED_NAME = re.compile(r"[A-Za-z]*[_-]?(\d{1,15})")
+"""Stems of frames: `0000123`, `frame_0123`, `img-123`"""
 UNLIMITED_PIXELS = 2**62  # no limit: only the header is read
 
 
 def photo_from_filename(path: Path, name: str, place: str | None = None) -> DatasetPhoto:
-    """Create a photo with the position of its `@UTM@` file name; without one for other names.
+    """Create a photo with the position of its `@UTM@` file name, or its number as a frame's.
 
     Raises InvalidRequest (`bad_coordinates`).
     """
     location = parse_utm_file_name(path.name)
     if location is None:
-        return DatasetPhoto(path, name, place=place)
+        numbered = NUMBERED_NAME.fullmatch(path.stem)
+        return DatasetPhoto(path, name, place=place, frame=int(numbered[1]) if numbered else None)
     return DatasetPhoto(
         path,
         name,
@@ -182,7 +186,8 @@ def _path_column(path: Path, row: dict[str, str]) -> str:
     if column is None:
         raise InvalidRequest(
             "missing_column",
-            f"{path} has no column {' or '.join(PATH_COLUMNS)}. Its columns are: {', '.join(row)}.",
+            f"{path} has no column {' or '.join(PATH_COLUMNS)}. Its columns are: {', '.join(row)}. "
+            f"A header is, for example, {PHOTO_TABLE_HEADER}; all but the first are optional.",
             missing=[PATH_COLUMNS[0]],
         )
     return column
@@ -216,6 +221,6 @@ def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: st
         longitude=numbers.get("longitude", location.longitude if location else None),
         heading=numbers["heading"] % 360 if "heading" in numbers else named.heading,
         place=values.get("place"),
-        frame=parse_integer(path, line, values, "frame") if "frame" in values else None,
+        frame=parse_integer(path, line, values, "frame") if "frame" in values else named.frame,
         sequence=values.get("sequence"),
     )

@@ -9,7 +9,7 @@ import numpy as np
 import utm
 from numpy.typing import NDArray
 
-from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto
 from shared.errors import InvalidRequest
 from shared.geodesy import distance_m
 
@@ -48,7 +48,8 @@ def utm_positions(photos: Sequence[DatasetPhoto]) -> tuple[Positions, list[UtmGr
             "no_positions",
             f"{len(missing)} of {len(photos)} photos have no position (first: {missing[0]}). "
             "Positions are read from @UTM@ file names, a CSV or EXIF. Without positions, use "
-            "another rule: frames N, or place-label.",
+            "another rule: frames N, or place-label. The header of a CSV is "
+            f"{PHOTO_TABLE_HEADER}; all columns but path are optional.",
             missing=missing[:20],
         )
     _project(photos, degrees, metres, grids)

@@ -254,9 +254,10 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
         if name_column is None:
             raise InvalidRequest(
                 "bad_table",
-                f"{source_name} has no column {' or '.join(NAME_COLUMNS)}. Further columns may be "
-                f"{', '.join(CSV_COLUMNS)}. The first line, split at commas, is "
-                f"{', '.join(columns) or 'empty'}.",
+                f"{source_name} has no column {' or '.join(NAME_COLUMNS)}. Its first line is "
+                f"{','.join(columns) or 'empty'}; a complete header is "
+                f"{','.join((NAME_COLUMNS[0], *CSV_COLUMNS))}. All columns but the first are "
+                "optional.",
             )
         unknown = [c for c in columns if c not in (name_column, *CSV_COLUMNS)]
         if unknown:

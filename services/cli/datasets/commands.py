@@ -42,7 +42,7 @@ from shared.datasets.check import (
     find_undecodable_photos,
     inspect_dataset,
 )
-from shared.datasets.dataset import EvaluationSet, TrainingSet
+from shared.datasets.dataset import PHOTO_TABLE_HEADER, EvaluationSet, TrainingSet
 from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rule
 from shared.datasets.ground_truth_files import sidecar_path, write_ground_truth
 from shared.datasets.open_dataset import open_evaluation_set
@@ -190,7 +190,11 @@ def _print_evaluation(summary: Json) -> None:
 
 
 PhotoListOption = Annotated[
-    Path, typer.Option(help="List of photos: .npy of paths, CSV, or text with a path per line.")
+    Path,
+    typer.Option(
+        help="List of photos: .npy of paths, text with a path per line, or CSV with the header "
+        f"{PHOTO_TABLE_HEADER}; all columns but path are optional."
+    ),
 ]
 
 

@@ -46,6 +46,8 @@ class ReportOptions:
     against: Path | None
     pairs: Path | None
     depth: int
+    ks: tuple[int, ...] | None
+    """Values of k of the reported recall@k; None for `DEFAULT_KS`"""
     grids: int
     only_wrong: bool
     faiss_gpu: bool
@@ -72,7 +74,9 @@ def evaluate(
     checkpoint: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="Checkpoint of `placewise train` to evaluate (.ckpt)."
+            exists=True,
+            dir_okay=False,
+            help="Checkpoint of a trained or published network to evaluate.",
         ),
     ] = None,
     image_size: Annotated[
@@ -111,7 +115,8 @@ def evaluate(
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="With --predictions: ground truth, .npy. If omitted: that of --data and --set.",
+            help="Ground truth of --predictions, or of the one --set of --data, .npy. If omitted: "
+            "that of --data and --set.",
         ),
     ] = None,
     database: Annotated[
@@ -145,6 +150,10 @@ def evaluate(
     depth: Annotated[
         int, typer.Option(min=1, max=1000, help="Number of database photos ranked per query.")
     ] = 20,
+    recall_at: Annotated[
+        str | None,
+        typer.Option(help="Values of k of the reported recalls. Default: 1,5,10,20."),
+    ] = None,
     grids: Annotated[
         int,
         typer.Option(
@@ -200,17 +209,6 @@ def evaluate(
     labelled queries. With --data, evaluate a --checkpoint, an --extractor or a --server on a data
     set. With --predictions, evaluate a file of predictions.
     """
-    report_options = ReportOptions(
-        out,
-        against,
-        pairs,
-        depth,
-        grids,
-        only_wrong,
-        faiss_gpu,
-        place_labels_are_paths,
-        as_json,
-    )
     map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
@@ -224,9 +222,21 @@ def evaluate(
     }
     output_options: OptionValues = {
         "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
-        "--sequences": sequences,
+        "--sequences": sequences, "--recall-at": recall_at,
     }  # fmt: skip
     with report_errors(as_json):
+        report_options = ReportOptions(
+            out,
+            against,
+            pairs,
+            depth,
+            _parse_recall_at(recall_at, depth),
+            grids,
+            only_wrong,
+            faiss_gpu,
+            place_labels_are_paths,
+            as_json,
+        )
         # Must be set before torch is loaded below; see services/cli/__init__.py.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         if predictions is not None:
@@ -255,7 +265,10 @@ def evaluate(
             evaluate_predictions_of_set(predictions, data, sets, protocol, rule, report_options)
             return
         if data is not None:
-            _reject_options("with --data", map_options | file_options)
+            lists: OptionValues = {"--database": database, "--queries": queries}
+            _reject_options("with --data", map_options | lists)
+            if ground_truth is not None:
+                _reject_options("with --ground-truth", {"--rule": rule})
             require_packages()
             from services.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
 
@@ -266,11 +279,15 @@ def evaluate(
             if sequences:
                 from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
 
-                _reject_options("with --sequences", {"--out": out, "--pairs": pairs})
+                unused: OptionValues = {
+                    "--out": out, "--pairs": pairs, "--recall-at": recall_at,
+                    "--ground-truth": ground_truth,
+                }  # fmt: skip
+                _reject_options("with --sequences", unused)
                 speeds = parse_motion(motion)
                 evaluate_sequences(data, sets, protocol, rule, target, speeds, as_json)
                 return
-            evaluate_sets(data, sets, protocol, rule, target, report_options)
+            evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
             return
         _reject_options("without --data", model_options | file_options | output_options)
         from services.cli.evaluation.live_map import evaluate_map
@@ -282,6 +299,21 @@ def _reject_options(context: str, options: OptionValues) -> None:
     invalid = [name for name, value in options.items() if value]
     if invalid:
         raise InvalidRequest("options_contradict", f"{', '.join(invalid)} can't be used {context}.")
+
+
+def _parse_recall_at(text: str | None, depth: int) -> tuple[int, ...] | None:
+    """Parse values of k such as `1,5,10,15`."""
+    if text is None:
+        return None
+    values = [part.strip() for part in text.split(",")]
+    ks = {int(value) for value in values if value.isdecimal()}
+    if len(ks) != len(values) or not 1 <= min(ks, default=0) <= max(ks) <= depth:
+        raise InvalidRequest(
+            "bad_recall_at",
+            f"--recall-at must be different numbers from 1 to --depth ({depth}), separated by "
+            f"commas, not {text}.",
+        )
+    return tuple(sorted(ks))
 
 
 def _parse_image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
@@ -315,8 +347,8 @@ def compare(
         str,
         typer.Option(
             help="Comma-separated extractor names with options as in EXTRACTOR, or checkpoints "
-            "(.ckpt). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` reduces "
-            "descriptors to 512 dimensions by PCA whitening.",
+            "(.ckpt, .pth). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` "
+            "reduces descriptors to 512 dimensions by PCA whitening.",
         ),
     ],
     set_name: Annotated[

@@ -45,6 +45,7 @@ from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_con
 
 BLOCK_BYTES = 64_000_000
 SEED = 0
+CHECKPOINT_SUFFIXES = (".ckpt", ".pth")
 
 
 def whiten_set(
@@ -200,7 +201,7 @@ def _validate_entries(
 ) -> None:
     """Check all entries before the first evaluation, which may take hours."""
     for entry in entries:
-        if entry.name.endswith(".ckpt"):
+        if entry.name.endswith(CHECKPOINT_SUFFIXES):
             if not Path(entry.name).is_file():
                 raise InvalidRequest("bad_extractors", f"Checkpoint {entry.name} does not exist.")
             if entry.fit:
@@ -233,7 +234,7 @@ def _evaluate_entry(
 ) -> tuple[dict[str, Any], RetrievalMetrics]:
     describer = (
         checkpoint_describer(Path(entry.name), "same", settings)
-        if entry.name.endswith(".ckpt")
+        if entry.name.endswith(CHECKPOINT_SUFFIXES)
         else extractor_describer(
             entry.name, None, evaluation_set, settings, progress, fit=entry.fit
         )

@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import UUID
@@ -32,6 +32,7 @@ from services.cli.ingest.upload import (
 )
 from services.cli.output import progress_bar
 from shared.config.settings import Settings
+from shared.datasets.ground_truth_files import read_ground_truth
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import Conflict, InvalidRequest, NotFound, Unavailable, Unprocessable
 from shared.evaluation.dataset_places import measure_places
@@ -236,14 +237,18 @@ def evaluate_sets(
     names: Sequence[str] | None,
     protocol: str | None,
     rule: str | None,
+    ground_truth: Path | None,
     target: EvaluationTarget,
     options: ReportOptions,
 ) -> None:
     """Evaluate a target on the named sets below `data`, or on all of them.
 
+    `ground_truth`: a file that replaces the ground truth of the only set, or None.
+
     Raises:
         NotFound: `no_evaluation_set`.
-        InvalidRequest: `options_contradict`, `no_model`, and errors of opening the sets.
+        InvalidRequest: `options_contradict`, `no_model`, `which_set`, and errors of opening the
+            sets.
         Misconfigured: `out_unwritable`, and errors of loading the model.
     """
     target.check()
@@ -261,6 +266,14 @@ def evaluate_sets(
     evaluation_sets = [
         open_evaluation_set(data, name, protocol=protocol, rule=rule) for name in set_names
     ]
+    if ground_truth is not None:
+        if len(evaluation_sets) > 1:
+            raise InvalidRequest(
+                "which_set",
+                f"--ground-truth belongs to one set. Pass --set with one of: "
+                f"{', '.join(set_names)}.",
+            )
+        evaluation_sets = [_replace_ground_truth(evaluation_sets[0], ground_truth)]
     results: list[EvaluationResult] = []
     run: EvaluationRun | None = None
     with progress_bar() as progress:
@@ -284,6 +297,15 @@ def evaluate_sets(
             results.append(result)
     assert run is not None, "at least one set was evaluated"
     output_results(run, results, options)
+
+
+def _replace_ground_truth(evaluation_set: EvaluationSet, path: Path) -> EvaluationSet:
+    positives, rule = read_ground_truth(
+        path,
+        database=[photo.name for photo in evaluation_set.database],
+        queries=[photo.name for photo in evaluation_set.queries],
+    )
+    return replace(evaluation_set, positives=tuple(positives), rule=rule or f"given by {path.name}")
 
 
 def make_describer(

@@ -86,7 +86,7 @@ def evaluate_rankings(
             if evaluation_set.database
             else None
         ),
-        ks=DEFAULT_KS,
+        ks=options.ks or DEFAULT_KS,
     )
     against = None
     if options.against is not None:

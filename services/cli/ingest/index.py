@@ -64,8 +64,8 @@ def index(
         Path | None,
         typer.Option(
             "--csv",
-            help="CSV table with the column filename (relative to DIR) and any of latitude, "
-            "longitude, heading, captured_at, place, tags.",
+            help="CSV table with the header filename,latitude,longitude,heading,captured_at,place,"
+            "tags. filename is relative to DIR; the other columns are optional.",
         ),
     ] = None,
     utm_zone: Annotated[

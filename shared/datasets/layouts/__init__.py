@@ -13,6 +13,7 @@ from shared.datasets.layouts.folder_pairs import FolderPairs
 from shared.datasets.layouts.gsv_cities import GsvCities, GsvXs
 from shared.datasets.layouts.msls import Msls
 from shared.datasets.layouts.npy_lists import NpyLists
+from shared.datasets.layouts.vpr_bench import VprBench
 
 TRAINING_LAYOUTS: tuple[TrainingLayout, ...] = (GsvXs(), GsvCities(), CsvTrainingTable())
 # Lists come before folders: if a dataset has both, the lists have the ground truth.
@@ -22,4 +23,5 @@ EVALUATION_LAYOUTS: tuple[EvaluationLayout, ...] = (
     Msls(),
     CsvTables(),
     FolderPairs(),
+    VprBench(),
 )

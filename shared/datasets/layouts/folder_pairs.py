@@ -4,8 +4,8 @@ Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Bes
 `rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
 as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
 2013): the first is the database, and photos of about the same number show the same place. In
-`database/` and `queries/` with as many photos each, without positions and labels, photos are
-numbered as well, for the rule `frames 10`.
+`database/` and `queries/` with as many photos each, without positions, labels and numbers in file
+names, photos are numbered as well, for the rule `frames 10`.
 
 Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
 and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
@@ -65,7 +65,7 @@ class FolderPairs:
         database, queries = (
             _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
         )
-        if len(database) == len(queries) and not any(map(_is_located, database + queries)):
+        if len(database) == len(queries) and not any(map(_is_placed, database + queries)):
             database, queries = _number(database), _number(queries)
         if protocol == VME_PROTOCOL:
             database, queries = (
@@ -75,8 +75,9 @@ class FolderPairs:
         return ListedSet(database, queries, _default_rule(database + queries))
 
 
-def _is_located(photo: DatasetPhoto) -> bool:
-    return photo.easting is not None or photo.place is not None
+def _is_placed(photo: DatasetPhoto) -> bool:
+    """Whether a photo has a position, a label, or a number in its file name."""
+    return any(value is not None for value in (photo.easting, photo.place, photo.frame))
 
 
 def _has_rides(folder: Path) -> bool:

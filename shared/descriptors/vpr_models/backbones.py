@@ -359,6 +359,7 @@ _BUILDERS: dict[str, BackboneBuilder] = {
     "resnet34": build_resnet,
     "resnet50": build_resnet,
     "resnet101": build_resnet,
+    "resnet152": build_resnet,
     "resnext50_32x4d": build_resnet,
     "efficientnet_b0": build_efficientnet_b0,
     "efficientnet_lite0": build_efficientnet_lite0,

@@ -37,13 +37,11 @@ from safetensors.torch import save
 
 from shared.descriptors.backbones.torchhub import module_fingerprint
 from shared.descriptors.vpr_models.config import VprModelConfig
-from shared.descriptors.vpr_models.gsv_compat import (
-    GSV_MODEL_ARGUMENTS,
-    is_gsv_checkpoint,
-    read_gsv_config,
-    rename_gsv_tensor,
-)
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.descriptors.vpr_models.published_checkpoints import (
+    GSV_MODEL_ARGUMENTS,
+    read_published_checkpoint,
+)
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     check_declared_size,
@@ -71,7 +69,7 @@ class Checkpoint:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Load a checkpoint of `placewise train` or gsv_xs, or a saved `checkpoint_state`.
+    """Load a checkpoint of `placewise train`, or one that `published_checkpoints` reads.
 
     Raises:
         NotFound: `checkpoint_not_found`.
@@ -80,9 +78,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
             VprModelConfig and `build_vpr_model`.
     """
     stored = _read(path)
-    parameters, tensors = stored.get("hyper_parameters"), stored.get("state_dict")
+    parameters = stored.get("hyper_parameters", {})
+    tensors = stored.get("state_dict", stored.get("model_state_dict", stored))
     if not isinstance(parameters, Mapping) or not isinstance(tensors, Mapping):
-        raise _checkpoint_unfit_error(path, "it has no hyper_parameters or no state_dict")
+        raise _checkpoint_unfit_error(path, "it has no mapping of tensors")
     if isinstance(parameters.get("model"), Mapping):
         config = VprModelConfig.parse({**parameters["model"], "pretrained": False})
         own_tensors = {
@@ -90,11 +89,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
             for n, t in tensors.items()
             if n.startswith(STATE_DICT_PREFIX)
         }
-    elif is_gsv_checkpoint(parameters):
-        config = read_gsv_config(parameters)
-        own_tensors = {rename_gsv_tensor(name): tensor for name, tensor in tensors.items()}
     else:
-        raise _checkpoint_unfit_error(path, 'it has no hyper_parameters["model"]')
+        try:
+            config, own_tensors = read_published_checkpoint(parameters, tensors)
+        except ValueError as error:
+            raise _checkpoint_unfit_error(path, str(error)) from error
     with torch.device("meta"):
         model = build_vpr_model(config)
     _load_tensors_into(model, own_tensors, path)
@@ -103,6 +102,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
     about = {name: value for name, value in parameters.items() if name not in model_fields}
     about |= {name: stored[name] for name in ("epoch", "global_step") if name in stored}
     return Checkpoint(model, model.config, model_fingerprint(model), about)
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Whether a file has the tensors of a VPR model, and not those of a backbone alone."""
+    try:
+        stored = load_tensors(path)
+    except TENSOR_READ_ERRORS:
+        return False
+    return isinstance(stored, Mapping) and (
+        not {"state_dict", "model_state_dict"}.isdisjoint(stored)
+        or any(str(name).startswith("backbone.") for name in stored)
+    )
 
 
 def checkpoint_state(model: VprModel, **about: Any) -> dict[str, Any]:
@@ -176,7 +187,10 @@ def _load_tensors_into(model: VprModel, tensors: dict[str, Any], path: Path) -> 
 def _checkpoint_unfit_error(path: Path, reason: str) -> Unprocessable:
     return Unprocessable(
         "checkpoint_unfit",
-        f"{path.name} is not a checkpoint of a VPR model: {reason}. Use one of `placewise train`.",
+        f"{path.name} is not a checkpoint of a known VPR model: {reason}. Use one of `placewise "
+        "train`, or of a network in docs/place-models.md. Other networks work without a checkpoint "
+        "if their authors publish a hubconf.py, as the extractor torchhub:OWNER/NAME@COMMIT:ENTRY:"
+        "input.size=HEIGHTxWIDTH (docs/how-to/weights-and-other-engines.md).",
     )
 
 

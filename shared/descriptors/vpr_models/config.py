@@ -15,6 +15,7 @@ STAGES = {
     "resnet34": 4,
     "resnet50": 4,
     "resnet101": 4,
+    "resnet152": 4,
     "resnext50_32x4d": 4,
     "efficientnet_b0": 8,
     "efficientnet_lite0": 8,

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from services.cli.evaluation.describers import ExtractorDescriber
 from services.cli.main import build_app
 from services.trainer.model_describer import ModelDescriber
+from shared.datasets.ground_truth_files import write_integer_lists
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state
@@ -127,6 +128,20 @@ def test_extractor_is_evaluated_and_everything_is_written(
     assert (
         json.loads((out / "metrics.json").read_text())["sets"]["town"]["recall"] == answer["recall"]
     )
+
+
+def test_a_ground_truth_file_replaces_that_of_a_set(
+    city: Path, town: EvaluationSet, checkpoint: Path, tmp_path: Path
+) -> None:
+    """Every database photo is correct for the first query, and none for the others."""
+    everything = [np.arange(len(town.database))] + [np.empty(0, np.int64)] * 5
+    write_integer_lists(tmp_path / "gt.npy", everything)
+    given = ["--data", city, "--checkpoint", checkpoint, "--ground-truth", tmp_path / "gt.npy"]
+    answer = run_json("evaluate", *given, "--recall-at", "1,3")
+    assert answer["recall"] == {"1": 1 / 6, "3": 1 / 6}
+    assert answer["rule"] == "given by gt.npy"
+    refused = run_json("evaluate", *given, "--rule", "radius 5", code=1)
+    assert "--rule can't be used with --ground-truth" in refused["detail"]
 
 
 class _Page(HTMLParser):

@@ -47,6 +47,15 @@ def test_recall_is_counted_over_all_queries_up_to_the_columns_that_are_there(
     assert answer["precision_recall"] is None, "a predictions file has no scores"
 
 
+def test_recall_is_reported_at_the_requested_numbers_of_photos(files: tuple[Path, Path]) -> None:
+    given = ("--predictions", files[0], "--ground-truth", files[1])
+    answer = run(*given, "--recall-at", "3,1,2", "--depth", 5)
+    assert answer["recall"] == {"1": 2 / 5, "2": 2 / 5, "3": 3 / 5}
+    for bad in ("1,6", "0,1", "1,1", "one", ""):
+        problem = run(*given, "--recall-at", bad, "--depth", 5, code=1)
+        assert problem["code"] == "bad_recall_at"
+
+
 def test_ground_truth_may_be_a_table_of_integers(tmp_path: Path, files: tuple[Path, Path]) -> None:
     table = np.array([[4, 2], [1, -1], [-1, -1], [3, -1], [0, 5]])
     np.save(tmp_path / "table.npy", table)

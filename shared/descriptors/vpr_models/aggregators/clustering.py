@@ -21,7 +21,9 @@ section 3):
             1, the dustbin takes the rest
     V_k   = sum over i of P_ik f_i              f: the features, by an MLP to `cluster_dim` numbers
     g     = the global token, by an MLP to `token_dim` numbers
-    row   = [g / |g|, V_0 / |V_0|, V_1 / |V_1|, ...] / | . |
+    row   = [g / |g|, V_0 / |V_0|, V_1 / |V_1|, ...] / | . |    cluster-major, K x cluster_dim
+
+The authors' code orders the same numbers as cluster_dim x K (`published_order`).
 
 The paper's backbone is DINOv2, whose class token is the global token. For a network without one, it
 is the mean of the map over its positions. The map needs more positions than there are clusters;
@@ -31,6 +33,7 @@ otherwise nothing is left for the dustbin.
 from __future__ import annotations
 
 import math
+import operator
 from typing import Annotated, ClassVar
 
 import torch
@@ -72,6 +75,8 @@ SINKHORN_ITERATIONS = 3
 DUSTBIN_SCORE = 1.0  # initial value
 
 Share = Annotated[float, Field(ge=0, lt=1)]
+# Left out of the stored configuration if false, so that fingerprints of older models remain.
+StoredIfTrue = Annotated[bool, Field(exclude_if=operator.not_)]
 
 
 class SALAD(Aggregator):
@@ -87,8 +92,10 @@ class SALAD(Aggregator):
         cluster_dim: Size = 128,
         token_dim: Size = 256,
         dropout: Share = 0.3,
+        published_order: StoredIfTrue = False,
     ) -> None:
         super().__init__(token_dim + num_clusters * cluster_dim)
+        self.published_order = published_order
         self.num_clusters = num_clusters
         self.features = _pointwise_mlp(in_channels, cluster_dim, dropout)
         self.scores = _pointwise_mlp(in_channels, num_clusters, dropout)
@@ -102,6 +109,8 @@ class SALAD(Aggregator):
         scores = self.scores(maps).flatten(2).float()  # (B, K, hw)
         plan = optimal_transport(scores, self.dustbin)
         clusters = normalize(plan @ features.transpose(1, 2), dim=-1)  # (B, K, cluster_dim)
+        if self.published_order:
+            clusters = clusters.transpose(1, 2)
         if token is None:
             token = maps.mean(dim=(-2, -1))
         global_token = normalize(self.token(token).float(), dim=-1)

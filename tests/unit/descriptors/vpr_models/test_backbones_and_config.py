@@ -49,6 +49,7 @@ def noise(height: int = 64, width: int = 96, count: int = 2) -> torch.Tensor:
         ("resnet34", (512, 32), 3, (128, 8)),
         ("resnet50", (2048, 32), 4, (1024, 16)),
         ("resnet101", (2048, 32), 4, (1024, 16)),
+        ("resnet152", (2048, 32), 4, (1024, 16)),
         ("resnext50_32x4d", (2048, 32), 3, (512, 8)),
         ("efficientnet_b0", (1280, 32), 6, (112, 16)),
         ("efficientnet_lite0", (1280, 32), 8, (320, 32)),
