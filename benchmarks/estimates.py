@@ -1,21 +1,26 @@
 """Place estimates: how many queries are answered, how many answers are right, how well calibrated.
 
-    placewise bench estimates FOLDER... [--splits 5]
+    placewise bench estimates [FOLDER...] [--splits 5]
 
-Each folder is an evaluation set with coordinates or place labels; labels with a slash are paths. It
-is described by the default extractor, with a vocabulary fitted on its database photos. The place
-model is fitted on the database photos only, as that of a live map is, and judged
+Each folder is an evaluation set with coordinates or place labels; labels with a slash are paths.
+Without one, it is the folder `tower` of PLACEWISE_TEST_DATA. It is described by the default
+extractor, with a vocabulary fitted on its database photos. The place model is fitted on the
+database photos only, as that of a live map is, and judged
 
 - on the set's queries;
 - on random splits: of all photos, as many as the set has queries become queries, so that a query
   has the same neighbours as a photo of the map;
+- on a random half of the set's queries, with the other half as labelled queries, as often;
 - on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
   four times: how many of the photos of these labels get an answer.
+
+Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -29,10 +34,12 @@ from services.cli.environment import read_settings
 from services.cli.output import Table
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import open_evaluation_set
+from shared.errors import Misconfigured
+from shared.evaluation.bootstrap import bootstrap_intervals, cluster_queries
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
 from shared.evaluation.place_fit import PlaceSample, fit_place_model
-from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.place_levels import LevelScheme, candidate_levels
 from shared.evaluation.place_probability import PlaceEstimate
 from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
 from shared.place_paths import label_levels
@@ -56,6 +63,8 @@ class DescribedPhotos:
     captured_at: Sequence[datetime | None]
     is_query: Mask
     """(n,) which photos are queries in the published split"""
+    clusters: NDArray[np.int64]
+    """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
 
@@ -66,16 +75,33 @@ class Judged:
 
     estimate: PlaceEstimate
     is_right: Sequence[bool | None]
+    cluster: int
+    """of the bootstrap"""
+
+    @property
+    def is_finest(self) -> bool:
+        return self.estimate.answer == 0
 
     @property
     def is_answer_right(self) -> bool | None:
         return None if self.estimate.answer is None else self.is_right[self.estimate.answer]
 
 
-def measure(progress: Progress, *, folders: Sequence[Path], splits: int) -> Report:
-    """Measure the estimates of evaluation sets."""
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A share of estimates, with its target in %."""
+
+    name: str
+    judged: Sequence[Judged]
+    counts: Callable[[Judged], bool]
+    at_least: float | None = None
+    at_most: float | None = None
+
+
+def measure(progress: Progress, *, folders: Sequence[Path] | None, splits: int) -> Report:
+    """Measure the estimates of evaluation sets, by default of the tower in PLACEWISE_TEST_DATA."""
     report = Report(f"estimates at certainty {CERTAINTY}")
-    for folder in folders:
+    for folder in folders or [_tower()]:
         photos = describe_set(folder, progress)
         bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
         published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
@@ -83,15 +109,22 @@ def measure(progress: Progress, *, folders: Sequence[Path], splits: int) -> Repo
         add_reliability(report, f"{photos.name}, its queries", published)
         progress.advance(bar)
         drawn: list[Judged] = []
+        refined: list[Judged] = []
         for seed in range(splits):
-            chosen = np.zeros(len(photos.rows), dtype=bool)
-            rng = np.random.default_rng(seed)
-            chosen[rng.choice(len(chosen), photos.is_query.sum(), replace=False)] = True
+            everything = np.ones(len(photos.rows), dtype=bool)
+            chosen = draw(everything, int(photos.is_query.sum()), seed)
             drawn += fit_and_judge(photos, ~chosen, chosen)
+            labelled = draw(photos.is_query, int(photos.is_query.sum()) // 2, seed)
+            unlabelled = photos.is_query & ~labelled
+            refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
             progress.advance(bar)
-        if drawn:
-            add_answers(report, f"{photos.name}, {splits} random splits", drawn)
-            add_reliability(report, f"{photos.name}, {splits} random splits", drawn)
+        for what, judged in (
+            (f"{photos.name}, {splits} random splits", drawn),
+            (f"{photos.name}, half of its queries labelled", refined),
+        ):
+            if judged:
+                add_answers(report, what, judged)
+                add_reliability(report, what, judged)
         left_out = []
         for missing in left_out_labels(photos):
             in_map = ~photos.is_query & ~missing
@@ -131,6 +164,7 @@ def described_photos(
         [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
         [photo.captured_at for photo in photos],
         np.arange(len(photos)) >= database,
+        cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
     )
@@ -173,18 +207,45 @@ class TrialMap:
         ]
         return ranking, self.own_photos.neighbours(int(found[0]))
 
+    def query_sample(self, query: int, spread: float) -> PlaceSample:
+        """Return the sample of a photo of the set."""
+        truth = self._photos.locations[query]
+        levels = candidate_levels(
+            *self.search(query), self._photos.scheme, spread, self._photos.radius_m
+        )
+        return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
 
-def fit_and_judge(photos: DescribedPhotos, in_map: Mask, queries: Mask) -> list[Judged]:
-    """Fit the model of a map of some of the photos, and estimate the places of others."""
+
+def draw(among: Mask, count: int, seed: int) -> Mask:
+    """Return the (n,) mask of `count` photos, drawn at random among some."""
+    drawn = np.zeros(len(among), dtype=bool)
+    drawn[np.random.default_rng(seed).choice(np.flatnonzero(among), count, replace=False)] = True
+    return drawn
+
+
+def fit_and_judge(
+    photos: DescribedPhotos, in_map: Mask, queries: Mask, labelled: Mask | None = None
+) -> list[Judged]:
+    """Fit the model of a map of some of the photos, and estimate the places of others.
+
+    Args:
+        photos: The set.
+        in_map: (n,) which of its photos are in the map.
+        queries: (n,) which are estimated.
+        labelled: (n,) which are labelled queries; none by default.
+    """
     trial = TrialMap(photos, in_map)
     samples, spread = trial.own_samples()
-    model = fit_place_model(samples, [], photos.scheme, spread).model
+    known = np.flatnonzero(labelled).tolist() if labelled is not None else []
+    labels = [sample for q in known if (sample := trial.query_sample(q, spread)).levels]
+    model = fit_place_model(samples, labels, photos.scheme, spread).model
     judged = []
     for query in np.flatnonzero(queries).tolist():
         estimate = model.estimate(*trial.search(query), photos.scheme, CERTAINTY, photos.radius_m)
         if estimate is not None:
             truth = photos.locations[query]
-            judged.append(Judged(estimate, [level.is_right(truth) for level in estimate.levels]))
+            right = [level.is_right(truth) for level in estimate.levels]
+            judged.append(Judged(estimate, right, int(photos.clusters[query])))
     return judged
 
 
@@ -199,14 +260,17 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
 
 def add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
     """Report the shares of answers, and of right ones among them, in %."""
-    answered = [j for j in judged if j.estimate.answer is not None]
-    finest = [j for j in answered if j.estimate.answer == 0]
-    report.add(f"{what}: answered", 100 * len(answered) / len(judged), "%", at_least=60)
-    report.add(f"{what}: right", _right_percent(answered), "%", at_least=100 * CERTAINTY)
-    report.add(
-        f"{what}: answered at the finest level", 100 * len(finest) / len(judged), "%", at_least=40
+    known = [j for j in judged if j.is_answer_right is not None]
+    finest = [j for j in known if j.is_finest]
+    precision = 100 * CERTAINTY
+    _add_shares(
+        report,
+        what,
+        Share("answered", judged, lambda j: j.estimate.answer is not None, at_least=60),
+        Share("right", known, lambda j: j.is_answer_right is True, at_least=precision),
+        Share("answered at the finest level", judged, lambda j: j.is_finest, at_least=40),
+        Share("right there", finest, lambda j: j.is_answer_right is True, at_least=precision),
     )
-    report.add(f"{what}: right there", _right_percent(finest), "%", at_least=100 * CERTAINTY)
 
 
 def add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
@@ -228,15 +292,22 @@ def add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None
 
 def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
     """Report the shares of photos that get an answer although their label is not in the map."""
-    finest = [j.estimate.answer == 0 for j in judged]
-    wrong = [j.is_answer_right is False for j in judged]
-    report.add(
-        f"{what}: answered at the finest level",
-        100 * float(np.mean(finest)),
-        "%",
-        at_most=100 * (1 - CERTAINTY),
+    most = 100 * (1 - CERTAINTY)
+    _add_shares(
+        report,
+        what,
+        Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=most),
+        Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
     )
-    report.add(f"{what}: wrong at any level", 100 * float(np.mean(wrong)), "%")
+
+
+def _tower() -> Path:
+    if "PLACEWISE_TEST_DATA" not in os.environ:
+        raise Misconfigured(
+            "no_data_set",
+            "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA.",
+        )
+    return Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"
 
 
 def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanking:
@@ -245,6 +316,17 @@ def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanki
     return order, scores[order].astype(np.float64)
 
 
-def _right_percent(judged: Sequence[Judged]) -> float:
-    known = [right for j in judged if (right := j.is_answer_right) is not None]
-    return 100 * float(np.mean(known)) if known else 100.0
+def _add_shares(report: Report, what: str, *shares: Share) -> None:
+    """Report shares in %, 100 % of no estimates, and show them with their intervals."""
+    table = Table("share", "%", "95 % interval", title=what)
+    for share in shares:
+        values = np.array([100.0 * share.counts(j) for j in share.judged])[:, None]
+        mean = float(values.mean()) if len(values) else 100.0
+        report.add(
+            f"{what}: {share.name}", mean, "%", at_most=share.at_most, at_least=share.at_least
+        )
+        clusters = np.array([j.cluster for j in share.judged], dtype=np.int64)
+        intervals = bootstrap_intervals(values, clusters)
+        bounds = f"{intervals[0].low:.1f} to {intervals[0].high:.1f}" if intervals else ""
+        table.add_row(share.name, f"{mean:.1f}", bounds)
+    report.tables.append(table)

@@ -31,7 +31,7 @@ from shared.evaluation.place_fit import (
     not_in_map_table,
     sample_weights,
 )
-from shared.evaluation.place_levels import FEATURES, LevelScheme, candidate_levels
+from shared.evaluation.place_levels import FEATURES, LevelScheme
 from shared.evaluation.place_probability import OUT_OF_MAP_SHARE, PRIOR_FILE, PlacePrior
 from shared.geodesy import EARTH_RADIUS_M
 
@@ -55,10 +55,9 @@ def sample_map(photos: DescribedPhotos) -> list[PlaceSample]:
     samples, spread = trial.own_samples()
     for query in np.flatnonzero(photos.is_query).tolist():
         truth = photos.locations[query]
-        levels = candidate_levels(*trial.search(query), photos.scheme, spread, photos.radius_m)
         in_map = any(is_same_place(truth, spot, photos.radius_m) for spot in trial.locations)
-        right = [level.is_right(truth) for level in levels]
-        samples.append(PlaceSample(query, levels, right, None if in_map else "outside"))
+        sample = trial.query_sample(query, spread)
+        samples.append(sample if in_map else replace(sample, left_out="outside"))
     return samples
 
 

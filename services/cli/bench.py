@@ -172,9 +172,13 @@ def train(
 @app.command("estimates")
 def estimates(
     folders: Annotated[
-        list[Path],
-        typer.Argument(help="Evaluation sets with coordinates or places.", exists=True),
-    ],
+        list[Path] | None,
+        typer.Argument(
+            help="Evaluation sets with coordinates or places. Default: tower in "
+            "PLACEWISE_TEST_DATA.",
+            exists=True,
+        ),
+    ] = None,
     splits: Annotated[int, typer.Option(min=0, help="Random splits of each set.")] = 5,
     as_json: JsonOption = False,
 ) -> None:

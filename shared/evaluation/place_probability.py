@@ -7,6 +7,7 @@ them to a map; without a fit, the coefficients are those of generated maps
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -31,8 +32,10 @@ from shared.evaluation.place_thresholds import CERTAINTIES, Thresholds
 
 CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
 
+log = logging.getLogger(__name__)
+
 OUT_OF_MAP_SHARE = 0.02
-MODEL_VERSION = 2
+MODEL_VERSION = 3
 PRIOR_FILE = Path(__file__).with_name("place_prior.json")
 
 Coefficients = tuple[float, ...]
@@ -103,10 +106,11 @@ class PlaceModel(BaseModel):
     @classmethod
     def _drop_other_version(cls, stored: Any) -> Any:
         """Read a model with the features of another release as the prior."""
-        is_other = (
-            isinstance(stored, dict) and stored.get("version", MODEL_VERSION) != MODEL_VERSION
-        )
-        return {} if is_other else stored
+        version = stored.get("version", MODEL_VERSION) if isinstance(stored, dict) else None
+        if version in (None, MODEL_VERSION):
+            return stored
+        _log_dropped_version(version)
+        return {}
 
     def for_scheme(self, scheme: LevelScheme) -> PlaceModel:
         """Return this model, or the prior if the map's levels changed since it was fitted."""
@@ -186,6 +190,17 @@ class PlaceModel(BaseModel):
                 shown, levels[0], probabilities[0], not_in_map, vote_weights(shown, unit)
             ),
         )
+
+
+@cache
+def _log_dropped_version(version: object) -> None:
+    """Log once per process that models of another version are not used."""
+    log.warning(
+        "stored place models of version %s are not used (this release: %d); the shipped prior "
+        "applies to their maps until the next evaluation",
+        version,
+        MODEL_VERSION,
+    )
 
 
 def error_radius_m(

@@ -5,15 +5,19 @@ certainty c is the lowest for which the share c of the held-out answers, at whic
 right, with one more wrong answer counted, as in conformal selection (Jin and Candes 2023). Among
 the answers above a threshold are surer ones, so that it is below c.
 
-An answer at the finest level also needs odds against "not in the map" that at most the share 1 - c
-of the impostors reaches (split conformal prediction, Vovk et al. 2005). Too few samples for a
-threshold leave c itself.
+An answer at any level but the coarsest also needs odds against "not in the map" that at most the
+share 1 - c of the impostors of each kind reaches, of those for which the level is wrong (Mondrian
+conformal prediction, Vovk et al. 2005). This holds with LIMIT_CONFIDENCE over the choice of the
+impostors, not on average (Vovk 2012). Too few samples for a threshold leave c itself.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import sqrt
+from statistics import NormalDist
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -24,6 +28,7 @@ CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses those of the next higher one."""
 MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
+LIMIT_CONFIDENCE = 0.95  # that no more impostors exceed a limit than are allowed
 MIN_PROBABILITY = 1e-9  # of "not in the map"; bounds the odds
 
 
@@ -34,8 +39,9 @@ class Thresholds(BaseModel):
 
     probability: float | None = None
     """minimum of the answered level; None: the certainty itself"""
-    finest_odds: float | None = None
-    """minimum ratio of the finest level's probability to that of "not in the map"; None: any"""
+    odds: tuple[float, ...] = ()
+    """minimum ratio of a level's probability to that of "not in the map", by position, finest
+    first; further levels have none"""
 
     def answer(
         self, probabilities: Sequence[float], not_in_map: float, certainty: float
@@ -43,12 +49,8 @@ class Thresholds(BaseModel):
         """Return the index of the finest level that is certain enough; None if none is."""
         least = certainty if self.probability is None else self.probability
         for position, probability in enumerate(probabilities):
-            excluded = (
-                position == 0
-                and self.finest_odds is not None
-                and finest_odds(probability, not_in_map) < self.finest_odds
-            )
-            if probability >= least and not excluded:
+            least_odds = self.odds[position] if position < len(self.odds) else 0.0
+            if probability >= least and odds_in_map(probability, not_in_map) >= least_odds:
                 return position
         return None
 
@@ -78,16 +80,30 @@ def choose_thresholds(
     """
     probability = _lowest_probability(judged, certainty)
     least = certainty if probability is None else probability
-    odds = [
-        finest_odds(s.probabilities[0], s.not_in_map) if s.probabilities[0] >= least else 0.0
-        for s in impostors
-    ]
-    return Thresholds(probability=probability, finest_odds=_exceeded_by(odds, 1 - certainty))
+    depth = max((len(s.probabilities) for s in impostors), default=0)
+    odds = tuple(
+        _least_odds(impostors, position, least, 1 - certainty)
+        for position in range(max(min(depth, 1), depth - 1))
+    )
+    return Thresholds(probability=probability, odds=odds)
 
 
-def finest_odds(probability: float, not_in_map: float) -> float:
-    """Return the ratio of the finest level's probability to that of "not in the map"."""
+def odds_in_map(probability: float, not_in_map: float) -> float:
+    """Return the ratio of a level's probability to that of "not in the map"."""
     return probability / max(not_in_map, MIN_PROBABILITY)
+
+
+def _least_odds(
+    impostors: Sequence[HeldOutEstimate], position: int, least: float, share: float
+) -> float:
+    """Return the odds that at most a share of the impostors of each kind reaches at a level."""
+    kinds: dict[str | None, list[float]] = defaultdict(list)
+    for impostor in impostors:
+        if position < len(impostor.is_right) and impostor.is_right[position] is False:
+            probability = impostor.probabilities[position]
+            odds = odds_in_map(probability, impostor.not_in_map)
+            kinds[impostor.left_out].append(odds if probability >= least else 0.0)
+    return max((_exceeded_by(odds, share) for odds in kinds.values()), default=0.0)
 
 
 def _lowest_probability(estimates: Sequence[HeldOutEstimate], certainty: float) -> float | None:
@@ -123,7 +139,13 @@ def _candidates(probabilities: FloatArray) -> FloatArray:
     return distinct[:: max(1, -(-len(distinct) // CANDIDATES))]
 
 
-def _exceeded_by(values: Sequence[float], share: float) -> float | None:
-    """Return a limit that at most the share of new values reaches; None with too few values."""
-    rank = int(share * (len(values) + 1) + 1e-9)
-    return None if rank == 0 else float(np.nextafter(sorted(values)[-rank], np.inf))
+def _exceeded_by(values: Sequence[float], share: float) -> float:
+    """Return a limit that at most the share of new values reaches, with LIMIT_CONFIDENCE.
+
+    The number of values above the quantile of the share is binomial; its lower bound is that of
+    the normal approximation. Too few values give a limit above all of them.
+    """
+    count = len(values)
+    margin = NormalDist().inv_cdf(LIMIT_CONFIDENCE) * sqrt(count * share * (1 - share))
+    rank = max(1, int(count * share - margin))
+    return float(np.nextafter(sorted(values)[-rank], np.inf))

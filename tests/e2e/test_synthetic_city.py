@@ -92,6 +92,7 @@ def test_city_json_says_every_argument_and_the_kind_of_each_query(out: Path) -> 
         "width": 96,
         "height": 72,
         "train": True,
+        "ride_frames": 0,
     }
     assert set(about["queries"]) == {path.name for path in (out / "queries").iterdir()}
     kinds = [query["kind"] for query in about["queries"].values()]

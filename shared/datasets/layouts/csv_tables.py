@@ -1,8 +1,8 @@
 """CSV layout for your own photos: `database.csv` and `queries.csv`, and `train.csv` for training.
 
-Columns: `path`, relative to the tables' folder; `latitude`, `longitude` or `easting`, `northing`,
-`zone`; `heading`, `place`, `frame`, `sequence`. All but `path` are optional; `train.csv` needs a
-`place` in each row, and may have a `city`.
+Columns: `path`, relative to the tables' folder, or else to `database/` and `queries/` there;
+`latitude`, `longitude` or `easting`, `northing`, `zone`; `heading`, `place`, `frame`, `sequence`.
+All but `path` are optional; `train.csv` needs a `place` in each row, and may have a `city`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from shared.datasets.dataset import TrainingSet
+from shared.datasets.dataset import DatasetPhoto, TrainingSet
 from shared.datasets.layouts.base import (
     DEFAULT_RULE,
     PLACEWISE_PROTOCOL,
@@ -33,15 +33,19 @@ class CsvTables:
         return {prefix: "."} if exists else {}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
-        database, queries = (
-            read_photo_list(base / "database.csv"),
-            read_photo_list(base / "queries.csv"),
-        )
+        database, queries = _read_photos(base, "database"), _read_photos(base, "queries")
         has_positions = any(photo.easting is not None for photo in database + queries)
         has_labels = any(photo.place for photo in database + queries)
         return ListedSet(
             database, queries, "place-label" if has_labels and not has_positions else DEFAULT_RULE
         )
+
+
+def _read_photos(base: Path, role: str) -> tuple[DatasetPhoto, ...]:
+    table = base / f"{role}.csv"
+    beside = read_photo_list(table)
+    is_inside = not beside[0].path.exists() and (base / role).is_dir()
+    return read_photo_list(table, base / role) if is_inside else beside
 
 
 class CsvTrainingTable:

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from benchmarks import estimates
 from benchmarks.estimates import (
     DescribedPhotos,
     add_answers,
     add_left_out,
     add_reliability,
+    draw,
     fit_and_judge,
     left_out_labels,
 )
 from benchmarks.report import Report
+from shared.errors import Misconfigured
 from shared.evaluation.place_evidence import PhotoLocation
+from shared.evaluation.place_fit import MIN_LABELLED_QUERIES
 from shared.evaluation.place_levels import LevelScheme
 
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
@@ -31,6 +39,7 @@ def described() -> DescribedPhotos:
         [PhotoLocation(None, None, place) for place in places],
         [None] * len(places),
         np.arange(len(places)) % PER_PLACE == 0,
+        np.arange(len(places)) // PER_PLACE,
         LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
         25.0,
     )
@@ -47,6 +56,39 @@ def test_queries_of_clear_places_are_answered_rightly() -> None:
     assert measured["house: answered"] > 80
     assert measured["house: right"] == 100
     assert measured["house: ECE of level 0"] < 0.2
+
+
+def test_labelled_queries_calibrate_the_estimates_of_the_others() -> None:
+    photos = described()
+    labelled = draw(np.arange(len(photos.rows)) % PER_PLACE > 3, MIN_LABELLED_QUERIES, seed=0)
+    assert labelled.sum() == MIN_LABELLED_QUERIES
+    in_map = ~photos.is_query & ~labelled
+    judged = fit_and_judge(photos, in_map, photos.is_query, labelled)
+    assert [j.cluster for j in judged] == list(range(PLACES))
+    without = fit_and_judge(photos, in_map, photos.is_query)
+    assert judged[0].estimate.probabilities != without[0].estimate.probabilities
+
+
+def test_without_a_folder_the_tower_of_the_test_data_is_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    described_folders = []
+
+    def describe(folder: Path, _: Progress) -> DescribedPhotos:
+        described_folders.append(folder)
+        return described()
+
+    monkeypatch.setattr(estimates, "describe_set", describe)
+    monkeypatch.setenv("PLACEWISE_TEST_DATA", str(tmp_path))
+    report = estimates.measure(Progress(), folders=None, splits=1)
+    assert described_folders == [tmp_path / "tower"]
+    titles = [table.title for table in report.tables]
+    assert "house, half of its queries labelled" in titles
+    shares = report.tables[0].columns
+    assert [column.header for column in shares] == ["share", "%", "95 % interval"]
+    monkeypatch.delenv("PLACEWISE_TEST_DATA")
+    with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
+        estimates.measure(Progress(), folders=None, splits=1)
 
 
 def test_each_floor_is_left_out_once_and_its_photos_get_few_fine_answers() -> None:

@@ -206,6 +206,16 @@ def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path)
         open_evaluation_set(tmp_path, rule="frames 2")
 
 
+def test_photos_of_csv_tables_may_be_in_folders_of_the_same_names(tmp_path: Path) -> None:
+    for role, name in (("database", "a.jpg"), ("queries", "q.jpg")):
+        (tmp_path / role).mkdir()
+        write_photo(tmp_path / role / name)
+        write_csv(tmp_path / f"{role}.csv", ("filename", "place"), [(name, "x")])
+    opened = open_evaluation_set(tmp_path)
+    assert opened.database[0].path == tmp_path / "database" / "a.jpg"
+    assert opened.queries[0].path == tmp_path / "queries" / "q.jpg"
+
+
 @pytest.mark.parametrize(
     ("header", "row", "code"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -59,7 +60,13 @@ def test_photo_of_one_colour_has_a_direction(grey: int) -> None:
 
 def test_it_sleeps_for_every_photo(monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
-    monkeypatch.setattr(time, "sleep", slept.append)
+    sleep, this_thread = time.sleep, threading.get_ident()
+
+    def record(seconds: float) -> None:
+        # Threads of other tests may still be ending.
+        slept.append(seconds) if threading.get_ident() == this_thread else sleep(seconds)
+
+    monkeypatch.setattr(time, "sleep", record)
     made = extractor("milliseconds=250")
     made.describe(pixels_of(made, range(4)), None)
     assert slept == [1.0]
