@@ -6,6 +6,7 @@ Also the table of the schema's compatibility with older releases, written by mig
 from __future__ import annotations
 
 from sqlalchemy import String
+from sqlalchemy.exc import ArgumentError
 from sqlalchemy.orm import Mapped, mapped_column
 
 # A foreign key may refer to a table whose module a service does not import itself.
@@ -28,6 +29,7 @@ from shared.catalog import (  # noqa: F401
 from shared.catalog.database.base import Base
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 
 
 class SchemaCompatibility(Base):
@@ -47,9 +49,19 @@ def open_catalog(
         settings: The settings.
         service: Name of the service, for `pg_stat_activity`.
         limits: Timeouts; by default those of background work.
+
+    Raises:
+        Misconfigured: `bad_setting`, if DATABASE_URL is malformed.
     """
-    return Catalog(
-        settings.catalog_url(),
-        PoolConfig.from_settings(settings, service),
-        TransactionTimeouts.for_background(settings) if limits is None else limits,
-    )
+    try:
+        return Catalog(
+            settings.catalog_url(),
+            PoolConfig.from_settings(settings, service),
+            TransactionTimeouts.for_background(settings) if limits is None else limits,
+        )
+    except (ArgumentError, ValueError):  # its text may contain a part of the password
+        raise Misconfigured(
+            "bad_setting",
+            "DATABASE_URL is malformed; expected postgresql://USER:PASSWORD@HOST:PORT/DATABASE, "
+            "with a number as the port and special characters of the password as %XX.",
+        ) from None

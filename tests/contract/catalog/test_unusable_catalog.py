@@ -22,6 +22,7 @@ from shared.catalog.database.errors import to_unavailable
 from shared.catalog.database.schema import check_pages, migrate
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
+from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, StorageFull
 from shared.jobs import InProcessWakeups
@@ -200,3 +201,15 @@ def test_a_full_disk_at_the_start_is_reported_with_the_free_bytes(
     assert caught.value.code == "disk_full"
     with catalog.engine.connect() as connection, pytest.raises(OperationalError):
         connection.execute(text("SELECT 1"))
+
+
+@pytest.mark.parametrize("rest", ["me:s3cret@db:port/x", "me:s3cret@[::db/x", "me:s3cret/x:y@z:/"])
+def test_a_malformed_url_is_a_bad_setting_without_its_password(
+    monkeypatch: pytest.MonkeyPatch, rest: str
+) -> None:
+    monkeypatch.setenv("DATABASE_URL", f"postgresql://{rest}")
+    with pytest.raises(Misconfigured, match="DATABASE_URL is malformed") as caught:
+        open_catalog(Settings(), "test")
+    assert caught.value.code == "bad_setting"
+    assert "s3cret" not in caught.value.detail
+    assert caught.value.__suppress_context__
