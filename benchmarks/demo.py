@@ -26,7 +26,7 @@ from placewise.answers import Estimate
 from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
-from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
+from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 from shared.synthetic_city.plan import CityOptions
 from shared.synthetic_city.write import NOT_COMPARABLE
 

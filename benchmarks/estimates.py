@@ -37,11 +37,11 @@ from shared.datasets.open_dataset import open_evaluation_set
 from shared.errors import Misconfigured
 from shared.evaluation.bootstrap import bootstrap_intervals, cluster_queries
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.place_fit import PlaceSample, fit_place_model
-from shared.evaluation.place_levels import LevelScheme, candidate_levels
-from shared.evaluation.place_probability import PlaceEstimate
-from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import PlaceSample, fit_place_model
+from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.probability import PlaceEstimate
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.place_paths import label_levels
 
 if TYPE_CHECKING:

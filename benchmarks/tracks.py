@@ -17,7 +17,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.places.levels import LevelScheme
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import frame_evidence
 from shared.tracks.filter import TrackFilter

@@ -1,11 +1,11 @@
-"""Fits the prior of place models on generated cities and writes it to `place_prior.json`.
+"""Fits the prior of place models on generated cities and writes it to `prior.json`.
 
     placewise datasets synth CITY --no-ladder --no-train --seed 1 ...   (several cities)
     python -m tools.make_place_prior CITY [CITY ...]
 
 Only coefficients are stored. Each city is described by the default extractor, with a vocabulary
 fitted on it, and sampled once with its coordinates, and once with label paths, which are squares of
-400 m and 100 m and the place. The samples are those of a live map (`place_samples`), and the city's
+400 m and 100 m and the place. The samples are those of a live map (`places.samples`), and the city's
 queries, which were taken in other weather and at night: the map's own photos do not show how weak
 the evidence of a right answer can be.
 """
@@ -23,16 +23,16 @@ from rich.progress import Progress
 
 from benchmarks.estimates import DescribedPhotos, TrialMap, describe_set
 from services.cli.output import console
-from shared.evaluation.place_evidence import PhotoLocation, is_same_place
-from shared.evaluation.place_fit import (
+from shared.evaluation.places.evidence import PhotoLocation, is_same_place
+from shared.evaluation.places.fit import (
     PlaceSample,
     RegressionTable,
     fit_map_estimate,
     not_in_map_table,
     sample_weights,
 )
-from shared.evaluation.place_levels import FEATURES, LevelScheme
-from shared.evaluation.place_probability import OUT_OF_MAP_SHARE, PRIOR_FILE, PlacePrior
+from shared.evaluation.places.levels import FEATURES, LevelScheme
+from shared.evaluation.places.probability import OUT_OF_MAP_SHARE, PRIOR_FILE, PlacePrior
 from shared.geodesy import EARTH_RADIUS_M
 
 SQUARES_M = (400.0, 100.0, 25.0)

@@ -22,7 +22,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole, is_geotagged
 from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
-from shared.evaluation.place_evidence import PhotoLocation
+from shared.evaluation.places.evidence import PhotoLocation
 from shared.geodesy import distances_m, latitude_bounds
 from shared.search_api.protocol import SearchBackend, SearchHit, SearchRequest
 

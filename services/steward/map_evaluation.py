@@ -42,7 +42,7 @@ from shared.evaluation.calibration import (
     fit_threshold,
     recall_at_precision,
 )
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     PhotoLocation,
     PlaceEvidence,
@@ -53,10 +53,10 @@ from shared.evaluation.place_evidence import (
     is_different_place,
     is_same_place,
 )
-from shared.evaluation.place_figures import PlaceEvaluation, evaluate_places
-from shared.evaluation.place_fit import PlaceSample
-from shared.evaluation.place_levels import LevelScheme, candidate_levels
-from shared.evaluation.place_samples import (
+from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
+from shared.evaluation.places.fit import PlaceSample
+from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.samples import (
     SAME_SESSION_PERIOD,
     IndexRanking,
     OwnPhotoSampler,

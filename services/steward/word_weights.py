@@ -23,7 +23,7 @@ from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.errors import NotFound
-from shared.evaluation.place_evidence import is_same_place
+from shared.evaluation.places.evidence import is_same_place
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, read_rows, rows_are_valid
 from shared.word_weights.record import HeldOut, Outcome, WordWeights

@@ -1,6 +1,6 @@
 """Evaluation of place recognition: location estimates, calibration, retrieval metrics, reports.
 
-Estimates of a query's place: `place_evidence` decides when two photos show the same place and how
+Estimates of a query's place: `places.evidence` decides when two photos show the same place and how
 strongly a ranking supports a place; `calibration` turns this evidence into an accept threshold and
 a confidence, and measures how good the confidence is.
 

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.place_evidence import PlaceEvidence
-from shared.evaluation.place_probability import PlaceModel
+from shared.evaluation.places.evidence import PlaceEvidence
+from shared.evaluation.places.probability import PlaceModel
 
 FALSE_ACCEPT_RATE = 0.05  # of impostors
 MIN_IMPOSTORS = 20  # with fewer, a rate of one in twenty cannot be estimated

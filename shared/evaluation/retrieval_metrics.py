@@ -30,7 +30,7 @@ from shared.evaluation.calibration import (
     recall_at_precision,
 )
 from shared.evaluation.exact_knn import Indices, Scores
-from shared.evaluation.place_evidence import PlaceEvidence
+from shared.evaluation.places.evidence import PlaceEvidence
 from shared.evaluation.ranking import DEFAULT_KS, Recalls, compute_recalls
 
 Hits = NDArray[np.bool_]

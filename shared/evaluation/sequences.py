@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from shared.datasets.dataset import DatasetPhoto, EvaluationSet
 from shared.datasets.ground_truth import parse_rule
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.place_fit import fit_place_model
-from shared.evaluation.place_levels import LevelScheme, photos_inside
-from shared.evaluation.place_probability import PlaceModel
-from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.levels import LevelScheme, photos_inside
+from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.seqslam import seqslam_matches
 from shared.tracks.belief import Belief, TrackStatus
 from shared.tracks.evidence import FrameEvidence, frame_evidence

@@ -10,7 +10,7 @@ is uniform for a = 1, when scores say nothing. A photo's u is estimated from how
 above the last one of the k hits: excesses over a high threshold follow an exponential distribution
 (Pickands 1975), so u = k / n * exp(-excess / mean excess). This works for any score and extractor,
 without a scale that is tuned. Where a place model gives the probability of the best place
-(`shared/evaluation/place_probability.py`), that replaces the power law's.
+(`shared/evaluation/places/probability.py`), that replaces the power law's.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 
 RANK_EXPONENT = 0.25
 """a: the photo of the right place comes first in 3,000 photos with 3000**-0.25 = 14 %"""

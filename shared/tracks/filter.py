@@ -32,8 +32,8 @@ from datetime import datetime
 
 import numpy as np
 
-from shared.evaluation.place_levels import LevelScheme
-from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix

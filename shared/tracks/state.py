@@ -8,8 +8,8 @@ from datetime import datetime
 
 import numpy as np
 
-from shared.evaluation.place_levels import CandidateLevel, LevelScheme
-from shared.evaluation.place_probability import error_radius_m
+from shared.evaluation.places.levels import CandidateLevel, LevelScheme
+from shared.evaluation.places.probability import error_radius_m
 from shared.geodesy import weighted_centroid
 from shared.place_paths import label_levels
 from shared.tracks.belief import Belief, TrackStatus

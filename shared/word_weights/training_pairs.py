@@ -18,7 +18,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
+from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 from shared.geodesy import EARTH_RADIUS_M, distances_m, latitude_bounds
 
 NEAREST_M, NEAR_M, FAR_M = 5.0, 25.0, 50.0

@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.evaluation.baselines import BASELINE_DESCRIPTORS
-from shared.evaluation.place_evidence import PhotoLocation
+from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
 from shared.synthetic_city.plan import CityPlan, positions_m
 from shared.word_weights.training_pairs import sample_pairs

@@ -35,10 +35,10 @@ from shared.config.settings import Settings
 from shared.datasets.ground_truth_files import read_ground_truth
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import Conflict, InvalidRequest, NotFound, Unavailable, Unprocessable
-from shared.evaluation.dataset_places import measure_places
 from shared.evaluation.exact_knn import Rankings, exact_knn
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH
-from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.places.data_set import measure_places
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH
+from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.ranking import (
     ProgressCallback,
     describe_evaluation_set,

@@ -8,13 +8,13 @@ from uuid import UUID
 from services.gateway.schemas import EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
 from shared.evaluation.calibration import Calibration
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     PhotoLocation,
     RankedPhoto,
     compute_evidence,
     estimate_location,
 )
-from shared.evaluation.place_probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.search_api.protocol import SearchHit
 
 

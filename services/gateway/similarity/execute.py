@@ -39,9 +39,9 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.calibration import Calibration
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH, RankedPhoto
-from shared.evaluation.place_levels import LevelScheme
-from shared.evaluation.place_probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
+from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse

@@ -12,7 +12,7 @@ from uuid import UUID
 
 from cachetools import LRUCache
 
-from shared.evaluation.place_evidence import RankedPhoto
+from shared.evaluation.places.evidence import RankedPhoto
 
 CACHED_RANKINGS = 1000  # of about 50 photos: 20 MB
 

@@ -35,9 +35,9 @@ from shared.catalog.tracks import (
     select_frames,
 )
 from shared.errors import Conflict, Gone, PlacewiseError
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH
-from shared.evaluation.place_levels import LevelScheme, photos_inside
-from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH
+from shared.evaluation.places.levels import LevelScheme, photos_inside
+from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import WakeupQueue

@@ -20,9 +20,9 @@ from benchmarks.estimates import (
 )
 from benchmarks.report import Report
 from shared.errors import Misconfigured
-from shared.evaluation.place_evidence import PhotoLocation
-from shared.evaluation.place_fit import MIN_LABELLED_QUERIES
-from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.places.evidence import PhotoLocation
+from shared.evaluation.places.fit import MIN_LABELLED_QUERIES
+from shared.evaluation.places.levels import LevelScheme
 
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
 

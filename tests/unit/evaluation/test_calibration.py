@@ -17,7 +17,7 @@ from shared.evaluation.calibration import (
     fit_threshold,
     recall_at_precision,
 )
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     DIFFERENT_PLACE_M,
     PhotoLocation,
     PlaceEvidence,

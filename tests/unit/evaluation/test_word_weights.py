@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
+from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 from shared.word_weights.training_pairs import (
     MAX_PAIRS,
     MIN_PAIRS,

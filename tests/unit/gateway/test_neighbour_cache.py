@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from services.gateway.similarity import neighbours
 from services.gateway.similarity.neighbours import NeighbourCache, Neighbours
-from shared.evaluation.place_evidence import PhotoLocation, RankedPhoto
+from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.ids import new_id
 
 FOUND: Neighbours = ((new_id(), RankedPhoto(0.9, PhotoLocation(45.0, 7.0, None))),)

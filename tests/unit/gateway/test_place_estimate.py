@@ -21,7 +21,7 @@ from shared.evaluation.calibration import (
     fit_confidence,
     fit_threshold,
 )
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     PhotoLocation,
     PlaceEvidence,
     RankedPhoto,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shared.evaluation.place_probability import OUT_OF_MAP_SHARE
+from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
 from shared.tracks.filter import CARRIED_AWAY, ENTERING, LEAVING, SPACING_M, TrackFilter

@@ -2,7 +2,7 @@
 
 The levels of a *label path* such as `tower/floor 7/elevator` are its prefixes. The levels of
 coordinates are circles of increasing radius around the estimated position. Each level has features
-that say how clearly the ranking points to it; a model (`place_probability`) turns them into a
+that say how clearly the ranking points to it; a model (`probability`) turns them into a
 probability.
 
 The features compare scores in units of the `spread` of a map's rankings, the median difference
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     VOTING_PHOTOS,
     PhotoLocation,
     RankedPhoto,

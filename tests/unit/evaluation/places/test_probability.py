@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from shared.evaluation.calibration import Calibration
-from shared.evaluation.place_evidence import PhotoLocation, RankedPhoto
-from shared.evaluation.place_figures import evaluate_places
-from shared.evaluation.place_fit import MIN_LABELLED_QUERIES, PlaceSample, fit_place_model
-from shared.evaluation.place_levels import (
+from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
+from shared.evaluation.places.figures import evaluate_places
+from shared.evaluation.places.fit import MIN_LABELLED_QUERIES, PlaceSample, fit_place_model
+from shared.evaluation.places.levels import (
     FEATURES,
     CandidateLevel,
     LevelScheme,
     candidate_levels,
     shared_neighbours,
 )
-from shared.evaluation.place_probability import PlaceModel, error_radius_m, shipped_prior
-from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.place_thresholds import (
+from shared.evaluation.places.probability import PlaceModel, error_radius_m, shipped_prior
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.thresholds import (
     CERTAINTIES,
     HeldOutEstimate,
     Thresholds,

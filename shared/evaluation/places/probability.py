@@ -1,8 +1,8 @@
 """Probabilities of a place estimate: of each level, and that the place is not in the map.
 
-Each is a logistic regression on the features of the ranking (`level_features`). `place_fit` fits
+Each is a logistic regression on the features of the ranking (`level_features`). `fit` fits
 them to a map; without a fit, the coefficients are those of generated maps
-(`tools/make_place_prior.py`). `place_thresholds` decides which level is the answer.
+(`tools/make_place_prior.py`). `thresholds` decides which level is the answer.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH, RankedPhoto
-from shared.evaluation.place_levels import (
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
+from shared.evaluation.places.levels import (
     CandidateLevel,
     FloatArray,
     LevelScheme,
@@ -28,7 +28,7 @@ from shared.evaluation.place_levels import (
     ranking_spread,
     vote_weights,
 )
-from shared.evaluation.place_thresholds import CERTAINTIES, Thresholds
+from shared.evaluation.places.thresholds import CERTAINTIES, Thresholds
 
 CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
 
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 OUT_OF_MAP_SHARE = 0.02
 MODEL_VERSION = 3
-PRIOR_FILE = Path(__file__).with_name("place_prior.json")
+PRIOR_FILE = Path(__file__).with_name("prior.json")
 
 Coefficients = tuple[float, ...]
 """Intercept, then one coefficient per standardised feature."""

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.evaluation.place_levels import FEATURES, CandidateLevel, FloatArray, LevelScheme
-from shared.evaluation.place_probability import (
+from shared.evaluation.places.levels import FEATURES, CandidateLevel, FloatArray, LevelScheme
+from shared.evaluation.places.probability import (
     OUT_OF_MAP_SHARE,
     Coefficients,
     PlaceModel,
@@ -27,7 +27,7 @@ from shared.evaluation.place_probability import (
     shipped_prior,
     sigmoid,
 )
-from shared.evaluation.place_thresholds import CERTAINTIES, HeldOutEstimate, choose_thresholds
+from shared.evaluation.places.thresholds import CERTAINTIES, HeldOutEstimate, choose_thresholds
 
 MIN_OWN_PHOTOS = 20
 MIN_LABELLED_QUERIES = 40

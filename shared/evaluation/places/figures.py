@@ -14,10 +14,10 @@ import numpy as np
 
 from shared.evaluation.bootstrap import bootstrap_intervals
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.place_fit import PlaceSample, fit_place_model
-from shared.evaluation.place_levels import LevelScheme
-from shared.evaluation.place_probability import PlaceModel
-from shared.evaluation.place_thresholds import HeldOutEstimate
+from shared.evaluation.places.fit import PlaceSample, fit_place_model
+from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.thresholds import HeldOutEstimate
 
 REPORTED_CERTAINTIES = (0.8, 0.9, 0.95, 0.99)
 RELIABILITY_BINS = 10

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from shared.datasets.dataset import DatasetPhoto, EvaluationSet
-from shared.evaluation.dataset_places import measure_places
 from shared.evaluation.exact_knn import Rows, exact_knn
-from shared.evaluation.place_levels import LevelScheme
+from shared.evaluation.places.data_set import measure_places
+from shared.evaluation.places.levels import LevelScheme
 
 FLOORS, ROOMS, VIEWS = 4, 6, 5
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -85,7 +85,7 @@ def test_the_model_is_fitted_on_a_sample_of_a_large_database(
     building: tuple[EvaluationSet, Rows, Rows], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evaluation_set, database, queries = building
-    monkeypatch.setattr("shared.evaluation.dataset_places.SAMPLED_PHOTOS", 30)
+    monkeypatch.setattr("shared.evaluation.places.data_set.SAMPLED_PHOTOS", 30)
     ranked = exact_knn(queries, database, 50)
     places = measure_places(evaluation_set, database, ranked, PATHS, 25.0)
     assert places is not None

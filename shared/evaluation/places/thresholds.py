@@ -22,7 +22,7 @@ from statistics import NormalDist
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.place_levels import FloatArray
+from shared.evaluation.places.levels import FloatArray
 
 CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses those of the next higher one."""

@@ -15,14 +15,14 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.evaluation.place_evidence import (
+from shared.evaluation.places.evidence import (
     DIFFERENT_PLACE_M,
     EVIDENCE_DEPTH,
     PhotoLocation,
     RankedPhoto,
 )
-from shared.evaluation.place_fit import PlaceSample
-from shared.evaluation.place_levels import (
+from shared.evaluation.places.fit import PlaceSample
+from shared.evaluation.places.levels import (
     CandidateLevel,
     LevelScheme,
     candidate_levels,

@@ -13,16 +13,16 @@ import numpy as np
 from shared.datasets.dataset import DatasetPhoto, EvaluationSet
 from shared.datasets.utm_coordinates import parse_utm_grid, utm_to_degrees
 from shared.evaluation.exact_knn import Rankings, Rows, exact_knn
-from shared.evaluation.place_evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.place_figures import (
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.figures import (
     REPORTED_CERTAINTIES,
     answer_figures,
     reliability_figures,
 )
-from shared.evaluation.place_fit import fit_place_model
-from shared.evaluation.place_levels import LevelScheme, candidate_levels
-from shared.evaluation.place_samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.place_thresholds import HeldOutEstimate
+from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.thresholds import HeldOutEstimate
 
 SAMPLED_PHOTOS = 1000
 """Database photos that the model is fitted on; as many as an evaluation of a live map draws"""

@@ -1,0 +1,1 @@
+"""The place of a query: evidence, levels, and a model of their probabilities."""
