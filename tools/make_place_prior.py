@@ -5,9 +5,9 @@
 
 Only coefficients are stored. Each city is described by the default extractor, with a vocabulary
 fitted on it, and sampled once with its coordinates, and once with label paths, which are squares of
-400 m and 100 m and the place. The samples are those of a live map (`places.samples`), and the city's
-queries, which were taken in other weather and at night: the map's own photos do not show how weak
-the evidence of a right answer can be.
+400 m and 100 m and the place. The samples are those of a live map (`places.samples`) and the
+city's queries, which were taken in other weather and at night: the map's own photos do not show how
+weak the evidence of a right answer can be.
 """
 
 from __future__ import annotations
