@@ -11,7 +11,7 @@ from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.admission import ADMIT_QUERY, AdmissionDep, UploadKind
+from services.gateway.admission import ADMIT_QUERY, AdmissionDep
 from services.gateway.authentication import READ
 from services.gateway.dependencies import (
     FileId,
@@ -41,17 +41,16 @@ from services.gateway.similarity.search_params import (
     SimilarityParams,
     check_place_filter,
 )
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import multipart_schema
+from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
-from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
-from shared.ingest.validation import StoredUpload, check_photo_signature
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.ingest.validation import StoredUpload
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import query_expired_error
-from shared.storage.keys import query_key
 
 router = APIRouter(tags=["similarity"])
 
@@ -135,18 +134,9 @@ async def search_by_uploaded_photo(
     search_params = query.search_params()
     await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
     await run_in_threadpool(_check_filter, gateway, query.map, search_params)
-    job_id = new_id()
-    key = query_key(job_id)
-    with admission.admit_upload(UploadKind.QUERY, request):
-        received = await store_form_file(
-            request, gateway.store, key, gateway.settings.max_file_size, check_photo_signature
-        )
-    await idempotent.claim_form(
-        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
-    )
-    params = {"filename": received.filename, "wanted": search_params.model_dump(mode="json")}
+    job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
     job = await run_in_threadpool(
-        _queue_query, gateway, query.map, job_id, received, params, idempotent
+        _queue_query, gateway, query.map, job_id, received, search_params, idempotent
     )
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
     if wait:
@@ -222,23 +212,17 @@ def _queue_query(
     map_name: str,
     job_id: UUID,
     received: StoredUpload,
-    params: dict[str, Any],
+    search_params: SearchParams,
     idempotent: IdempotentRequest,
 ) -> Job:
     with delete_if_refused(gateway.store, received.key):
-        check_photo_signature(received.first_bytes)
         for name in received.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
-            job = Job(
-                id=job_id,
-                map_id=get_map(session, map_name).id,
-                kind=JobKind.DESCRIBE,
-                priority=Priority.QUERY,
-                params=params,
-            )
+            map_id = get_map(session, map_name).id
+            job = describe_query_job(job_id, map_id, received.filename, search_params)
             idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job

@@ -12,7 +12,7 @@ from fastapi.responses import JSONResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.admission import ADMIT_QUERY, AdmissionDep, UploadKind
+from services.gateway.admission import ADMIT_QUERY, AdmissionDep
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import (
     FrameId,
@@ -40,7 +40,8 @@ from services.gateway.tracks.schemas import (
     TrackStateResponse,
     parse_frame_form,
 )
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import multipart_schema
+from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
 from shared.catalog.tracks import (
@@ -58,10 +59,8 @@ from shared.catalog.tracks import (
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
-from shared.ingest.validation import StoredUpload, check_photo_signature
-from shared.jobs import Job, JobKind, Priority
+from shared.ingest.validation import StoredUpload
 from shared.jobs.wakeups import WakeupQueue
-from shared.storage.keys import query_key
 
 router = APIRouter(tags=["tracks"])
 
@@ -241,18 +240,7 @@ async def add_track_frame(
     are computed again (409, `frame_too_late`, beyond).
     """
     await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
-    job_id = new_id()
-    with admission.admit_upload(UploadKind.QUERY, request):
-        received = await store_form_file(
-            request,
-            gateway.store,
-            query_key(job_id),
-            gateway.settings.max_file_size,
-            check_photo_signature,
-        )
-    await idempotent.claim_form(
-        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
-    )
+    job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
     frame = await run_in_threadpool(
         _accept_frame, gateway, query.map, track_id, job_id, received, idempotent
     )
@@ -300,7 +288,6 @@ def _accept_frame(
 ) -> TrackFrame:
     """Store the frame with its job, or return the frame that it repeats."""
     with delete_if_refused(gateway.store, received.key):
-        check_photo_signature(received.first_bytes)
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
@@ -320,16 +307,7 @@ def _accept_frame(
             stored = add_frame(session, track, frame, form.expected_version)
             if stored is frame:
                 session.add(
-                    Job(
-                        id=job_id,
-                        map_id=track.map_id,
-                        kind=JobKind.DESCRIBE,
-                        priority=Priority.QUERY,
-                        params={
-                            "filename": received.filename,
-                            "wanted": SearchParams().model_dump(mode="json"),
-                        },
-                    )
+                    describe_query_job(job_id, track.map_id, received.filename, SearchParams())
                 )
             response = _frame_response(stored, map_name)
             headers = accepted_headers(response.frame_url)

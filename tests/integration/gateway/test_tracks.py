@@ -253,7 +253,7 @@ def nearest(service: Service, number: int) -> str:
 
 @only_sqlite
 def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
-    alone, told, placed = (
+    alone, labelled, placed = (
         begin(street),
         begin(street, latitude=latitude_of(0), longitude=7, accuracy_m=20),
         begin(street),
@@ -263,14 +263,14 @@ def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
     odometry: dict[str, Any] = {"distance_m": 80, "distance_accuracy_m": 5, "turn_degrees": 10}
     send(street, placed, 1, **odometry)
     ride(street, alone, 0, 1)
-    ride(street, told, 0, 1)
+    ride(street, labelled, 0, 1)
     first, started, measured = (
         [frame["state"]["probability"] for frame in read(street, track)["frames"]]
-        for track in (alone, told, placed)
+        for track in (alone, labelled, placed)
     )
     assert started[0] > first[0]
     assert measured[0] > first[0]
-    smoothed = read(street, told, smoothed=True)["frames"]
+    smoothed = read(street, labelled, smoothed=True)["frames"]
     assert smoothed[0]["state"]["probability"] >= started[0] - 1e-9
 
 

@@ -1,0 +1,56 @@
+"""Query photos: received and queued, for a similarity search or a frame of a track."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+from fastapi import Request
+
+from services.gateway.admission import AdmissionControl, UploadKind
+from services.gateway.dependencies import GatewayContext
+from services.gateway.idempotency import IdempotentRequest
+from services.gateway.similarity.search_params import SearchParams
+from services.gateway.uploads.multipart import store_form_file
+from shared.ids import new_id
+from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.jobs import Job, JobKind, Priority
+from shared.storage.keys import query_key
+
+
+async def receive_query_photo(
+    request: Request,
+    gateway: GatewayContext,
+    admission: AdmissionControl,
+    idempotent: IdempotentRequest,
+) -> tuple[UUID, StoredUpload]:
+    """Store the photo of a request's form; its signature is checked as it arrives.
+
+    Returns:
+        The id of its future job, and the upload.
+    """
+    job_id = new_id()
+    with admission.admit_upload(UploadKind.QUERY, request):
+        received = await store_form_file(
+            request,
+            gateway.store,
+            query_key(job_id),
+            gateway.settings.max_file_size,
+            check_photo_signature,
+        )
+    await idempotent.claim_form(
+        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
+    )
+    return job_id, received
+
+
+def describe_query_job(
+    job_id: UUID, map_id: UUID, filename: str, search_params: SearchParams
+) -> Job:
+    """Create the job that describes a query photo and keeps the parameters of its search."""
+    return Job(
+        id=job_id,
+        map_id=map_id,
+        kind=JobKind.DESCRIBE,
+        priority=Priority.QUERY,
+        params={"filename": filename, "wanted": search_params.model_dump(mode="json")},
+    )
