@@ -74,8 +74,8 @@ async function fitVocabulary(follow) {
     h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to learn from, at most", sample)),
     h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
   if ((await closed) !== "yes") return;
-  const wanted = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
-  follow(await post("/vocabularies", { json: wanted }), "Fitting a vocabulary");
+  const options = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
+  follow(await post("/vocabularies", { json: options }), "Fitting a vocabulary");
 }
 
 async function measure(follow) {
