@@ -30,8 +30,7 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
-from tests.support.servers.daemon import free_ports
-from tests.support.servers.handle import Handle
+from tests.support.servers.daemon import Daemon, free_ports
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class Servers:
     s3_proxy: FaultProxy
 
     @property
-    def processes(self) -> dict[str, Handle]:
+    def processes(self) -> dict[str, Daemon]:
         """Server processes by name."""
         found = {
             "PostgreSQL": self.postgres.process,

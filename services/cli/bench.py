@@ -26,7 +26,6 @@ DEV_PACKAGES = (
     "faiss",
     "psutil",
     "pytest",
-    "testcontainers",
     "threadpoolctl",
 )
 
