@@ -50,6 +50,8 @@ class Photo(Answer):
     role: str
     image_url: str
     thumbnail_url: str
+    preview_url: str | None = None
+    """Of a JPEG of at most 1,600 px, or of the original where that is as small; None before 0.2."""
 
 
 class OnePhoto(Photo):
