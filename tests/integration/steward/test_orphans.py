@@ -216,8 +216,9 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -
     with chunk_map.catalog.read() as session:
         photo_id = session.scalars(select(Photo.id)).one()
     chunk_map.delete(photo_id)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
-    assert chunk_map.objects("thumbnails/") == set()  # left by a batch that met the deletion
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    # Left by a batch that met the deletion.
+    assert chunk_map.objects("thumbnails/") == chunk_map.objects("previews/") == set()
 
 
 def test_files_that_people_put_beside_the_originals_are_not_removed(chunk_map: ChunkMap) -> None:
