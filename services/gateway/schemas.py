@@ -203,7 +203,8 @@ class SimilarityResponse(ResponseModel):
     estimate: EstimateResponse
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
-        "them; `foreign`: fitted on other photos; `none`: the extractor uses none"
+        "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
+        "map has a vocabulary; `none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "

@@ -12,6 +12,7 @@ const STANDING = {
   own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
   provisional: ["Provisional", "The vocabulary was learnt when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
   foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
+  pending: ["Not yet", "Until this map has a vocabulary, its photos are compared by an average of their features. Fit one: nothing improves the answers as much."],
   none: ["None", "This extractor uses no vocabulary."],
 };
 
