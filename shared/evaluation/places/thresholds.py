@@ -8,7 +8,8 @@ the answers above a threshold are surer ones, so that it is below c.
 An answer at any level but the coarsest also needs odds against "not in the map" that at most the
 share 1 - c of the impostors of each kind reaches, of those for which the level is wrong (Mondrian
 conformal prediction, Vovk et al. 2005). This holds with LIMIT_CONFIDENCE over the choice of the
-impostors, not on average (Vovk 2012). Too few samples for a threshold leave c itself.
+impostors, not on average (Vovk 2012). Too few samples for a threshold leave c itself. Fewer than
+MIN_IMPOSTORS impostors, as in a map of one place, leave the level without an answer.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
 LIMIT_CONFIDENCE = 0.95  # that no more impostors exceed a limit than are allowed
+MIN_IMPOSTORS = 20  # for which a level is wrong; fewer say nothing about one in twenty
 MIN_PROBABILITY = 1e-9  # of "not in the map"; bounds the odds
+UNREACHABLE_ODDS = 2 / MIN_PROBABILITY
 
 
 class Thresholds(BaseModel):
@@ -80,7 +83,7 @@ def choose_thresholds(
     """
     probability = _lowest_probability(judged, certainty)
     least = certainty if probability is None else probability
-    depth = max((len(s.probabilities) for s in impostors), default=0)
+    depth = max((len(s.probabilities) for s in [*judged, *impostors]), default=0)
     odds = tuple(
         _least_odds(impostors, position, least, 1 - certainty)
         for position in range(max(min(depth, 1), depth - 1))
@@ -96,14 +99,19 @@ def odds_in_map(probability: float, not_in_map: float) -> float:
 def _least_odds(
     impostors: Sequence[HeldOutEstimate], position: int, least: float, share: float
 ) -> float:
-    """Return the odds that at most a share of the impostors of each kind reaches at a level."""
+    """Return the odds that at most a share of the impostors of each kind reaches at a level.
+
+    UNREACHABLE_ODDS with fewer than MIN_IMPOSTORS impostors for which the level is wrong.
+    """
     kinds: dict[str | None, list[float]] = defaultdict(list)
     for impostor in impostors:
         if position < len(impostor.is_right) and impostor.is_right[position] is False:
             probability = impostor.probabilities[position]
             odds = odds_in_map(probability, impostor.not_in_map)
             kinds[impostor.left_out].append(odds if probability >= least else 0.0)
-    return max((_exceeded_by(odds, share) for odds in kinds.values()), default=0.0)
+    if sum(map(len, kinds.values())) < MIN_IMPOSTORS:
+        return UNREACHABLE_ODDS
+    return max(_exceeded_by(odds, share) for odds in kinds.values())
 
 
 def _lowest_probability(estimates: Sequence[HeldOutEstimate], certainty: float) -> float | None:
