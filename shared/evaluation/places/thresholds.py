@@ -8,8 +8,9 @@ the answers above a threshold are surer ones, so that it is below c.
 An answer at any level but the coarsest also needs odds against "not in the map" that at most the
 share 1 - c of the impostors of each kind reaches, of those for which the level is wrong (Mondrian
 conformal prediction, Vovk et al. 2005). This holds with LIMIT_CONFIDENCE over the choice of the
-impostors, not on average (Vovk 2012). Too few samples for a threshold leave c itself. Fewer than
-MIN_IMPOSTORS impostors, as in a map of one place, leave the level without an answer.
+impostors, not on average (Vovk 2012), so that it takes n impostors with c^n <= 1 - LIMIT_CONFIDENCE
+(59 for c = 0.95): with fewer, as in a map of one place, the level is never the answer. Too few
+samples for a threshold leave c itself.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
 LIMIT_CONFIDENCE = 0.95  # that no more impostors exceed a limit than are allowed
-MIN_IMPOSTORS = 20  # for which a level is wrong; fewer say nothing about one in twenty
 MIN_PROBABILITY = 1e-9  # of "not in the map"; bounds the odds
 UNREACHABLE_ODDS = 2 / MIN_PROBABILITY
 
@@ -101,7 +101,7 @@ def _least_odds(
 ) -> float:
     """Return the odds that at most a share of the impostors of each kind reaches at a level.
 
-    UNREACHABLE_ODDS with fewer than MIN_IMPOSTORS impostors for which the level is wrong.
+    UNREACHABLE_ODDS with too few impostors for which the level is wrong.
     """
     kinds: dict[str | None, list[float]] = defaultdict(list)
     for impostor in impostors:
@@ -109,7 +109,8 @@ def _least_odds(
             probability = impostor.probabilities[position]
             odds = odds_in_map(probability, impostor.not_in_map)
             kinds[impostor.left_out].append(odds if probability >= least else 0.0)
-    if sum(map(len, kinds.values())) < MIN_IMPOSTORS:
+    most = max(map(len, kinds.values()), default=0)
+    if (1 - share) ** most > 1 - LIMIT_CONFIDENCE:
         return UNREACHABLE_ODDS
     return max(_exceeded_by(odds, share) for odds in kinds.values())
 
