@@ -182,7 +182,8 @@ class AsyncClient(AsyncTransport):
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
+                (comma-separated);
                 `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
                 share of answers that must be right.
         """
