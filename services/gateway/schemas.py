@@ -55,6 +55,7 @@ class PhotoResponse(ResponseModel):
     role: PhotoRole
     image_url: str
     thumbnail_url: str
+    preview_url: str
 
     @classmethod
     def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
@@ -79,6 +80,7 @@ class PhotoResponse(ResponseModel):
             "role": photo.role,
             "image_url": image_url,
             "thumbnail_url": url_in_map(f"/uploads/{photo.id}/thumbnail", map_name),
+            "preview_url": url_in_map(f"/uploads/{photo.id}/preview", map_name),
         }
 
 
