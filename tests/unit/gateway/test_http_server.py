@@ -18,7 +18,7 @@ def test_an_address_of_the_network_is_its_own_url() -> None:
     assert lan_url("192.168.1.23", 8000) == "http://192.168.1.23:8000"
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])  # noqa: S104
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_a_wildcard_address_is_replaced_by_one_that_others_can_open(host: str) -> None:
     url = lan_url(host, 8000)
     # None on a machine without any network.
