@@ -187,7 +187,7 @@ def test_a_proposal_that_is_not_probable_enough_is_not_written(folder: Path) -> 
 def test_exif_is_written_into_the_photo_and_undone(
     folder: Path, latitude: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exif_writers.shutil, "which", lambda name: None)  # pyexiv2
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pyexiv2
     for path, north in ((folder / "1.jpg", 0.0), (folder / "3.jpg", 40.0)):
         path.with_suffix(".jpg.xmp").write_bytes(
             add_position(None, latitude + north * DEGREES_PER_M, -LONGITUDE, 5.0)
@@ -224,7 +224,7 @@ def test_a_photo_whose_exif_cannot_be_written_is_skipped_with_the_reason(
 def test_a_missing_exif_writer_is_named_with_the_ways_to_get_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exif_writers.shutil, "which", lambda name: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr(exif_writers, "find_spec", lambda name: None)
     result = run(folder, "--write", "exif")
     assert result.exit_code == 1
@@ -240,7 +240,7 @@ def test_exiftool_writes_where_it_is_installed(
         f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path}/arguments\necho no >&2; exit 1'
     )
     program.chmod(0o755)
-    monkeypatch.setattr(exif_writers.shutil, "which", lambda name: str(program))
+    monkeypatch.setattr("shutil.which", lambda name: str(program))
     result = run(folder, "--write", "exif")
     assert (result.exit_code, "exiftool can't write the EXIF: no" in result.stderr) == (1, True)
     arguments = (tmp_path / "arguments").read_text().splitlines()
