@@ -2,8 +2,9 @@
 
 import { Problem } from "../api.js";
 import { fill, h, openDialog } from "../dom.js";
-import { percent, score, whereabouts } from "../format.js";
-import { original } from "../photo.js";
+import { nameOf, percent, score, strength, whereabouts } from "../format.js";
+import { preview } from "../photo.js";
+import { coordinateTools } from "../places.js";
 
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
 export function compare(asked, photos, index, signal) {
@@ -25,11 +26,12 @@ export function compare(asked, photos, index, signal) {
     const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Asking what makes them similar…"));
     fill(body,
       h("figure", {}, h("div", { class: "frame" }, asked.picture(), overlay), h("figcaption", {}, asked.name)),
-      h("figure", {}, h("div", { class: "frame" }, original(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename), h("span", { class: "soft" }, ` ${whereabouts(photo)}`))),
+      h("figure", {}, h("div", { class: "frame" }, preview(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${whereabouts(photo)}`)),
+        photo.latitude !== null && coordinateTools(photo.latitude, photo.longitude)),
       h("div", { class: "compare-words" },
         h("div", {},
-          photo.match_probability !== null && h("p", {}, h("span", { class: "figure large" }, percent(photo.match_probability)), h("span", { class: "soft" }, " the same place")),
-          h("p", {}, h("span", { class: "figure" }, score(photo.similarity_score)), h("span", { class: "soft" }, " cosine similarity"))),
+          photo.match_probability !== null && h("p", {}, h("span", { class: `strength ${strength(photo.match_probability)}` }, strength(photo.match_probability)), h("span", { class: "figure large" }, ` ${percent(photo.match_probability)}`), h("span", { class: "soft" }, " the same place")),
+          h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`, photo.weighted_score !== null && `, weighted score ${score(photo.weighted_score)}`))),
         why,
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),

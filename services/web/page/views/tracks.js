@@ -1,8 +1,8 @@
 // Tracks: a list, and one track on the map with its uncertainty and its frames.
 
 import { ask, get } from "../api.js";
-import { button, confirmed, field, fill, h } from "../dom.js";
-import { count, degrees, metres, percent, plural, when } from "../format.js";
+import { advancedTabs, button, confirmed, field, fill, h, time } from "../dom.js";
+import { count, degrees, metres, percent, plural } from "../format.js";
 
 const PHOTOS_SHOWN = 1000; // of the map, behind the track
 const FRAMES_SHOWN = 500; // in the table
@@ -22,13 +22,13 @@ async function showList(view, signal) {
   const { tracks } = await get("/tracks", { query: { limit: 100 }, signal });
   const none = h("section", { class: "card empty" }, h("h2", {}, "No tracks yet"), h("p", {}, "A track follows a camera through the map, frame by frame: ", h("code", {}, "placewise track PHOTOS_OR_VIDEO"), ", or ", h("code", {}, "POST /tracks"), "."));
   const rows = tracks.map((track) => h("tr", {},
-    h("td", {}, h("a", { href: `#/tracks/${track.track_id}` }, when(track.created_at))),
+    h("td", {}, h("a", { href: `#/tracks/${track.track_id}` }, time(track.created_at))),
     h("td", { class: "number" }, count(track.version)),
     h("td", {}, track.state ? chip(track.state.status) : "–"),
     h("td", { class: "number" }, percent(track.state?.probability)),
     h("td", { class: "name" }, whereabouts(track.state))));
   fill(view,
-    h("header", { class: "head" }, h("h1", {}, "Tracks")),
+    h("header", { class: "head" }, h("h1", {}, "Tracks"), advancedTabs("tracks")),
     tracks.length ? h("section", { class: "card" }, table("Tracks", heads("Begun", "Frames", "Status", "Probability", "Last place"), rows)) : none);
 }
 
