@@ -34,6 +34,9 @@ from tests.integration.extractor.model_changes import (
 from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_model_changes.py fits vocabularies on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 
 def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:
     old, before = fitted.active(), fitted.rows()
