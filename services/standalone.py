@@ -81,9 +81,9 @@ class Standalone:
     """Why a service thread could not continue: the process must end with this error."""
 
     def stop(self, error: PlacewiseError | None = None) -> None:
-        """Stop the server because a service thread has failed; by default, with `part_died`."""
+        """Stop the server because a service thread has failed; by default `thread_crashed`."""
         self.error = error or Misconfigured(
-            "part_died", "A service thread crashed. Its exception is in the log above."
+            "thread_crashed", "A service thread crashed. Its exception is in the log above."
         )
         self.server.should_exit = True
 
@@ -91,8 +91,8 @@ class Standalone:
         """Serve HTTP until the process is stopped by a signal.
 
         Raises:
-            Misconfigured: `part_died`, if a service thread has crashed; also as the extractor's
-                start raises it.
+            Misconfigured: `thread_crashed`, if a service thread has crashed; also as the
+                extractor's start raises it.
         """
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])

@@ -167,7 +167,7 @@ class EstimateResponse(ResponseModel):
     levels: list[EstimateLevelResponse] = Field(
         [],
         description="levels of the estimate, finest first; each contains the finer ones and is at "
-        "least as probable",
+        "least as probable; empty before the first evaluation of 20 or more photos with a place",
     )
     answer_level: int | None = Field(
         None,
@@ -187,8 +187,8 @@ class EstimateResponse(ResponseModel):
     radius_95_m: float | None = Field(None, description="the same with 95 %")
     calibration_source: str | None = Field(
         None,
-        description="what the probabilities were fitted on: `prior` (generated maps), "
-        "`own_photos` or `labelled_queries` of this map; null without levels",
+        description="what the probabilities were fitted on: `own_photos` or `labelled_queries` of "
+        "this map; null without levels",
     )
 
 
@@ -203,7 +203,8 @@ class SimilarityResponse(ResponseModel):
     estimate: EstimateResponse
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
-        "them; `foreign`: fitted on other photos; `none`: the extractor uses none"
+        "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
+        "map has a vocabulary; `none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "

@@ -12,6 +12,7 @@ const STANDING = {
   own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
   provisional: ["Provisional", "The vocabulary was learnt when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
   foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
+  pending: ["Not yet", "Until this map has a vocabulary, its photos are compared by an average of their features. Fit one: nothing improves the answers as much."],
   none: ["None", "This extractor uses no vocabulary."],
 };
 
@@ -74,8 +75,8 @@ async function fitVocabulary(follow) {
     h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to learn from, at most", sample)),
     h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
   if ((await closed) !== "yes") return;
-  const wanted = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
-  follow(await post("/vocabularies", { json: wanted }), "Fitting a vocabulary");
+  const options = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
+  follow(await post("/vocabularies", { json: options }), "Fitting a vocabulary");
 }
 
 async function measure(follow) {

@@ -85,7 +85,6 @@ function ringsInWords(estimate) {
 /** What the probabilities were fitted on, and how they become better. */
 function source({ calibration_source: fitted }) {
   const words = {
-    prior: ["These probabilities come from generated maps. ", h("a", { href: "#/model" }, "Measure the map"), " to fit them to its photos."],
     own_photos: ["These probabilities were fitted on the map’s own photos. ", h("a", { href: "#/add" }, "Add test photos"), " of another day to correct them."],
     labelled_queries: ["These probabilities were fitted on test photos."],
   }[fitted];
