@@ -31,7 +31,17 @@ def serve() -> None:
         from services.standalone import serve_standalone
 
         settings = read_settings()
-        serve_standalone(settings, lambda running: _print(_startup_message(running, settings)))
+        is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
+
+        def announce(running: Standalone) -> None:
+            _print(_startup_message(running, settings))
+            if is_first_start and settings.database_url is None:
+                from services.cli.descriptors.local_weights import suggest_extractor
+
+                if suggestion := suggest_extractor(settings):
+                    _print(f"  note:     {suggestion}")
+
+        serve_standalone(settings, announce)
 
 
 def _startup_message(running: Standalone, settings: Settings) -> str:
