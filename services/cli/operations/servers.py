@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
@@ -25,9 +26,12 @@ def serve() -> None:
     """Run the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C.
 
     If HOST is not a loopback address, every call requires an API key. The first start creates and
-    prints an admin key; `placewise keys` creates others.
+    prints an admin key; `placewise keys` creates others. With DEBUG, in a checkout of the
+    repository, the server restarts when its code changes.
     """
+    changed = threading.Event()
     with report_errors(as_json=False):
+        from services.code_reload import can_reload, restart_process, watch_code
         from services.standalone import serve_standalone
 
         settings = read_settings()
@@ -40,8 +44,17 @@ def serve() -> None:
 
                 if suggestion := suggest_extractor(settings):
                     _print(f"  note:     {suggestion}")
+            if settings.debug and can_reload():
+
+                def restart() -> None:
+                    changed.set()
+                    running.server.should_exit = True
+
+                watch_code(restart)
 
         serve_standalone(settings, announce)
+    if changed.is_set():
+        restart_process()
 
 
 def _startup_message(running: Standalone, settings: Settings) -> str:
