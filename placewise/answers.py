@@ -50,6 +50,9 @@ class Photo(Answer):
     role: str
     image_url: str
     thumbnail_url: str
+    preview_url: str = ""
+    """Of a JPEG of at most 1,600 px, or of the original if that is as small; empty from a server
+    that makes no previews."""
 
 
 class OnePhoto(Photo):

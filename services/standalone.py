@@ -26,7 +26,7 @@ from services.gateway.authentication import (
 )
 from services.gateway.dependencies import GatewayContext
 from services.gateway.proxy_sign_in import with_proxy_sign_in
-from services.http_server import http_server, listen, reachable_url, stop_on_signals
+from services.http_server import http_server, lan_url, listen, reachable_url, stop_on_signals
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
@@ -69,6 +69,8 @@ class Standalone:
 
     url: str
     """Its URL, reachable from this machine."""
+    lan_url: str | None
+    """Its URL for other devices of the network; None if only this machine can reach it."""
     server: uvicorn.Server
     listener: socket.socket
     first_admin_key: str | None
@@ -79,9 +81,9 @@ class Standalone:
     """Why a service thread could not continue: the process must end with this error."""
 
     def stop(self, error: PlacewiseError | None = None) -> None:
-        """Stop the server because a service thread has failed; by default, with `part_died`."""
+        """Stop the server because a service thread has failed; by default `thread_crashed`."""
         self.error = error or Misconfigured(
-            "part_died", "A service thread crashed. Its exception is in the log above."
+            "thread_crashed", "A service thread crashed. Its exception is in the log above."
         )
         self.server.should_exit = True
 
@@ -89,8 +91,8 @@ class Standalone:
         """Serve HTTP until the process is stopped by a signal.
 
         Raises:
-            Misconfigured: `part_died`, if a service thread has crashed; also as the extractor's
-                start raises it.
+            Misconfigured: `thread_crashed`, if a service thread has crashed; also as the
+                extractor's start raises it.
         """
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
@@ -174,13 +176,20 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
         gateway = GatewayContext(
-            requests, store, wakeups, metered_search, settings, authenticator, registry
+            requests,
+            store,
+            wakeups,
+            metered_search,
+            settings,
+            authenticator,
+            registry,
+            lan_url=lan_url(host, port),
         )
         server = http_server(
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
         stack.enter_context(serve_metrics(settings, registry))
-        running = Standalone(url, server, listener, first_admin_key, local_key)
+        running = Standalone(url, gateway.lan_url, server, listener, first_admin_key, local_key)
 
         def run_extractor(stop: threading.Event) -> None:
             if lazy_extractor:

@@ -121,5 +121,5 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.include_router(
         metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ, ALL_MAPS]
     )
-    app.include_router(create_web_page_router(gateway.settings))
+    app.include_router(create_web_page_router(gateway.settings, gateway.lan_url))
     return app

@@ -181,7 +181,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
     """Serve searches in the shard SEARCH_SHARD on HOST and PORT until SIGTERM.
 
     Raises:
-        Misconfigured: `address_in_use`; `part_died` if a thread has crashed.
+        Misconfigured: `address_in_use`; `thread_crashed` if a thread has crashed.
     """
     stop, failed = threading.Event(), threading.Event()
     with service_process(settings, "search") as catalog:
@@ -221,5 +221,6 @@ def serve_search(settings: Settings, announce: Announce) -> None:
                     thread.join()
     if failed.is_set():
         raise Misconfigured(
-            "part_died", "A thread of the search service stopped unexpectedly. See the log above."
+            "thread_crashed",
+            "A thread of the search service crashed. See the log above.",
         )

@@ -29,7 +29,7 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
     """Run all tasks of the steward until SIGTERM.
 
     Raises:
-        Misconfigured: `search_missing`, `redis_missing`; `part_died` if a thread has crashed.
+        Misconfigured: `search_missing`, `redis_missing`; `thread_crashed` if a thread has crashed.
     """
     stop, failed = threading.Event(), threading.Event()
 
@@ -67,4 +67,4 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
             for thread in threads:
                 thread.join()
     if failed.is_set():
-        raise Misconfigured("part_died", "A thread of the steward failed. See the log above.")
+        raise Misconfigured("thread_crashed", "A thread of the steward failed. See the log above.")

@@ -94,6 +94,17 @@ def detect_media_type(first_bytes: bytes) -> str | None:
     return None
 
 
+# The longer side of a preview. Larger screens scale it up, which a photo of a place survives.
+PREVIEW_PIXELS = 1600
+# Formats that all browsers show.
+BROWSER_MEDIA_TYPES = ("image/jpeg", "image/png", "image/webp")
+
+
+def needs_preview(media_type: str | None, width: int, height: int) -> bool:
+    """Return whether browsers need a preview because the photo is large, or of another format."""
+    return media_type not in BROWSER_MEDIA_TYPES or max(width, height) > PREVIEW_PIXELS
+
+
 def open_photo(file: BinaryIO) -> Image.Image:
     """Open a photo with Pillow; reads the header and decodes no pixels."""
     return Image.open(file, formats=PILLOW_FORMATS)

@@ -278,7 +278,7 @@ def _retry_after_crash(
     # An upload batch continues without the photo that may be the cause: see BatchWorker.
     if together == 1 and job.attempts >= max_attempts and not has_batch_items(job):
         error = PlacewiseError(
-            "worker_fell",
+            "worker_crashed",
             f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "
             "If the photo is valid, check the worker's log and memory, then retry the job.",
         )

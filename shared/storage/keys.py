@@ -18,6 +18,7 @@ FEATURES = "features/"
 JOURNAL = "journal/"
 MODELS = "models/"
 ORIGINALS = "originals/"
+PREVIEWS = "previews/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
 TRASH = "trash/"
@@ -33,6 +34,7 @@ OWN_PREFIXES = (
     JOURNAL,
     MODELS,
     ORIGINALS,
+    PREVIEWS,
     QUERIES,
     THUMBNAILS,
     TRASH,
@@ -137,6 +139,15 @@ def is_original_key(key: str) -> bool:
 
 def thumbnail_key(photo_id: UUID) -> str:
     return f"{THUMBNAILS}{photo_id}.jpg"
+
+
+def preview_key(photo_id: UUID) -> str:
+    return f"{PREVIEWS}{photo_id}.jpg"
+
+
+def derived_image_keys(photo_id: UUID) -> tuple[str, ...]:
+    """Return the keys of all images that are made of a photo; some may not exist."""
+    return thumbnail_key(photo_id), preview_key(photo_id)
 
 
 def query_key(job_id: UUID) -> str:

@@ -281,6 +281,13 @@ def _check_vocabulary(settings: Settings) -> str:
             "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
             "photos were uploaded just now.",
         )
+    pending = [m.name for m in maps if m.vocabulary == "pending"]
+    if pending:
+        return (
+            f"no vocabulary yet in {', '.join(pending)}: their descriptors are GeM-pooled until "
+            "one is fitted (placewise vocabulary fit --map NAME), which starts by itself at "
+            f"AUTO_FIT_PHOTOS ({settings.auto_fit_photos}) photos"
+        )
     provisional = [m.name for m in maps if m.vocabulary == "provisional"]
     if provisional:
         return (

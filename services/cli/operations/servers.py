@@ -8,6 +8,7 @@ service only.
 
 from __future__ import annotations
 
+import io
 import shlex
 import sys
 import threading
@@ -77,7 +78,20 @@ def _startup_message(running: Standalone, settings: Settings) -> str:
         f"  folder:   {command} index DIR",
         f"            {command} query PHOTO",
     ]
+    if running.lan_url is not None:
+        lines.append(f"  phone:    {running.lan_url}   (in the same network)")
+        if err_console.is_terminal:
+            lines.append(_qr_code(running.lan_url))
     return "\n".join(lines)
+
+
+def _qr_code(text: str) -> str:
+    """Draw a QR code with half blocks, for a dark terminal; cameras also read the inverse."""
+    import segno
+
+    drawing = io.StringIO()
+    segno.make_qr(text).terminal(out=drawing, border=2, compact=True)
+    return drawing.getvalue()
 
 
 def _key_instructions(running: Standalone, settings: Settings, command: str) -> list[str]:

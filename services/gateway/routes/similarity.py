@@ -42,7 +42,11 @@ from services.gateway.similarity.search_params import (
     check_place_filter,
 )
 from services.gateway.uploads.multipart import multipart_schema
-from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
+from services.gateway.uploads.query_photo import (
+    describe_query_job,
+    query_job_search_params,
+    receive_query_photo,
+)
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
@@ -235,7 +239,7 @@ def _result_or_next_job(
     if job.state == JobState.SUCCEEDED:
         if job.kind == JobKind.COMPARE:
             return comparison_response(gateway, job, map_name)
-        search_params = SearchParams.model_validate(job.params["wanted"])
+        search_params = query_job_search_params(job)
         query = query_from_job(gateway, job)
         if search_params.needs_comparison:
             return start_comparison_of_query_photo(gateway, job, query, search_params)

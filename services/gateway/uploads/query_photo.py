@@ -52,5 +52,11 @@ def describe_query_job(
         map_id=map_id,
         kind=JobKind.DESCRIBE,
         priority=Priority.QUERY,
-        params={"filename": filename, "wanted": search_params.model_dump(mode="json")},
+        params={"filename": filename, "search_params": search_params.model_dump(mode="json")},
     )
+
+
+def query_job_search_params(job: Job) -> SearchParams:
+    """The parameters that `describe_query_job` has stored, also under their name before 0.1.0."""
+    stored = job.params.get("search_params") or job.params["wanted"]
+    return SearchParams.model_validate(stored)

@@ -311,7 +311,7 @@ class BatchWorker:
     def _fail_suspect_item(self, job: Job) -> None:
         """Fail the next item: several workers died on it, since no photo was imported meanwhile."""
         error = PlacewiseError(
-            "worker_fell",
+            "worker_crashed",
             f"The steward died {job.attempts} times while it imported this photo. If the photo "
             "is valid, check the steward's log and memory, then upload it again.",
         )

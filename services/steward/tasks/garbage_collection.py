@@ -36,11 +36,11 @@ from shared.storage.keys import (
     ARCHIVES,
     CHECKPOINTS,
     WORK,
+    derived_image_keys,
     incoming_key,
     local_features_key,
     local_features_prefix,
     query_object_keys,
-    thumbnail_key,
 )
 
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
@@ -130,9 +130,9 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Delete the objects of deleted photos at once, and their rows after `grace_seconds`.
 
-    The objects (original, thumbnail, local features) go as soon as the journal has recorded the
-    deletion. After the grace period every search worker has seen the deletion and compaction has
-    dropped the descriptors.
+    The objects (original, thumbnail, preview, local features) go as soon as the journal has
+    recorded the deletion. After the grace period every search worker has seen the deletion and
+    compaction has dropped the descriptors.
     """
     journal_deletions(catalog, store, Photo)
     with catalog.read() as session:
@@ -146,7 +146,8 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
         generation_ids = _generations_with_chunks(session, {photo.map_id for photo in photos})
     for photo in photos:
         store.delete(photo.object_key)
-        store.delete(thumbnail_key(photo.id))
+        for key in derived_image_keys(photo.id):
+            store.delete(key)
         for generation_id in generation_ids[photo.map_id]:
             store.delete(local_features_key(generation_id, photo.id))
     photo_ids = [photo.id for photo in photos]

@@ -117,8 +117,8 @@ def advance_model_changes(catalog: Catalog, wakeups: Wakeups) -> None:
 def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
     """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one.
 
-    A provisional vocabulary is replaced once the map has as many photos, and at least
-    MIN_PHOTOS_TO_FIT.
+    Pooled descriptors are replaced by those of a vocabulary at the same number, a provisional
+    vocabulary once the map has at least MIN_PHOTOS_TO_FIT, too.
     """
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
@@ -159,18 +159,17 @@ def _has_enough_waiting_photos(session: Session, map_id: UUID, min_photos: int) 
 
 
 def _has_outgrown_its_vocabulary(session: Session, map_id: UUID, min_photos: int) -> bool:
-    """Return whether the map's vocabulary is provisional and the map has enough photos for another.
+    """Return whether the map's vocabulary is pending or provisional, and it has enough photos.
 
     A PCA whitening was fitted on descriptors of the vocabulary, so a user has to replace both.
     """
     active = active_generation(session, map_id)
-    if (
-        active is None
-        or active.pca_from is not None
-        or vocabulary_standing(session, active) != "provisional"
-    ):
+    if active is None or active.pca_from is not None:
         return False
-    required = max(min_photos, MIN_PHOTOS_TO_FIT)
+    standing = vocabulary_standing(session, active)
+    if standing not in ("pending", "provisional"):
+        return False
+    required = min_photos if standing == "pending" else max(min_photos, MIN_PHOTOS_TO_FIT)
     photos = (
         select(Photo.id)
         .where(
@@ -209,7 +208,7 @@ def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
     if generation.state == GenerationState.BUILDING:
         if not search_workers_have_loaded(session, job, generation):
             return 0
-        _activate_generation(session, generation)
+        _activate_generation(session, job, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
     photos = estimate_described(session, generation_id)
@@ -274,8 +273,8 @@ def _queue_missing_photos(session: Session, generation: Generation) -> int:
     return len(rows)
 
 
-def _activate_generation(session: Session, generation: Generation) -> None:
-    """Make the built generation the map's active one and retire the previous one."""
+def _activate_generation(session: Session, job: Job, generation: Generation) -> None:
+    """Make the generation that `job` built the map's active one and retire the previous one."""
     active = active_generation(session, generation.map_id)
     assert active is not None, "a generation is built only while another is active"
     active.state = GenerationState.RETIRED
@@ -284,7 +283,8 @@ def _activate_generation(session: Session, generation: Generation) -> None:
     generation.state = GenerationState.ACTIVE
     generation.activated_at = db_now()
     map_ = session.get_one(Map, generation.map_id)
-    map_.extractor = generation.extractor
+    if job.params.get("extractor") is not None:
+        map_.extractor = generation.extractor
     enqueue_event(
         session,
         EventKind.GENERATION_SWITCHED,

@@ -243,7 +243,7 @@ def test_a_crash_of_a_lone_job_counts_an_attempt_and_the_last_one_fails_it(
     job = read_job(catalog, job_id)
     assert job.state == JobState.FAILED
     assert job.error is not None
-    assert job.error["code"] == "worker_fell"
+    assert job.error["code"] == "worker_crashed"
     assert "gpu-7" in job.error["detail"]
     assert (job.progress_failed, job.lease_token) == (1, None)
     assert job.finished_at is not None

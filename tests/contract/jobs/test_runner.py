@@ -106,7 +106,7 @@ def test_the_jobs_of_a_crashed_batch_are_retried_alone_until_the_cause_fails(
     failed = read_job(catalog, bad)
     assert failed.state == JobState.FAILED
     assert failed.error is not None
-    assert failed.error["code"] == "worker_fell"
+    assert failed.error["code"] == "worker_crashed"
     assert "RuntimeError" in failed.error["detail"]
 
 

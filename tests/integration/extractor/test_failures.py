@@ -55,7 +55,7 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
     poisonous = averages.job_of(photo_ids[1])
     assert (poisonous.state, poisonous.attempts) == (JobState.FAILED, 3)
     assert poisonous.error is not None
-    assert poisonous.error["code"] == "worker_fell"
+    assert poisonous.error["code"] == "worker_crashed"
     assert "RuntimeError" in poisonous.error["detail"]
     for photo_id in (photo_ids[0], photo_ids[2]):
         job = averages.job_of(photo_id)

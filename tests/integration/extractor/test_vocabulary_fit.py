@@ -202,7 +202,7 @@ def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
     assert (job.state, job.stage) == (JobState.FAILED, "cluster")
     assert next(crashes) == fitted.settings.max_attempts + 1
     assert job.error is not None
-    assert job.error["code"] == "worker_fell"
+    assert job.error["code"] == "worker_crashed"
     monkeypatch.undo()
     assert fitted.active().id == old
 

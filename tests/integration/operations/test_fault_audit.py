@@ -80,7 +80,7 @@ def test_unfinished_and_failed_jobs_are_counted(
         map_id = session.get_one(Photo, next(iter(acknowledged.values()))).map_id
         add_job(session, map_id)
         add_job(session, map_id, state=JobState.RUNNING)
-        add_job(session, map_id, state=JobState.FAILED, error={"code": "worker_fell"})
+        add_job(session, map_id, state=JobState.FAILED, error={"code": "worker_crashed"})
     assert changed(check_invariants(catalog, store, acknowledged)) == {"stuck": 2, "failed": 1}
 
 

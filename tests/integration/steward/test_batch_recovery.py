@@ -135,7 +135,7 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
         batches.worker = restart(batches, job_id)
     job = batches.finish(job_id)
     assert (job["state"], counts(job)) == ("succeeded", (3, 4, 1))
-    assert codes(batches.items(job_id)) == [None, None, "worker_fell", None]
+    assert codes(batches.items(job_id)) == [None, None, "worker_crashed", None]
 
 
 def test_a_batch_pauses_while_the_store_is_away(
