@@ -18,6 +18,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.http_connections import Connections, LimitedProtocol
 from shared.errors import Misconfigured
+from shared.security.api_keys import is_loopback
 
 PEER_ADDRESS = "placewise.peer"
 """Key of the ASGI scope: address of the connection, whatever the headers say."""
@@ -150,7 +151,30 @@ def listen(host: str, port: int) -> Iterator[socket.socket]:
         yield listener
 
 
+WILDCARD_ADDRESSES = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104
+
+
 def reachable_url(host: str, port: int) -> str:
     """Returns a URL for this machine; the wildcard addresses are replaced by loopback ones."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
+    return _http_url(WILDCARD_ADDRESSES.get(host, host), port)
+
+
+def lan_url(host: str, port: int) -> str | None:
+    """Returns a URL for other devices of the network; None if they can't reach the server.
+
+    For a wildcard address, it has the address from which this machine reaches other networks.
+    """
+    if is_loopback(host):
+        return None
+    if host in WILDCARD_ADDRESSES:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect(("192.0.2.1", 9))  # selects a route; sends nothing
+            except OSError:  # no network
+                return None
+            host = probe.getsockname()[0]
+    return _http_url(host, port)
+
+
+def _http_url(host: str, port: int) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"

@@ -26,7 +26,7 @@ from services.gateway.authentication import (
 )
 from services.gateway.dependencies import GatewayContext
 from services.gateway.proxy_sign_in import with_proxy_sign_in
-from services.http_server import http_server, listen, reachable_url, stop_on_signals
+from services.http_server import http_server, lan_url, listen, reachable_url, stop_on_signals
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
@@ -69,6 +69,8 @@ class Standalone:
 
     url: str
     """Its URL, reachable from this machine."""
+    lan_url: str | None
+    """Its URL for other devices of the network; None if only this machine can reach it."""
     server: uvicorn.Server
     listener: socket.socket
     first_admin_key: str | None
@@ -174,13 +176,20 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
         gateway = GatewayContext(
-            requests, store, wakeups, metered_search, settings, authenticator, registry
+            requests,
+            store,
+            wakeups,
+            metered_search,
+            settings,
+            authenticator,
+            registry,
+            lan_url=lan_url(host, port),
         )
         server = http_server(
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
         stack.enter_context(serve_metrics(settings, registry))
-        running = Standalone(url, server, listener, first_admin_key, local_key)
+        running = Standalone(url, gateway.lan_url, server, listener, first_admin_key, local_key)
 
         def run_extractor(stop: threading.Event) -> None:
             if lazy_extractor:

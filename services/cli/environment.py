@@ -48,12 +48,12 @@ def _describe_setting_error(error: ErrorDetails) -> str:
     name = str(error["loc"][0])
     field = Settings.model_fields[name]
     # A value that holds a secret, or one that is not a single text, is not repeated.
-    shown = isinstance(error["input"], str | int | float) and not _is_secret(field)
+    shown = isinstance(error["input"], str | int | float) and not is_secret(field)
     value = f"={error['input']}" if shown else ""
     return f"{name.upper()}{value}: {message} ({field.description})"
 
 
-def _is_secret(field: FieldInfo) -> bool:
+def is_secret(field: FieldInfo) -> bool:
     return SecretStr in (field.annotation, *get_args(field.annotation))
 
 

@@ -29,6 +29,7 @@ COMMANDS = {
     "import-anyloc": ("ingest.import_anyloc", "import_anyloc"),
     "query": ("query", "query"),
     "track": ("track.command", "track"),
+    "locate": ("locate.command", "locate"),
     "export": ("export", "app"),
     "describe": ("descriptors.describe", "describe"),
     "evaluate": ("evaluation.commands", "evaluate"),

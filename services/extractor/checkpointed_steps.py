@@ -38,7 +38,17 @@ from shared.storage.keys import job_work_key, new_vocabulary_key, new_whitening_
 
 
 def map_extractor(catalog: Catalog, models: ModelRegistry, job: Job) -> Extractor:
-    """Return the extractor of the job's map with its weights loaded."""
+    """Return the extractor of the job's map with its weights loaded.
+
+    The active generation may have another one that pools instead, until the map has a vocabulary.
+    """
+    with catalog.read() as session:
+        name = session.get_one(Map, job.map_id).extractor
+    return models.extractor(name)
+
+
+def active_extractor(catalog: Catalog, models: ModelRegistry, job: Job) -> Extractor:
+    """Return the extractor of the map's active generation, or the map's before there is one."""
     with catalog.read() as session:
         active = active_generation(session, job.map_id)
         name = active.extractor if active else session.get_one(Map, job.map_id).extractor

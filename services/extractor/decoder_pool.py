@@ -7,11 +7,12 @@ for a running task, and a crash breaks its whole pool; `pebble.ProcessPool` repl
 
 from __future__ import annotations
 
+import functools
 import logging
 import multiprocessing
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
@@ -35,6 +36,8 @@ SCHEDULED_PER_PROCESS = 2
 # A process may be killed for other reasons than its photo, so each photo gets a second attempt.
 MAX_DECODE_ATTEMPTS = 2
 
+Decode = Callable[[bytes], DecodedPhoto]
+
 
 class DecoderPool:
     """Decodes photos in parallel processes; results are in the order of the photos."""
@@ -45,7 +48,11 @@ class DecoderPool:
         self._pool = self._start_pool()
 
     def decode(
-        self, photos: Iterable[bytes], preprocessing: Preprocessing
+        self,
+        photos: Iterable[bytes],
+        preprocessing: Preprocessing,
+        *,
+        with_previews: bool = False,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -57,13 +64,19 @@ class DecoderPool:
                 log.error("the decoder pool crashed, starting a new one")
                 self.close()
                 self._pool = self._start_pool()
+        decode = functools.partial(
+            decode_photo,
+            preprocessing=preprocessing,
+            max_pixels=self._settings.max_image_pixels,
+            with_preview=with_previews,
+        )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()
         for data in photos:
             if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
-                outcomes.append(self._result(*pending.popleft(), preprocessing))
-            pending.append((self._schedule(data, preprocessing), data))
-        outcomes += [self._result(future, data, preprocessing) for future, data in pending]
+                outcomes.append(self._result(*pending.popleft(), decode))
+            pending.append((self._schedule(data, decode), data))
+        outcomes += [self._result(future, data, decode) for future, data in pending]
         return outcomes
 
     def close(self) -> None:
@@ -80,18 +93,18 @@ class DecoderPool:
             initargs=[self._settings.decode_memory_bytes],
         )
 
-    def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[DecodedPhoto]:
+    def _schedule(self, data: bytes, decode: Decode) -> ProcessFuture[DecodedPhoto]:
         try:
             return self._pool.schedule(
-                decode_photo,
-                args=[data, preprocessing, self._settings.max_image_pixels],
+                decode,
+                args=[data],
                 timeout=self._settings.decode_timeout_seconds,
             )
         except RuntimeError as error:  # raised by pebble when the pool is not running
             raise _pool_broken_error() from error
 
     def _result(
-        self, future: ProcessFuture[DecodedPhoto], data: bytes, preprocessing: Preprocessing
+        self, future: ProcessFuture[DecodedPhoto], data: bytes, decode: Decode
     ) -> DecodedPhoto | PlacewiseError:
         for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
             try:
@@ -113,7 +126,7 @@ class DecoderPool:
                         f"The decoder crashed on this photo {MAX_DECODE_ATTEMPTS} times "
                         f"({type(error).__name__}).",
                     )
-                future = self._schedule(data, preprocessing)
+                future = self._schedule(data, decode)
         raise AssertionError("the last attempt returns")
 
     def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:

@@ -38,6 +38,7 @@ from shared.catalog.vocabularies import (
 from shared.descriptors.extractor import Extractor, spec_fingerprint
 from shared.descriptors.vocabulary import encode_centres
 from shared.errors import Conflict, PlacewiseError
+from shared.extractor_config.configs import pooled_config
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
@@ -59,10 +60,11 @@ class ResolvedGeneration(DescriptorPipeline):
 def resolve_generation(
     catalog: Catalog, store: ObjectStore, models: ModelRegistry, job: Job
 ) -> ResolvedGeneration | None:
-    """Return the generation for the batch of `job`; None while the map has no vocabulary.
+    """Return the generation for the batch of `job`; None while the map waits for a vocabulary.
 
     A job that names a generation gets that one; other jobs get the map's active one, which is
-    created on first use if the extractor ships a vocabulary or needs none.
+    created on first use if the extractor ships a vocabulary or needs none, and with GeM pooling
+    under POOL_WITHOUT_VOCABULARY.
 
     Raises:
         Unavailable: `spec_differs` if this worker can't reproduce the generation's spec.
@@ -80,7 +82,7 @@ def resolve_generation(
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
         created = _create_first_generation(
-            catalog, store, models.extractor(map_extractor), job.map_id
+            catalog, store, models, models.extractor(map_extractor), job.map_id
         )
         if created is None:
             return None
@@ -95,16 +97,25 @@ def resolve_generation(
 
 
 def _create_first_generation(
-    catalog: Catalog, store: ObjectStore, extractor: Extractor, map_id: UUID
+    catalog: Catalog,
+    store: ObjectStore,
+    models: ModelRegistry,
+    extractor: Extractor,
+    map_id: UUID,
 ) -> tuple[Generation, Vocabulary | None] | None:
     """Create the map's first generation, with the shipped vocabulary if one is needed.
 
-    Returns None if a vocabulary is needed and none is shipped; the existing generation if another
-    worker has created it meanwhile.
+    If none is shipped, the generation's extractor pools the same local features, while the map
+    keeps its own, with which the vocabulary is fitted later.
+
+    Returns None if the map waits for a vocabulary instead (POOL_WITHOUT_VOCABULARY=false); the
+    existing generation if another worker has created it meanwhile.
     """
     shipped = extractor.shipped_vocabulary()
     if extractor.config.needs_vocabulary and shipped is None:
-        return None
+        if not models.pool_without_vocabulary:
+            return None
+        extractor = models.extractor(pooled_config(extractor.config).name)
     key = new_vocabulary_key()
     if shipped is not None:
         store.put(key, encode_centres(shipped[0]))

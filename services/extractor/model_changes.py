@@ -23,6 +23,7 @@ from sqlalchemy import select
 from services.extractor.added_models import ModelImporter, model_cache_folder
 from services.extractor.checkpointed_steps import (
     FIT_PROGRESS_UNITS,
+    active_extractor,
     checkpoint_and_release,
     map_extractor,
     run_fit_steps,
@@ -234,14 +235,16 @@ class VocabularySwitchJob:
         """Switch to the map's vocabulary `vocabulary_id`, or to None for an extractor without one.
 
         With the parameter `extractor`, also switch to that extractor; None then means the
-        vocabulary that it ships with.
+        vocabulary that it ships with. Without both, a map that pools until it has a vocabulary
+        goes on doing so.
 
         Raises:
             Unprocessable: `vocabulary_unfit` if the extractor can't use the vocabulary, or if it
                 needs one and None was given.
         """
         if job.params.get("extractor") is None:
-            extractor = map_extractor(self._catalog, self._models, job)
+            current = active_extractor if job.params["vocabulary_id"] is None else map_extractor
+            extractor = current(self._catalog, self._models, job)
             shipped = None
         else:
             extractor = self._models.extractor(job.params["extractor"])

@@ -32,7 +32,7 @@ from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, Rows, read_row, rows_are_valid
-from shared.storage.keys import query_key, thumbnail_key
+from shared.storage.keys import preview_key, query_key, thumbnail_key
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ def prepare_batch(
     jobs: list[Job],
     target: ResolvedGeneration,
 ) -> DescribeBatch:
-    """Read and decode the photos of the claimed jobs, and store the thumbnails of new ones.
+    """Read and decode the photos of the claimed jobs; store thumbnails and previews of new ones.
 
     Where possible, stored rows are read instead (`read_rows_to_project`).
     """
@@ -191,7 +191,8 @@ def prepare_batch(
 
     batch.seconds["read"] = time.perf_counter() - started
     started = time.perf_counter()
-    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing)
+    is_new = batch.kind == JobKind.INDEX
+    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing, with_previews=is_new)
     for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
             batch.failed.append((job, outcome))
@@ -200,11 +201,13 @@ def prepare_batch(
             batch.decoded.append(outcome)
     batch.seconds["decode"] = time.perf_counter() - started
 
-    if batch.kind == JobKind.INDEX:
+    if is_new:
         # Stored here and not with the chunk, while the model runs the previous batch.
         started = time.perf_counter()
         for job, decoded in zip(batch.ready, batch.decoded, strict=True):
             store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
+            if decoded.preview is not None:
+                store.put(preview_key(photo_id_of(job)), decoded.preview)
         batch.seconds["thumbnails"] = time.perf_counter() - started
     return batch
 

@@ -43,12 +43,13 @@ from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
+from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind, WaitingFor
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
 from shared.jobs.runner import ClaimedJobs, JobRunner
 from shared.jobs.trace_context import job_trace_context
+from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows
 from shared.telemetry.heartbeat import Heartbeat
@@ -121,7 +122,13 @@ class ExtractorWorker:
         return self._models.state
 
     def warm_up(self) -> None:
-        """Load the extractor of new maps, so that the first photo does not wait for it."""
+        """Load the extractor of new maps, so that the first photo does not wait for it.
+
+        Photos that wait for a vocabulary since POOL_WITHOUT_VOCABULARY was off are released.
+        """
+        if self._settings.pool_without_vocabulary:
+            with self._catalog.write() as session:
+                make_waiting_jobs_claimable(session, Job.waiting_for == WaitingFor.VOCABULARY)
         try:
             self._models.extractor(self._settings.new_map_extractor)
         except PlacewiseError as error:

@@ -28,6 +28,7 @@ from services.gateway.routes import (
     model_changes,
     models,
     photos,
+    positions,
     presigned_uploads,
     similarity,
     stats,
@@ -106,6 +107,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         similarity,
         tracks,
         photos,
+        positions,
         model_changes,
         models,
         evaluations,
@@ -121,5 +123,5 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.include_router(
         metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ, ALL_MAPS]
     )
-    app.include_router(create_web_page_router(gateway.settings))
+    app.include_router(create_web_page_router(gateway.settings, gateway.lan_url))
     return app

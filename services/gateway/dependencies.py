@@ -229,6 +229,8 @@ class GatewayContext:
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
     neighbours: NeighbourCache = field(default_factory=NeighbourCache)
+    lan_url: str | None = None
+    """URL of this server for other devices of its network, if it is known."""
     track_frames: Counter = field(init=False)
     """Applied frames of tracks by the status of the track, or `failed`."""
 

@@ -55,6 +55,7 @@ class PhotoResponse(ResponseModel):
     role: PhotoRole
     image_url: str
     thumbnail_url: str
+    preview_url: str
 
     @classmethod
     def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
@@ -79,6 +80,7 @@ class PhotoResponse(ResponseModel):
             "role": photo.role,
             "image_url": image_url,
             "thumbnail_url": url_in_map(f"/uploads/{photo.id}/thumbnail", map_name),
+            "preview_url": url_in_map(f"/uploads/{photo.id}/preview", map_name),
         }
 
 
@@ -165,7 +167,7 @@ class EstimateResponse(ResponseModel):
     levels: list[EstimateLevelResponse] = Field(
         [],
         description="levels of the estimate, finest first; each contains the finer ones and is at "
-        "least as probable",
+        "least as probable; empty before the first evaluation of 20 or more photos with a place",
     )
     answer_level: int | None = Field(
         None,
@@ -185,8 +187,8 @@ class EstimateResponse(ResponseModel):
     radius_95_m: float | None = Field(None, description="the same with 95 %")
     calibration_source: str | None = Field(
         None,
-        description="what the probabilities were fitted on: `prior` (generated maps), "
-        "`own_photos` or `labelled_queries` of this map; null without levels",
+        description="what the probabilities were fitted on: `own_photos` or `labelled_queries` of "
+        "this map; null without levels",
     )
 
 
@@ -201,7 +203,8 @@ class SimilarityResponse(ResponseModel):
     estimate: EstimateResponse
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
-        "them; `foreign`: fitted on other photos; `none`: the extractor uses none"
+        "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
+        "map has a vocabulary; `none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "

@@ -1,7 +1,8 @@
 """The web page on `/`, the API documentation on `/docs` and `/redoc`, and their static assets.
 
 All assets come from this server: Leaflet, Swagger UI and ReDoc are files of installed packages. The
-only other origin that a page may load from is that of MAP_TILES.
+only other origin that a page may load from is that of MAP_TILES: images, and only once the user has
+agreed.
 
 Assets are read once, compressed on first use, and revalidated by an ETag of their content.
 Starlette's StaticFiles derives the ETag from the file's modification time, which differs between
@@ -13,14 +14,17 @@ from __future__ import annotations
 import functools
 import gzip
 import hashlib
+import io
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import urlsplit
 
-from fastapi import APIRouter, Request
+import segno
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from services.gateway.routes.health import ServiceResponse, service_info
@@ -112,11 +116,18 @@ VENDORED_PACKAGES = (
 API_DOCS_CSP = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 
 
-def create_web_page_router(settings: Settings) -> APIRouter:
-    """Create the routes of the web page, the API documentation and the assets."""
+def create_web_page_router(settings: Settings, lan_url: str | None = None) -> APIRouter:
+    """Create the routes of the web page, the API documentation and the assets.
+
+    Args:
+        settings: The settings.
+        lan_url: URL of this server for other devices of the network, if it is known.
+    """
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
-    assets["settings.json"] = StaticAsset(".json", json.dumps(_page_settings(settings)).encode())
+    assets["settings.json"] = StaticAsset(
+        ".json", json.dumps(_page_settings(settings, lan_url)).encode()
+    )
 
     page_headers = _page_headers(settings)
     policy = page_headers["Content-Security-Policy"]
@@ -142,6 +153,16 @@ def create_web_page_router(settings: Settings) -> APIRouter:
     def redoc(request: Request) -> Response:
         return pages["redoc.html"].to_response(request, docs_headers)
 
+    @router.api_route(ASSET_PREFIX + "qr.svg", methods=["GET", "HEAD"], include_in_schema=False)
+    def qr_code(
+        url: Annotated[str, Query(max_length=200, pattern=r"^https?://[!-~]+$")],
+    ) -> Response:
+        """A QR code of the page's own URL, for the camera of a phone."""
+        image = io.BytesIO()
+        segno.make_qr(url).save(image, kind="svg", border=2, dark="#000", light="#fff", scale=6)
+        headers = {"X-Content-Type-Options": "nosniff"}
+        return Response(image.getvalue(), media_type=MEDIA_TYPES[".svg"], headers=headers)
+
     @router.api_route(
         ASSET_PREFIX + "{path:path}", methods=["GET", "HEAD"], include_in_schema=False
     )
@@ -154,12 +175,13 @@ def create_web_page_router(settings: Settings) -> APIRouter:
     return router
 
 
-def _page_settings(settings: Settings) -> dict[str, str | int | None]:
+def _page_settings(settings: Settings, lan_url: str | None) -> dict[str, str | int | None]:
     """Settings of the page. Served without a key: must not expose stored data."""
     return {
         "map_tiles": settings.map_tiles,
-        "map_attribution": settings.map_attribution,
+        "map_attribution": settings.tile_attribution,
         "max_file_size": settings.max_file_size,
+        "lan_url": lan_url,
     }
 
 

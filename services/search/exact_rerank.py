@@ -84,7 +84,10 @@ def _thread_pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, _cpu_count() - 1), "search-part")
 
 
-RERANK_STEP_ROWS = 8  # rows compared exactly between two checks of the floor and the budget
+# Minimum number of rows compared exactly between two checks of the floor and the budget. A step is
+# at least an eighth of the rows compared before: long results occupy all threads, and at most an
+# eighth of the rows is compared in vain.
+RERANK_STEP_ROWS = 8
 
 Scores = NDArray[np.float64]
 
@@ -156,7 +159,8 @@ class ExactReranker:
                 unseen_bound = float(upper_bounds[done])
                 break
             # At least k rows are needed before the floor can rise.
-            end = min(len(rows), max(self.k, done + RERANK_STEP_ROWS), budget.max_rows or len(rows))
+            step = max(RERANK_STEP_ROWS, done // 8)
+            end = min(len(rows), max(self.k, done + step), budget.max_rows or len(rows))
             self.prefetch(rows[done:end])
             self._multiply(rows[done:end], scores[done:end])
             scores[done:end] /= self.norm

@@ -49,7 +49,7 @@ from shared.codes.rotation import Rotation, get_rotation
 from shared.codes.sign_codes import WORD_BITS, Words, encode_signs, level_ends
 
 BOUND_DEVIATIONS = 6.0
-SEED_ROWS = 64  # rows estimated from their whole codes early, to raise the floor
+SEED_ROWS = 64  # rows, or k, estimated from their whole codes early, to raise the floor
 PRUNE_MIN_ROWS = 4 * SEED_ROWS
 
 
@@ -275,8 +275,9 @@ class SignCodeSearch:
 
     def search(self, first: FirstLevelScan, budget: SearchBudget) -> SignCodeResult:
         """Prune rows level by level, then compare the remaining ones exactly."""
+        seeds = max(SEED_ROWS, self._k)
         if self._k < int(first.counts.sum()):  # otherwise there is no k-th score to reach
-            self._raise_floor(first.nearest_rows(max(SEED_ROWS, self._k)))
+            self._raise_floor(first.nearest_rows(seeds))
         rows = np.flatnonzero(first.distances <= self._max_distance(0))
         distances = first.distances[rows].astype(np.int64)
         last = len(self._level_ends) - 1
@@ -285,8 +286,8 @@ class SignCodeSearch:
                 break  # estimating so few rows takes no longer than another level of distances
             self._add_distances(rows, level, distances)
             rows, distances = self._prune(rows, level, distances)
-            if len(rows) > PRUNE_MIN_ROWS:  # a higher floor saves more than it costs
-                nearest = np.argpartition(distances, SEED_ROWS)[:SEED_ROWS]
+            if len(rows) > 4 * seeds:  # a higher floor saves more than it costs
+                nearest = np.argpartition(distances, seeds)[:seeds]
                 self._raise_floor(rows[nearest])
                 rows, distances = self._prune(rows, level, distances)
             if budget.is_exhausted(0):

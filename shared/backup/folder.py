@@ -40,6 +40,7 @@ from shared.storage.keys import (
     INCOMING,
     ORIGINALS,
     OWNER_MARK,
+    PREVIEWS,
     QUERIES,
     TRASH,
     WORK,
@@ -202,7 +203,7 @@ def _unreadable(path: Path, name: str) -> Misconfigured:
 
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
-EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, TRASH, WORK)
+EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH, WORK)
 
 
 def list_backup_objects(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:

@@ -12,8 +12,9 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
 from shared.catalog.generations import Generation, active_generation
+from shared.catalog.maps import Map
 from shared.errors import Conflict
-from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES
+from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES, get_extractor_config
 from shared.ids import new_id
 
 
@@ -53,9 +54,16 @@ class Vocabulary(Journaled, Base):
 
 
 def vocabulary_standing(session: Session, generation: Generation) -> str:
-    """Return the standing of the generation's vocabulary; `none` for an extractor without one."""
+    """Return the standing of the generation's vocabulary; `none` for an extractor without one.
+
+    `pending` if the generation pools because its map's extractor has no vocabulary yet.
+    """
     if generation.vocabulary_id is None:
-        return "none"
+        name = session.get_one(Map, generation.map_id).extractor
+        if generation.extractor == name:
+            return "none"
+        needed = get_extractor_config(name, allow_test_extractors=True).needs_vocabulary
+        return "pending" if needed else "none"
     return session.get_one(Vocabulary, generation.vocabulary_id).standing
 
 

@@ -90,6 +90,11 @@ class ExtractorSettings(BaseSettings):
         ge=1,
         description="photos at which a vocabulary is fitted automatically for a map without one",
     )
+    pool_without_vocabulary: bool = Field(
+        True,
+        description="describe the photos of a map whose extractor is shipped without a vocabulary "
+        "by GeM pooling until the map has one; false: they wait for it",
+    )
     local_features: Literal["recompute", "keep"] = Field(
         "recompute",
         description="local features of compared photos: recompute them each time, or keep them as "

@@ -14,6 +14,8 @@ from shared.config.sizes import Size
 from shared.security.api_keys import Scope
 
 MIN_ADMIN_KEY_CHARACTERS = 16
+OPENSTREETMAP_TILES = "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+OPENSTREETMAP_ATTRIBUTION = "© OpenStreetMap contributors"
 
 
 class GatewaySettings(BaseSettings):
@@ -108,13 +110,14 @@ class GatewaySettings(BaseSettings):
     )
 
     map_tiles: str | None = Field(
-        None,
-        description="URL template of the web page's map tiles: "
-        "https://tile.openstreetmap.org/{z}/{x}/{y}.png; unset: a plain coordinate grid, and the "
-        "page loads nothing from other servers",
+        OPENSTREETMAP_TILES,
+        description="URL template of the streets in the web page's maps, which a browser loads "
+        "once its user has agreed; `off`: the maps have a coordinate grid only",
     )
     map_attribution: str | None = Field(
-        None, description="attribution of MAP_TILES, as their licence requires"
+        None,
+        description="attribution of MAP_TILES, as their licence requires; unset: that of "
+        "OpenStreetMap for its tiles",
     )
 
     # Upload limits.
@@ -246,6 +249,8 @@ class GatewaySettings(BaseSettings):
     @field_validator("map_tiles")
     @classmethod
     def _check_tile_url(cls, value: str | None) -> str | None:
+        if value == "off":
+            return None
         # The host becomes part of the page's Content-Security-Policy: nothing else may follow it.
         if value is not None and not (
             re.fullmatch(r"https?://[A-Za-z0-9.-]+(:\d+)?/[^\s]+", value)
@@ -253,18 +258,25 @@ class GatewaySettings(BaseSettings):
         ):
             raise ValueError(
                 f"{value!r} is not a URL template with {{z}}, {{x}} and {{y}}, such as "
-                "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+                f"{OPENSTREETMAP_TILES}, or off"
             )
         return value
 
     @model_validator(mode="after")
     def _check_map_attribution(self) -> Self:
-        if self.map_tiles is not None and self.map_attribution is None:
+        if self.map_tiles is not None and self.tile_attribution is None:
             raise ValueError(
                 "MAP_TILES needs MAP_ATTRIBUTION, which is shown in the corner of the map: "
-                "© OpenStreetMap contributors"
+                f"{OPENSTREETMAP_ATTRIBUTION}"
             )
         return self
+
+    @property
+    def tile_attribution(self) -> str | None:
+        """The attribution of MAP_TILES."""
+        if self.map_attribution is None and self.map_tiles == OPENSTREETMAP_TILES:
+            return OPENSTREETMAP_ATTRIBUTION
+        return self.map_attribution
 
     @property
     def allowed_origins(self) -> tuple[str, ...]:

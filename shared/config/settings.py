@@ -3,23 +3,34 @@
 The fields are declared in groups, one base class a group, here and in the modules beside this one.
 Each field is an environment variable of the same name in capitals. Names of durations end in
 `_seconds`, names of sizes in `_bytes`, except where AnyLoc's name is kept (`MAX_FILE_SIZE`, in
-bytes). Sizes may have a unit: `100MB`.
+bytes). Sizes may have a unit: `100MB`. `SECRET_SETTINGS` may also be read from files.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, SecretStr, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic.fields import FieldInfo
+from pydantic_settings import (
+    BaseSettings,
+    DotEnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
 
 from shared.config.extractor_settings import ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
 from shared.config.shards import Shard
+from shared.config.sizes import Size
 from shared.config.storage_settings import StorageSettings
+from shared.errors import Misconfigured
+
+# Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.
+SECRET_SETTINGS = ("ADMIN_KEY", "DATABASE_URL", "REDIS_URL", "S3_ACCESS_KEY", "S3_SECRET_KEY")
 
 CGROUP_MEMORY_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
 
@@ -41,11 +52,21 @@ class ServiceSettings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="listening port; 0 picks a free port")
     debug: bool = Field(
         False,
-        description="log every request and every rejected request; responses stay the same",
+        description="log every request and every rejected request, and restart the embedded server "
+        "of a checkout when its code changes; responses stay the same",
     )
     log_format: Literal["text", "json"] = Field(
         "text", description="log format; json writes one JSON object per line"
     )
+    log_file: Path | None = Field(
+        None,
+        description="file of the log of one service, beside stderr; services on one machine need "
+        "different files; unset: stderr only",
+    )
+    log_file_size: Size = Field(
+        10_000_000, gt=0, description="bytes at which LOG_FILE is rotated: renamed to LOG_FILE.1"
+    )
+    log_files: int = Field(5, ge=1, description="rotated log files that are kept")
     metrics_port: int | None = Field(
         None,
         ge=0,
@@ -112,6 +133,42 @@ class JobSettings(BaseSettings):
     )
 
 
+class SecretFilesSource(PydanticBaseSettingsSource):
+    """Reads `SECRET_SETTINGS` from the files that their NAME_FILE variables name."""
+
+    def __init__(self, settings_cls: type[BaseSettings]) -> None:
+        super().__init__(settings_cls)
+        variables = {**DotEnvSettingsSource(settings_cls).env_vars, **os.environ}
+        self._variables = {name.upper(): value for name, value in variables.items()}
+
+    def get_field_value(self, field: FieldInfo, field_name: str) -> tuple[str | None, str, bool]:
+        """Return the text of the file of one setting, or None, the variable's name, and False.
+
+        Raises:
+            Misconfigured: `bad_setting` if the file cannot be read, or the setting is given twice.
+        """
+        name = field_name.upper()
+        variable = f"{name}_FILE"
+        path = self._variables.get(variable)
+        if not path:
+            return None, variable, False
+        if self._variables.get(name):
+            raise Misconfigured("bad_setting", f"{name} and {variable} are both set. Unset one")
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "the file is not UTF-8 text"
+            raise Misconfigured("bad_setting", f"{variable}={path}: {reason}") from None
+        return text.strip(), variable, False
+
+    def __call__(self) -> dict[str, Any]:
+        """Return the settings that are in files, by field name."""
+        names = [name.lower() for name in SECRET_SETTINGS]
+        fields = self.settings_cls.model_fields
+        found = {name: self.get_field_value(fields[name], name)[0] for name in names}
+        return {name: value for name, value in found.items() if value}
+
+
 # The fields of the last base come first: pydantic collects them against the order of resolution.
 class Settings(
     SearchSettings,
@@ -130,6 +187,18 @@ class Settings(
         frozen=True,
         validate_default=True,
     )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Add files with secrets to the sources: arguments, environment, `.env`, files."""
+        return (init_settings, env_settings, dotenv_settings, SecretFilesSource(settings_cls))
 
     @model_validator(mode="after")
     def _check_batch_fits_slot(self) -> Self:

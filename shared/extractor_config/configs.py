@@ -241,6 +241,22 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
     return _apply_options(config, options) if colon else config
 
 
+def pooled_config(config: ExtractorConfig) -> ExtractorConfig:
+    """Return the configuration of a VLAD extractor with GeM pooling instead.
+
+    It has the same local features and preprocessing, and needs no vocabulary.
+    """
+    base, _, options = config.name.partition(":")
+    shared = [
+        option
+        for option in options.split(",")
+        if option.partition("=")[0] in ("facet", "layer", "preprocessing")
+    ]
+    return get_extractor_config(
+        f"{base}:{','.join([*shared, 'aggregator=gem'])}", allow_test_extractors=config.for_tests
+    )
+
+
 def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
     is_default_size = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
     return ExtractorConfig(

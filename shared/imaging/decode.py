@@ -29,8 +29,10 @@ from shared.imaging.file_formats import (
     HEIC_MEDIA_TYPE,
     PHOTO_READ_ERRORS,
     PHOTO_SIGNATURE_BYTES,
+    PREVIEW_PIXELS,
     check_pixel_count,
     detect_media_type,
+    needs_preview,
     open_photo,
 )
 from shared.imaging.photo_header import ROTATED_ORIENTATIONS
@@ -53,16 +55,21 @@ EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright
 
 @dataclass(frozen=True, slots=True)
 class DecodedPhoto:
-    """Preprocessed pixels and thumbnail of a photo."""
+    """Preprocessed pixels, thumbnail and preview of a photo."""
 
     pixels: Pixels
     """(height, width, 3) RGB after preprocessing."""
     thumbnail: bytes
     """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
+    preview: bytes | None = None
+    """The same with PREVIEW_PIXELS; None if not requested, or if the photo needs none
+    (`shared.imaging.file_formats.needs_preview`)."""
 
 
-def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> DecodedPhoto:
-    """Decode and preprocess a photo, and make its upright thumbnail.
+def decode_photo(
+    data: bytes, preprocessing: Preprocessing, max_pixels: int, *, with_preview: bool = False
+) -> DecodedPhoto:
+    """Decode and preprocess a photo, and make its upright thumbnail and preview.
 
     Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
     eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
@@ -72,6 +79,7 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
         data: The file's bytes.
         preprocessing: Resizes the pixels for the backbone.
         max_pixels: Maximum of width x height.
+        with_preview: Whether to make a preview, too, if the photo needs one.
 
     Raises:
         Unprocessable: `undecodable_photo` with the decoder's reason, `too_many_pixels`,
@@ -80,8 +88,10 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
-            with _open_image(data) as image:
+            media_type = detect_media_type(data[:PHOTO_SIGNATURE_BYTES])
+            with _open_image(data, media_type) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
+                with_preview &= needs_preview(media_type, image.width, image.height)
                 if image.width * image.height > FULL_DECODE_PIXELS:
                     # None keeps the mode; other formats than JPEG ignore the call.
                     image.draft(None, (image.width // 2, image.height // 2))
@@ -89,7 +99,9 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
                 as_stored = _to_rgb(image)
                 upright = _apply_exif_orientation(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
-            return DecodedPhoto(pixels=pixels, thumbnail=_thumbnail(upright))
+            thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
+            preview = _small_jpeg(upright, PREVIEW_PIXELS, quality=80) if with_preview else None
+            return DecodedPhoto(pixels, thumbnail, preview)
     except UnidentifiedImageError as error:
         raise Unprocessable(
             "undecodable_photo",
@@ -108,8 +120,8 @@ def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> 
         ) from error
 
 
-def _open_image(data: bytes) -> Image.Image:
-    if detect_media_type(data[:PHOTO_SIGNATURE_BYTES]) != HEIC_MEDIA_TYPE:
+def _open_image(data: bytes, media_type: str | None) -> Image.Image:
+    if media_type != HEIC_MEDIA_TYPE:
         return open_photo(io.BytesIO(data))
     try:
         import pillow_heif  # optional: its wheels include libraries under other licences
@@ -155,13 +167,15 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     return on_black
 
 
-def _thumbnail(rgb: Image.Image) -> bytes:
-    small = rgb.copy()
-    # Averaged over integer blocks first: a fifth of the time, no visible difference at this size.
-    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), reducing_gap=1.0)
+def _small_jpeg(rgb: Image.Image, longer_side: int, *, quality: int) -> bytes:
+    """Encode a copy whose longer side has at most `longer_side` pixels, without any metadata."""
+    scale = min(1.0, longer_side / max(rgb.size))
+    size = max(1, round(rgb.width * scale)), max(1, round(rgb.height * scale))
+    # Averaged over integer blocks first: a fraction of the time, no visible difference.
+    small = rgb.resize(size, Image.Resampling.BICUBIC, reducing_gap=1.0)
     small.info.clear()  # removes the camera's metadata (location, time, owner)
     buffer = io.BytesIO()
-    small.save(buffer, "JPEG", quality=85)
+    small.save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
 
 
@@ -169,11 +183,15 @@ MAX_TRAINING_PIXELS = 100_000_000
 
 
 def decode_resized(
-    path: Path, size: tuple[int, int], max_pixels: int = MAX_TRAINING_PIXELS
+    path: Path,
+    size: tuple[int, int],
+    max_pixels: int = MAX_TRAINING_PIXELS,
+    *,
+    resampling: Image.Resampling = Image.Resampling.BILINEAR,
 ) -> Image.Image:
     """Decode a photo to upright RGB of `size` (height, width), ignoring the aspect ratio.
 
-    The resize is antialiased bilinear.
+    The resize is antialiased.
 
     Raises:
         Unprocessable: `undecodable_photo`, `too_many_pixels`; the message has the reason but not
@@ -188,7 +206,7 @@ def decode_resized(
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
                 upright = _apply_exif_orientation(image, _to_rgb(image))
-            return upright.resize((width, height), Image.Resampling.BILINEAR)
+            return upright.resize((width, height), resampling)
     except UnidentifiedImageError as error:
         raise Unprocessable(
             "undecodable_photo", f"it is not {ACCEPTED_PHOTOS}, or its header is damaged"

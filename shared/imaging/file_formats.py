@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from enum import StrEnum
+from pathlib import PurePosixPath
 from typing import BinaryIO
 
 from PIL import Image
@@ -69,6 +70,12 @@ PHOTO_SIGNATURE_BYTES = 16  # enough to detect every accepted format
 Image.MAX_IMAGE_PIXELS = None
 
 
+def photo_suffix(filename: str) -> str:
+    """Return the lower-case ending of a photo's file name, `.jpg`; empty if it is no photo's."""
+    suffix = PurePosixPath(filename).suffix.lower()
+    return suffix if suffix in PHOTO_SUFFIXES else ""
+
+
 def detect_media_type(first_bytes: bytes) -> str | None:
     """Detect the media type from the first PHOTO_SIGNATURE_BYTES; None if not accepted."""
     if first_bytes.startswith(b"\xff\xd8\xff"):
@@ -85,6 +92,17 @@ def detect_media_type(first_bytes: bytes) -> str | None:
     if first_bytes[4:8] == b"ftyp" and first_bytes[8:12] in HEIC_BRANDS:
         return HEIC_MEDIA_TYPE
     return None
+
+
+# The longer side of a preview. Larger screens scale it up, which a photo of a place survives.
+PREVIEW_PIXELS = 1600
+# Formats that all browsers show.
+BROWSER_MEDIA_TYPES = ("image/jpeg", "image/png", "image/webp")
+
+
+def needs_preview(media_type: str | None, width: int, height: int) -> bool:
+    """Return whether browsers need a preview because the photo is large, or of another format."""
+    return media_type not in BROWSER_MEDIA_TYPES or max(width, height) > PREVIEW_PIXELS
 
 
 def open_photo(file: BinaryIO) -> Image.Image:

@@ -226,7 +226,10 @@ class PhotoHeader:
     heading: float | None = None
     """degrees clockwise from north, in [0, 360)"""
     captured_at: datetime | None = None
-    """UTC"""
+    """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
+    time_zone_is_known: bool = False
+    camera: str | None = None
+    """make, model and serial number"""
 
 
 def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
@@ -277,13 +280,18 @@ def _with_exif(width: int, height: int, exif: Image.Exif) -> PhotoHeader:
     if latitude is None or longitude is None:
         latitude = longitude = None
     heading = _number(gps.get(GPS.GPSImgDirection))
+    details = _directory(exif, IFD.Exif)
+    gps_time = _gps_time(gps)
+    clock, time_zone_is_known = _clock_time(details)
     return PhotoHeader(
         width=width,
         height=height,
         latitude=latitude,
         longitude=longitude,
         heading=heading % 360 if heading is not None else None,
-        captured_at=_captured_at(gps, _directory(exif, IFD.Exif)),
+        captured_at=gps_time or clock,
+        time_zone_is_known=gps_time is not None or time_zone_is_known,
+        camera=_camera(exif, details),
     )
 
 
@@ -343,27 +351,42 @@ def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | No
     return value if abs(value) <= limit else None
 
 
-def _captured_at(gps: dict[int, Any], exif: dict[int, Any]) -> datetime | None:
-    """Return the GPS time, which is UTC; else the camera's clock with its offset (default UTC)."""
-    day, clock = gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)
-    if isinstance(day, str) and isinstance(clock, tuple) and len(clock) == 3:
-        parts = [_number(part) for part in clock]
-        if all(part is not None for part in parts):
-            hours, minutes, seconds = (part or 0.0 for part in parts)
-            try:
-                midnight = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
-                return midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds)
-            except (ValueError, OverflowError):
-                pass  # fall through to the camera's clock
-    taken = exif.get(Base.DateTimeOriginal)
-    offset = exif.get(Base.OffsetTimeOriginal)
-    if not isinstance(taken, str):
+def _camera(exif: Image.Exif, details: dict[int, Any]) -> str | None:
+    try:
+        texts = [exif.get(Base.Make), exif.get(Base.Model), details.get(Base.BodySerialNumber)]
+    except PHOTO_READ_ERRORS:
         return None
+    known = [text.strip("\0 ") for text in texts if isinstance(text, str)]
+    return " ".join(filter(None, known)) or None
+
+
+def _gps_time(gps: dict[int, Any]) -> datetime | None:
+    """Return the GPS time, which is UTC."""
+    day, clock = gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)
+    if not (isinstance(day, str) and isinstance(clock, tuple) and len(clock) == 3):
+        return None
+    parts = [_number(part) for part in clock]
+    if any(part is None for part in parts):
+        return None
+    hours, minutes, seconds = (part or 0.0 for part in parts)
+    try:
+        midnight = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
+        return midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _clock_time(details: dict[int, Any]) -> tuple[datetime | None, bool]:
+    """Return the time of the camera's clock (UTC without an offset), and if it has an offset."""
+    taken = details.get(Base.DateTimeOriginal)
+    offset = details.get(Base.OffsetTimeOriginal)
+    if not isinstance(taken, str):
+        return None, False
     try:
         local = datetime.strptime(taken.strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
         if isinstance(offset, str) and offset.strip("\0 "):
             zone = datetime.fromisoformat(f"2000-01-01T00:00:00{offset.strip(chr(0) + ' ')}").tzinfo
-            return local.replace(tzinfo=zone or UTC).astimezone(UTC)
-        return local
+            return local.replace(tzinfo=zone or UTC).astimezone(UTC), zone is not None
+        return local, False
     except (ValueError, OverflowError):
-        return None
+        return None, False

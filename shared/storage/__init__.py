@@ -10,6 +10,7 @@
 | `checkpoints/<uuid>` | an uploaded checkpoint, until it is added as a model or rejected |
 | `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
 | `thumbnails/<photo>` | a photo's thumbnail, JPEG |
+| `previews/<photo>` | a preview for browsers, JPEG, of a photo that needs one |
 | `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, manifest, sign codes |
 | `journal/<first>-<last>-<uuid>.jsonl.gz` | rows of the catalog (`shared.journal`) |
 | `vocabularies/<uuid>.npy` | VLAD centres |

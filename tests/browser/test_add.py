@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import FilePayload, Page, expect
@@ -58,18 +59,20 @@ def test_each_photo_is_watched_until_it_can_be_found(page: Page, town: Town) -> 
 def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
     page: Page, town: Town
 ) -> None:
-    add(page, photo(1), NO_PHOTO)
+    add(page, NO_PHOTO, photo(1))
     refused = page.locator(".queue-row.failed")
     expect(refused.locator(".queue-name")).to_have_text("notes.jpg")
     expect(refused.locator(".errors")).to_contain_text("JPEG")
     expect(page.locator(".queue-row.done")).to_have_count(1)
     expect(page.locator(".summary .bad")).to_have_text("1 failed")
-    refused.get_by_role("button", name="Try again").click()
-    expect(refused.locator(".errors li")).to_have_count(1)
+    expect(page.locator(".queue-row.done, .queue-row.failed")).to_have_count(2)
+    expect(page.locator(".queue-row").first.locator(".queue-name")).to_have_text("notes.jpg")
+    # The same bytes would be refused again.
+    expect(page.get_by_role("button", name="Try")).to_have_count(0)
 
 
 def test_many_photos_go_as_a_batch_with_counters_and_named_errors(page: Page, town: Town) -> None:
-    page.get_by_text("Say more of the next photos").click()
+    page.get_by_text("Details for these photos").click()
     page.get_by_label("Tags").fill("north, wing")
     add(page, *[photo(number) for number in range(30)], NO_PHOTO)
     expect(page.locator(".queue-row.failed .state")).to_have_text("30 added, 1 failed")
@@ -78,6 +81,32 @@ def test_many_photos_go_as_a_batch_with_counters_and_named_errors(page: Page, to
     name = page.evaluate("localStorage.getItem('placewise-map')")
     found = town.get("/search", map=name, tags="north,wing")
     assert found["total_found"] == 30
+
+
+def test_test_photos_are_measured_with_and_never_found(page: Page, town: Town) -> None:
+    page.get_by_text("Details for these photos").click()
+    page.get_by_label("Use").select_option("Test photos")
+    add(page, photo(1))
+    expect(page.locator(".queue-row.done")).to_have_count(1)
+    name = page.evaluate("localStorage.getItem('placewise-map')")
+    [stored] = town.get("/search", map=name)["images"]
+    assert stored["role"] == "query"
+    page.get_by_role("link", name="See the photos").click()
+    expect(page.locator(".photo-card .corner")).to_have_text("test photo")
+    page.locator(".photo-card a").click()
+    expect(page.locator(".facts")).to_contain_text("no: a test photo")
+
+
+def test_a_photo_of_a_folder_is_named_with_its_path(page: Page, town: Town, tmp_path: Path) -> None:
+    folder = tmp_path / "Italy" / "Day 2"
+    folder.mkdir(parents=True)
+    (folder / "IMG_2078.jpg").write_bytes(photo_bytes(3))
+    page.locator("input[webkitdirectory]").set_input_files(tmp_path / "Italy")
+    expect(page.locator(".queue-row.done .queue-name")).to_have_text("Italy/Day 2/IMG_2078.jpg")
+    page.get_by_role("link", name="See the photos").click()
+    expect(page.locator(".photo-name")).to_have_text("Italy/Day 2/IMG_2078.jpg")
+    page.locator(".photo-card a").click()
+    expect(page.locator("h1")).to_have_text("Italy/Day 2/IMG_2078.jpg")
 
 
 def test_an_archive_goes_as_it_is(page: Page, town: Town) -> None:

@@ -10,7 +10,19 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Town, Visitor
 
-VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track", "add", "model", "status"]
+VIEWS = [
+    "ask",
+    "answer",
+    "compare",
+    "photos",
+    "photo",
+    "tracks",
+    "track",
+    "add",
+    "locate",
+    "model",
+    "status",
+]
 SERIOUS = {"serious", "critical"}
 
 
@@ -87,7 +99,10 @@ def test_a_match_is_reached_by_keyboard_alone(visitor: Visitor, town: Town) -> N
 
 def test_views_are_named_and_marked_as_the_current_one(visitor: Visitor) -> None:
     page = visitor.visit("ask")
-    page.get_by_role("link", name="Model").press("Enter")
+    page.get_by_role("link", name="Advanced").press("Enter")
     expect(page.get_by_role("heading", name="Model", exact=True)).to_be_visible()
     expect(page).to_have_title("Model · riverside · Placewise")
-    expect(page.locator(".tabs [aria-current=page]")).to_have_text("Model")
+    expect(page.locator(".tabs [aria-current=page]")).to_have_text("Advanced")
+    page.get_by_role("link", name="Tracks").press("Enter")
+    expect(page.get_by_role("heading", name="Tracks", exact=True)).to_be_visible()
+    expect(page.locator(".tabs [aria-current=page]")).to_have_text("Advanced")

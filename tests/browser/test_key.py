@@ -1,4 +1,4 @@
-"""A server that wants a key is asked for it by the page."""
+"""The page asks for the key of a server that needs one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def give(page: Page, key: str) -> None:
 
 
 def test_the_key_is_asked_for_once_and_kept_for_the_tab_alone(page: Page) -> None:
-    expect(page.get_by_role("dialog")).to_contain_text("wants a key")
+    expect(page.get_by_role("dialog")).to_contain_text("needs a key")
     give(page, "x" * 20)
     expect(page.get_by_role("dialog")).to_contain_text("does not know this key")
     give(page, KEY)
@@ -48,3 +48,14 @@ def test_the_key_is_asked_for_once_and_kept_for_the_tab_alone(page: Page) -> Non
     page.reload()
     expect(page.get_by_role("heading", name="Where was this taken?")).to_be_visible()
     expect(page.get_by_role("dialog")).to_have_count(0)
+
+
+def test_the_key_is_remembered_on_this_device_until_it_is_forgotten(page: Page) -> None:
+    page.get_by_label("Remember the key on this device").check()
+    give(page, KEY)
+    expect(page.get_by_role("heading", name="Where was this taken?")).to_be_visible()
+    another_tab = page.context.new_page()
+    another_tab.goto(page.url + "#/status")
+    another_tab.get_by_role("button", name="Forget the key").click()
+    expect(another_tab.get_by_role("dialog")).to_contain_text("needs a key")
+    assert KEY not in another_tab.evaluate("JSON.stringify([localStorage, sessionStorage])")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from playwright.sync_api import expect
+import re
+
+from playwright.sync_api import Route, expect
 
 from tests.browser.conftest import MAP, Town, Visitor
 
@@ -48,6 +50,24 @@ def test_the_state_of_things_is_told(visitor: Visitor, town: Town) -> None:
     photos = town.get("/database/stats")["total_images"]
     expect(page.locator(".tile").first).to_contain_text(str(photos))
     expect(page.get_by_role("heading", name="Newest jobs")).to_be_visible()
+    expect(page.locator("time").first).to_contain_text(re.compile("just now|ago"))
+
+
+def test_a_phone_gets_the_address_as_a_code_where_it_can_reach_the_server(
+    visitor: Visitor,
+) -> None:
+    page = visitor.visit("status")
+    expect(page.get_by_text("make run HOST=0.0.0.0")).to_be_visible()
+
+    def on_a_network(route: Route) -> None:
+        settings = route.fetch().json()
+        route.fulfill(json={**settings, "lan_url": "http://192.168.1.23:8000"})
+
+    page.route("**/console/settings.json", on_a_network)
+    page = visitor.visit("status")
+    expect(page.get_by_role("link", name="http://192.168.1.23:8000")).to_be_visible()
+    code = page.get_by_alt_text("QR code of http://192.168.1.23:8000")
+    assert code.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 100
 
 
 def test_a_new_map_is_made_and_chosen(visitor: Visitor, town: Town) -> None:

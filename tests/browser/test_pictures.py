@@ -70,7 +70,7 @@ def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> Non
     page.keyboard.press("Escape")
     page = visitor.visit("photos")
     page.get_by_text("More filters").click()
-    page.get_by_label("Role").select_option("database")
+    page.get_by_label("Use").select_option("database")
     page.get_by_text("More filters").click()
     page.get_by_role("button", name="Show the map").click()
     expect(page.locator("path.point").first).to_be_attached()

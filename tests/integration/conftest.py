@@ -34,9 +34,9 @@ class LentDecoders:
         self._pool = pool
 
     def decode(
-        self, photos: Sequence[bytes], preprocessing: Preprocessing
+        self, photos: Sequence[bytes], preprocessing: Preprocessing, *, with_previews: bool = False
     ) -> list[DecodedPhoto | PlacewiseError]:
-        return self._pool.decode(photos, preprocessing)
+        return self._pool.decode(photos, preprocessing, with_previews=with_previews)
 
     def close(self) -> None:
         pass

@@ -87,7 +87,8 @@ class MapResponse(ResponseModel):
     counted_at: datetime = Field(description="when the three counts above were computed")
     generation_id: UUID | None
     vocabulary: str | None = Field(
-        description="`own`, `provisional`, `foreign` or `none`; null before the first photo"
+        description="`own`, `provisional`, `foreign`, `pending` or `none`; null before the first "
+        "photo"
     )
     dimension: int | None = Field(
         description="dimension of its descriptors; null before the first photo"

@@ -1,4 +1,4 @@
-"""Routes of stored photos: read, update, delete, image, thumbnail and metadata search."""
+"""Routes of stored photos: read, update, delete, images and metadata search."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from urllib.parse import quote
 from uuid import UUID
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import Field
 from sqlalchemy.orm import Session
 
+from services.gateway.admission import AdmissionControl, AdmissionDep
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import (
     NO_NUL_PATTERN,
     FileId,
+    GatewayContext,
     GatewayDep,
     MapQuery,
     PageParams,
@@ -27,10 +29,13 @@ from services.gateway.dependencies import (
 )
 from services.gateway.schemas import (
     DeletedPhotoResponse,
+    JobAcceptedResponse,
     MetadataSearchResponse,
     PhotoDetailResponse,
     PhotoResponse,
     RequestModel,
+    accepted_headers,
+    to_job_accepted,
 )
 from services.gateway.similarity.search_params import (
     FilterParams,
@@ -39,10 +44,12 @@ from services.gateway.similarity.search_params import (
 )
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
+from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
+from shared.imaging.file_formats import needs_preview
 from shared.ingest.photo_metadata import (
     check_coordinate_pair,
     check_metadata,
@@ -50,9 +57,9 @@ from shared.ingest.photo_metadata import (
     parse_tags,
     parse_time,
 )
-from shared.jobs import Job
-from shared.jobs.transitions import cancel_jobs
-from shared.storage.keys import thumbnail_key
+from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs.transitions import cancel_jobs, requeue_job
+from shared.storage.keys import preview_key, thumbnail_key
 
 router = APIRouter(tags=["photos"])
 
@@ -151,6 +158,10 @@ def read_image(request: Request, gateway: GatewayDep, file_id: FileId, query: Ma
     """Get the original bytes of a photo."""
     with gateway.catalog.read() as session:
         photo = get_photo(session, get_map(session, query.map).id, file_id)
+    return _original_response(request, gateway, photo)
+
+
+def _original_response(request: Request, gateway: GatewayContext, photo: Photo) -> Response:
     etag = f'"{photo.sha256}"'
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers={"ETag": etag})
@@ -185,6 +196,90 @@ def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Res
             "The photo has no thumbnail yet, because it has not been described.",
         ) from None
     return Response(data, media_type="image/jpeg")
+
+
+@router.get(
+    "/uploads/{file_id}/preview",
+    operation_id="get_preview",
+    response_class=Response,
+    responses={
+        **IMAGE_RESPONSE,
+        202: {
+            "model": JobAcceptedResponse,
+            "description": "The preview does not exist yet; this job makes it.",
+        },
+    },
+    dependencies=[READ],
+)
+def read_preview(
+    request: Request,
+    gateway: GatewayDep,
+    admission: AdmissionDep,
+    file_id: FileId,
+    query: MapQuery,
+) -> Response:
+    """Get a photo as browsers show it: an upright JPEG of at most 1,600 pixels without metadata.
+
+    The preview is made when the photo is described. If it does not exist, the photo's job is
+    queued again, and the response is 202. A JPEG, PNG or WebP photo of at most 1,600 pixels has no
+    preview: the response is the original.
+    """
+    with gateway.catalog.read() as session:
+        photo = get_photo(session, get_map(session, query.map).id, file_id)
+    if not needs_preview(photo.media_type, photo.width, photo.height):
+        return _original_response(request, gateway, photo)
+    headers = {"ETag": f'"{photo.sha256}-preview"', "Cache-Control": "private, no-cache"}
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    try:
+        data = gateway.store.get(preview_key(photo.id))
+    except NotFound:
+        job = gateway.catalog.run(
+            lambda session: _queue_preview(session, admission, photo, query.map)
+        )
+        gateway.wakeups.send()
+        accepted = to_job_accepted(job, query.map)
+        return JSONResponse(
+            accepted.model_dump(mode="json"), 202, accepted_headers(accepted.status_url)
+        )
+    return Response(data, media_type="image/jpeg", headers=headers)
+
+
+def _queue_preview(
+    session: Session, admission: AdmissionControl, photo: Photo, map_name: str
+) -> Job:
+    """Return the photo's job, queued again unless it is unfinished.
+
+    Describing a photo again makes its preview; its stored descriptor is unchanged.
+
+    Raises:
+        NotFound: `preview_not_found` if the photo can't be described.
+        TooManyRequests: `queue_full`.
+    """
+    job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
+    if job is not None and job.state in UNFINISHED_STATES:
+        return job
+    if job is not None and job.state != JobState.SUCCEEDED:
+        reason = job.error["detail"] if job.error else f"Its job is {job.state}."
+        raise NotFound(
+            "preview_not_found",
+            f"The photo has no preview, because it has not been described. {reason}",
+        )
+    admission.admit_job(map_name)
+    if job is None:  # deleted, or lost with the catalog
+        job = Job(
+            map_id=photo.map_id,
+            kind=JobKind.INDEX,
+            priority=Priority.UPLOAD,
+            photo_id=photo.id,
+        )
+        session.add(job)
+        session.flush()
+        get_photo(session, photo.map_id, photo.id).job_id = job.id
+    else:
+        requeue_job(job)
+        session.flush()
+    return job
 
 
 class MetadataSearchParams(FilterParams, PageParams):

@@ -30,10 +30,10 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
 from shared.storage.keys import (
     ORIGINALS,
+    derived_image_keys,
     incoming_key,
     local_features_prefix,
     query_object_keys,
-    thumbnail_key,
 )
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,8 @@ def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     for photo in photos:
         if photo.object_key:  # empty: its objects were deleted with the photo
             store.delete(photo.object_key)
-        store.delete(thumbnail_key(photo.id))
+        for key in derived_image_keys(photo.id):
+            store.delete(key)
     ids = [photo.id for photo in photos]
     if ids:
         with catalog.write() as session:

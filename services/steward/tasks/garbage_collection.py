@@ -14,6 +14,10 @@ from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
+from services.steward.tasks.model_changes import (
+    adopt_failed_reindex_jobs,
+    delete_done_reindex_jobs,
+)
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
@@ -36,11 +40,11 @@ from shared.storage.keys import (
     ARCHIVES,
     CHECKPOINTS,
     WORK,
+    derived_image_keys,
     incoming_key,
     local_features_key,
     local_features_prefix,
     query_object_keys,
-    thumbnail_key,
 )
 
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
@@ -130,9 +134,9 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Delete the objects of deleted photos at once, and their rows after `grace_seconds`.
 
-    The objects (original, thumbnail, local features) go as soon as the journal has recorded the
-    deletion. After the grace period every search worker has seen the deletion and compaction has
-    dropped the descriptors.
+    The objects (original, thumbnail, preview, local features) go as soon as the journal has
+    recorded the deletion. After the grace period every search worker has seen the deletion and
+    compaction has dropped the descriptors.
     """
     journal_deletions(catalog, store, Photo)
     with catalog.read() as session:
@@ -146,7 +150,8 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
         generation_ids = _generations_with_chunks(session, {photo.map_id for photo in photos})
     for photo in photos:
         store.delete(photo.object_key)
-        store.delete(thumbnail_key(photo.id))
+        for key in derived_image_keys(photo.id):
+            store.delete(key)
         for generation_id in generation_ids[photo.map_id]:
             store.delete(local_features_key(generation_id, photo.id))
     photo_ids = [photo.id for photo in photos]
@@ -282,7 +287,9 @@ def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: J
 
 
 def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
-    """Run every collection of this module once."""
+    """Run every collection of this module once, and complete the switch to new generations."""
+    adopt_failed_reindex_jobs(catalog)
+    delete_done_reindex_jobs(catalog)
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)
     collect_whitenings(catalog, store, settings.retired_grace_seconds)

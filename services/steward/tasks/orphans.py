@@ -40,15 +40,16 @@ from shared.storage.keys import (
     INCOMING,
     MODELS,
     ORIGINALS,
+    PREVIEWS,
     QUERIES,
     THUMBNAILS,
     VOCABULARIES,
     WHITENINGS,
+    derived_image_keys,
     incoming_key,
     is_original_key,
     local_features_key,
     query_object_keys,
-    thumbnail_key,
 )
 from shared.storage.protocol import ObjectInfo
 from shared.storage.trash import (
@@ -269,12 +270,12 @@ def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
     return [incoming_key(upload_id) for upload_id in waiting]
 
 
-def _referenced_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
-    photo_ids = _parse_uuids(key.removeprefix(THUMBNAILS).removesuffix(".jpg") for key in keys)
+def _referenced_derived_images(session: Session, keys: list[str]) -> Iterable[str]:
+    photo_ids = _parse_uuids(key.rpartition("/")[2].removesuffix(".jpg") for key in keys)
     live = session.scalars(
         select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
     )
-    return [thumbnail_key(photo_id) for photo_id in live]
+    return [key for photo_id in live for key in derived_image_keys(photo_id)]
 
 
 def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:
@@ -340,7 +341,8 @@ REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] =
     CHECKPOINTS: _referenced_by_unfinished_jobs(JobKind.ADD_MODEL),
     MODELS: _referenced_models,
     ORIGINALS: _referenced_originals,
-    THUMBNAILS: _referenced_thumbnails,
+    THUMBNAILS: _referenced_derived_images,
+    PREVIEWS: _referenced_derived_images,
     "chunks/": _referenced_chunks,
     VOCABULARIES: _referenced_vocabularies,
     WHITENINGS: _referenced_whitenings,

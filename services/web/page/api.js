@@ -18,6 +18,11 @@ export class Problem extends Error {
   }
 }
 
+const REFUSALS = [400, 403, 413, 415, 422];
+
+/** Whether the same request, or a job with this error, may succeed when it is repeated. */
+export const maySucceed = ({ status, code }) => code === "no_heic_decoder" || !(REFUSALS.includes(status) || code === "photo_differs");
+
 export const currentMap = () => localStorage.getItem(MAP) ?? "default";
 export const chooseMap = (name) => localStorage.setItem(MAP, name);
 
@@ -37,8 +42,17 @@ function address(path, query) {
   return url;
 }
 
+const knownKey = () => sessionStorage.getItem(KEY) ?? localStorage.getItem(KEY);
+export const hasKey = () => knownKey() !== null;
+
+/** Forget the key, in this tab and on this device. */
+export function forgetKey() {
+  sessionStorage.removeItem(KEY);
+  localStorage.removeItem(KEY);
+}
+
 function headersOf(more) {
-  const key = sessionStorage.getItem(KEY);
+  const key = knownKey();
   return { ...(key ? { Authorization: `Bearer ${key}` } : {}), ...more };
 }
 
@@ -48,15 +62,18 @@ let asking = null;
 function askForKey(problem) {
   asking ??= (async () => {
     const input = h("input", { type: "password", autocomplete: "current-password", required: true, name: "key" });
-    const known = sessionStorage.getItem(KEY) !== null;
+    const remember = h("input", { type: "checkbox" });
+    const known = knownKey() !== null;
     const form = h("form", { method: "dialog" },
-      h("p", {}, known ? "The server does not know this key." : "This server wants a key for every call. It was shown at the first start, or set with ADMIN_KEY."),
-      field("Key", input, "Kept until this tab is closed."),
+      h("p", {}, known ? "The server does not know this key." : "This server needs a key for every call. It was shown at the first start, or set with ADMIN_KEY."),
+      field("Key", input, "Kept until this tab is closed, unless you remember it."),
+      h("label", { class: "check" }, remember, h("span", {}, "Remember the key on this device")),
       h("div", { class: "row end" }, h("button", { class: "primary", value: "yes" }, "Go on")));
     const answer = await openDialog("The server's key", form).closed;
     asking = null;
     if (answer !== "yes") throw problem;
-    sessionStorage.setItem(KEY, input.value.trim());
+    forgetKey();
+    (remember.checked ? localStorage : sessionStorage).setItem(KEY, input.value.trim());
   })();
   return asking;
 }

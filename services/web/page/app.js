@@ -4,16 +4,18 @@ import { chooseMap, currentMap, get, post } from "./api.js";
 import { field, fill, h, noteError, openDialog } from "./dom.js";
 import { showAsk } from "./views/ask.js";
 
-// The first view comes with the page; the others when they are wanted.
+// The first view comes with the page; the others are loaded on demand.
 const VIEWS = {
   ask: { title: "Ask", show: showAsk },
   photos: { title: "Photos", show: async (...view) => (await import("./views/photos.js")).showPhotos(...view) },
   photo: { title: "Photo", show: async (...view) => (await import("./views/photo.js")).showPhoto(...view) },
   tracks: { title: "Tracks", show: async (...view) => (await import("./views/tracks.js")).showTracks(...view) },
   add: { title: "Add", show: async (...view) => (await import("./views/add.js")).showAdd(...view) },
+  locate: { title: "Locate a folder", show: async (...view) => (await import("./views/locate.js")).showLocate(...view) },
   model: { title: "Model", show: async (...view) => (await import("./views/model.js")).showModel(...view) },
   status: { title: "Status", show: async (...view) => (await import("./views/status.js")).showStatus(...view) },
 };
+const TAB_OF = { locate: "add", photo: "photos", tracks: "model" };
 const NEW_MAP = "\n"; // no map's name
 
 const main = document.getElementById("main");
@@ -30,7 +32,7 @@ async function route() {
   const view = VIEWS[name] ?? VIEWS.ask;
   document.title = `${view.title} · ${currentMap()} · Placewise`;
   for (const link of document.querySelectorAll(".tabs a")) {
-    const here = link.hash === `#/${name === "photo" ? "photos" : name}`;
+    const here = link.hash === `#/${TAB_OF[name] ?? name}`;
     link.toggleAttribute("aria-current", here);
     if (here) link.setAttribute("aria-current", "page");
   }

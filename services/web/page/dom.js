@@ -1,5 +1,7 @@
 // Elements without a framework: h("p", { class: "soft" }, "text", child).
 
+import { ago, when } from "./format.js";
+
 /** An element. `on...` are listeners, true and false are attributes with no value; a null is left out. */
 export function h(name, attributes = {}, ...children) {
   const element = document.createElement(name);
@@ -12,6 +14,9 @@ export function h(name, attributes = {}, ...children) {
   element.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
   return element;
 }
+
+/** A time as people say it; the exact one as its title. */
+export const time = (text) => h("time", { datetime: text, title: when(text) }, ago(text));
 
 /** Put these in the place of all that is in the element. */
 export function fill(element, ...children) {
@@ -38,6 +43,12 @@ export function button(label, onclick, kind = "") {
 }
 
 let hints = 0;
+
+/** The views below *Advanced*, above each of them. */
+export function advancedTabs(current) {
+  const link = (view, title) => h("a", { href: `#/${view}`, class: "button", "aria-current": view === current ? "page" : null }, title);
+  return h("nav", { class: "row subtabs", "aria-label": "Advanced" }, link("model", "Model"), link("tracks", "Tracks"));
+}
 
 /** A field with its label; the hint is no part of its name. */
 export function field(label, input, hint = null) {
@@ -87,14 +98,14 @@ export function openDialog(title, ...content) {
   return { dialog, heading, closed };
 }
 
-/** Ask before something that can't be undone; true when it is wanted. */
-export async function confirmed(title, text, action) {
+/** Ask before `action`, a button of the style `kind`; true when it is chosen. */
+export async function confirmed(title, text, action, { kind = "danger", otherwise = "Keep" } = {}) {
   const { dialog, closed } = openDialog(
     title,
     h("p", {}, text),
     h("div", { class: "row end" },
-      h("button", { type: "button", onclick: () => dialog.close("") }, "Keep"),
-      h("button", { type: "button", class: "danger", onclick: () => dialog.close("yes") }, action)),
+      h("button", { type: "button", onclick: () => dialog.close("") }, otherwise),
+      h("button", { type: "button", class: kind, onclick: () => dialog.close("yes") }, action)),
   );
   return (await closed) === "yes";
 }

@@ -5,6 +5,14 @@ export const plural = (number, noun) => `${count(number)} ${noun}${number === 1 
 export const percent = (share) => (share === null || share === undefined ? "–" : `${(100 * share).toFixed(1)} %`);
 export const score = (cosine) => cosine.toFixed(3);
 
+const STRENGTHS = [[0.8, "strong"], [0.3, "fair"], [0, "weak"]];
+
+/** A match in one word, by the probability that it shows the same place; null where none is known. */
+export const strength = (probability) => (probability === null ? null : STRENGTHS.find(([least]) => probability >= least)[1]);
+
+/** A photo's name, with its folders if it was uploaded with them. */
+export const nameOf = (photo) => photo.relative_path ?? photo.original_filename;
+
 export function bytes(number) {
   const units = ["B", "kB", "MB", "GB", "TB"];
   const power = number < 1000 ? 0 : Math.min(units.length - 1, Math.floor(Math.log10(number) / 3));
@@ -20,6 +28,16 @@ export const degrees = (latitude, longitude) => `${latitude.toFixed(5)}, ${longi
 /** Local time, short. */
 export function when(text) {
   return new Date(text).toLocaleString("en-GB", { year: "numeric", month: "short", day: "numeric", hour: "2-digit", minute: "2-digit" });
+}
+
+/** How long ago, or the date after a week. */
+export function ago(text) {
+  const seconds = (Date.now() - new Date(text)) / 1000;
+  if (seconds < 45) return "just now";
+  if (seconds < 5400) return `${Math.max(1, Math.round(seconds / 60))} min ago`;
+  if (seconds < 129600) return `${Math.round(seconds / 3600)} h ago`;
+  if (seconds < 604800) return `${Math.round(seconds / 86400)} days ago`;
+  return new Date(text).toLocaleDateString("en-GB", { year: "numeric", month: "short", day: "numeric" });
 }
 
 export function duration(seconds) {

@@ -1,7 +1,9 @@
-// The map: Leaflet, with the tiles of MAP_TILES or else a graticule.
+// The map: Leaflet with a graticule, or with streets once the visitor has agreed to load them.
 
-import { h } from "./dom.js";
+import { confirmed, h, noteError } from "./dom.js";
 import { serverSettings } from "./settings.js";
+
+const STREETS = "placewise-streets"; // the origin of the tiles that this device may load
 
 const MOST_ZOOM = 21;
 const LINES = 9; // about so many across the map
@@ -9,7 +11,7 @@ const POINTS_DRAWN = 5000;
 
 let loaded = null;
 
-/** Leaflet and what the server says of tiles; loaded when the first map is wanted. */
+/** Leaflet, and the settings of the tiles; loaded with the first map. */
 function load() {
   loaded ??= Promise.all([
     new Promise((resolve, reject) => {
@@ -61,7 +63,6 @@ export async function openMap(element, label, { onpick = null, signal } = {}) {
   element.setAttribute("aria-label", label);
   const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
   const map = L.map(element, {
-    attributionControl: Boolean(settings.map_tiles),
     fadeAnimation: !still,
     zoomAnimation: !still,
     markerZoomAnimation: !still,
@@ -78,13 +79,8 @@ export async function openMap(element, label, { onpick = null, signal } = {}) {
   // Where no label of the graticule lies.
   L.control.zoom({ position: "bottomright" }).addTo(map);
   L.control.scale({ imperial: false }).addTo(map);
-  if (settings.map_tiles) {
-    map.attributionControl.setPrefix("");
-    L.tileLayer(settings.map_tiles, { attribution: escaped(settings.map_attribution), maxZoom: MOST_ZOOM, maxNativeZoom: 19 }).addTo(map);
-  } else {
-    const lines = L.layerGroup().addTo(map);
-    map.on("moveend resize", () => drawGraticule(map, lines));
-  }
+  map.attributionControl.setPrefix("");
+  addGround(map, element, settings);
   // The wheel scrolls the page until the map was asked for.
   map.on("focus click", () => map.scrollWheelZoom.enable());
   map.on("blur mouseout", () => map.scrollWheelZoom.disable());
@@ -106,6 +102,56 @@ export async function openMap(element, label, { onpick = null, signal } = {}) {
   }
   return new PlaceMap(map, things);
 }
+
+/** The graticule, or streets; with a button that changes between them, if the server names tiles. */
+function addGround(map, element, settings) {
+  const lines = L.layerGroup().addTo(map);
+  const drawLines = () => drawGraticule(map, lines);
+  map.on("moveend resize", drawLines);
+  if (!settings.map_tiles) return;
+  const { origin } = new URL(settings.map_tiles, location.href);
+  const tiles = L.tileLayer(settings.map_tiles, { attribution: escaped(settings.map_attribution), className: "streets", maxZoom: MOST_ZOOM, maxNativeZoom: 19 });
+  const allowed = () => origin === location.origin || localStorage.getItem(STREETS) === origin;
+  const toggle = h("button", { type: "button", class: "streets-button", "aria-pressed": "false" }, "Streets");
+  const show = (shown) => {
+    toggle.setAttribute("aria-pressed", String(shown));
+    if (shown) {
+      map.off("moveend resize", drawLines);
+      lines.clearLayers();
+      tiles.addTo(map);
+    } else {
+      tiles.remove();
+      map.on("moveend resize", drawLines);
+      if (map.getSize().x) drawLines();
+    }
+  };
+  toggle.addEventListener("click", async () => {
+    try {
+      if (map.hasLayer(tiles)) {
+        localStorage.removeItem(STREETS);
+        show(false);
+      } else if (allowed() || await mayLoad(origin)) {
+        localStorage.setItem(STREETS, origin);
+        show(true);
+      }
+    } catch (error) {
+      noteError(error);
+    }
+  });
+  const control = L.control({ position: "topright" });
+  control.onAdd = () => {
+    L.DomEvent.disableClickPropagation(toggle);
+    return toggle;
+  };
+  control.addTo(map);
+  element.classList.add("has-streets");
+  if (allowed()) show(true);
+}
+
+/** Ask before the browser loads anything from another server. */
+const mayLoad = (origin) => confirmed("Show streets?",
+  `Your browser then loads the street map from ${new URL(origin).host}. That server sees your network address and which area you look at; it does not see your photos. Until you agree, this page loads nothing from other servers.`,
+  "Load streets", { kind: "primary", otherwise: "Not now" });
 
 class PlaceMap {
   constructor(map, things) {

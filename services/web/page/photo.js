@@ -1,9 +1,12 @@
 // Photos of the server as pictures. They are fetched, because an <img> can't send a key.
 
-import { Problem, ask } from "./api.js";
-import { h } from "./dom.js";
+import { ask, get } from "./api.js";
+import { h, noteError } from "./dom.js";
+import { nameOf } from "./format.js";
+import { hasEnded } from "./jobs.js";
 
 const AT_ONCE = 6;
+const JOB_WAIT_SECONDS = 10;
 const waiting = [];
 let loading = 0;
 
@@ -29,25 +32,47 @@ function next() {
 }
 
 async function show(image) {
+  const { url, original, waited } = image.dataset;
   try {
-    let response;
-    try {
-      response = await ask(image.dataset.url);
-    } catch (error) {
-      // Until it is described, a photo has no thumbnail.
-      if (!(error instanceof Problem) || error.code !== "thumbnail_not_found") throw error;
-      response = await ask(image.dataset.url.replace("/thumbnail", "/image"));
+    const response = await ask(url).catch((error) => {
+      // Until it is described, a photo has no thumbnail; one that can't be described has neither.
+      if (["thumbnail_not_found", "preview_not_found"].includes(error.code)) return ask(original);
+      throw error;
+    });
+    if (response.status !== 202) {
+      await draw(image, response);
+      return;
     }
-    const url = URL.createObjectURL(await response.blob());
-    try {
-      image.src = url;
-      await image.decode();
-    } finally {
-      URL.revokeObjectURL(url);
-    }
+    // Until the preview is made, the original is shown, where the browser can.
+    const { job_id: jobId } = await response.json();
+    await draw(image, await ask(original)).finally(() => waited || showWhenMade(image, jobId).catch(noteError));
   } catch {
     image.classList.add("missing");
     image.alt = `${image.alt} (can't be loaded)`;
+  }
+}
+
+/** Show the picture again when the job has ended that makes it, unless the view was left. */
+async function showWhenMade(image, jobId) {
+  image.dataset.waited = true; // once
+  const { alt } = image;
+  while (image.isConnected) {
+    if (!hasEnded(await get(`/jobs/${jobId}`, { query: { wait: JOB_WAIT_SECONDS } }))) continue;
+    image.classList.remove("missing");
+    image.alt = alt;
+    waiting.push(image);
+    next();
+    return;
+  }
+}
+
+async function draw(image, response) {
+  const url = URL.createObjectURL(await response.blob());
+  try {
+    image.src = url;
+    await image.decode();
+  } finally {
+    URL.revokeObjectURL(url);
   }
 }
 
@@ -55,13 +80,26 @@ async function show(image) {
 const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 
 function picture(url, photo, alt) {
-  const image = h("img", { src: NOTHING, alt, "data-url": url, width: photo.width, height: photo.height });
+  const image = h("img", { src: NOTHING, alt, "data-url": url, "data-original": photo.image_url, width: photo.width, height: photo.height });
   inSight.observe(image);
   return image;
 }
 
 /** The thumbnail, loaded when it comes into sight. */
-export const thumbnail = (photo, alt = photo.original_filename) => picture(photo.thumbnail_url, photo, alt);
+export const thumbnail = (photo, alt = nameOf(photo)) => picture(photo.thumbnail_url, photo, alt);
 
-/** The photo itself. */
-export const original = (photo, alt = photo.original_filename) => picture(photo.image_url, photo, alt);
+/** The photo at the size of a screen. */
+export const preview = (photo, alt = nameOf(photo)) => picture(photo.preview_url, photo, alt);
+
+/** A file of this machine; where the browser can't show its format, as it can't HEIC, a drawing in its place. */
+export function localPicture(file, attributes) {
+  const url = URL.createObjectURL(file);
+  const image = h("img", { src: url, ...attributes });
+  image.addEventListener("load", () => URL.revokeObjectURL(url));
+  image.addEventListener("error", () => {
+    URL.revokeObjectURL(url);
+    image.src = "/console/unshown.svg";
+    image.title = "This browser can’t show photos of this format.";
+  }, { once: true });
+  return image;
+}

@@ -1,6 +1,6 @@
 // What is being added: a few uploads at a time, each with its job, many photos as batches.
 
-import { Problem, currentMap, get, idempotencyKey, post, send } from "./api.js";
+import { Problem, currentMap, get, idempotencyKey, maySucceed, post, send } from "./api.js";
 import { count, plural } from "./format.js";
 import { stateInWords, watchJob } from "./jobs.js";
 
@@ -35,6 +35,8 @@ class Entry {
     this.errors = [];
     this.hold = null;
     this.again = false;
+    /** Whether what failed may succeed when it is repeated. */
+    this.canRetry = false;
   }
 
   set(changes) {
@@ -60,7 +62,7 @@ class Entry {
     try {
       await this.work();
     } catch (error) {
-      this.set({ phase: "failed", failed: this.total - this.done, errors: [...this.errors, { name: "", detail: error.message }] });
+      this.set({ phase: "failed", failed: this.total - this.done, canRetry: maySucceed(error), errors: [...this.errors, { name: "", detail: error.message }] });
     }
   }
 
@@ -68,13 +70,14 @@ class Entry {
     return watchJob(id, (job) => this.set({ job, phase: "working", done: job.progress.done, failed: job.progress.failed, total: Math.max(job.progress.total, this.total) }), undefined, { map: this.map });
   }
 
-  canRetry() {
-    return this.phase === "failed";
-  }
-
   async retry() {
     this.begin();
     this.queue.start();
+  }
+
+  /** Failures that are not listed: the server's list of them is cut. */
+  get unlisted() {
+    return this.phase === "failed" && this.errors.length >= ERRORS_SHOWN ? this.failed - this.errors.length : 0;
   }
 
   words() {
@@ -99,6 +102,7 @@ class PhotoEntry extends Entry {
   async work() {
     const form = new FormData();
     // Fields first: the server reads the form as it comes.
+    if (this.name.includes("/")) form.append("relative_path", this.name);
     for (const [name, value] of Object.entries(this.fields)) form.append(name, Array.isArray(value) ? value.join(",") : value);
     form.append("file", this.picture, this.picture.name);
     const stored = await this.sendForm("/upload", form);
@@ -106,7 +110,7 @@ class PhotoEntry extends Entry {
     if (stored.job_id && stored.status !== "succeeded") {
       this.set({ phase: "working" });
       const job = await this.watch(stored.job_id);
-      if (job.state !== "succeeded") throw new Error(job.error?.detail ?? `The job is ${job.state}.`);
+      if (job.state !== "succeeded") throw new Problem(job.error?.status, job.error ?? { detail: `The job is ${job.state}.` }, null);
     }
     this.set({ phase: "done", done: 1, failed: 0 });
   }
@@ -133,13 +137,14 @@ class BatchEntry extends Entry {
     const job = await this.watch(this.batch);
     const { done, failed, total } = job.progress;
     const errors = failed ? await this.#failedItems() : [];
-    if (job.state !== "succeeded" && job.error && !errors.length) errors.push({ name: "", detail: job.error.detail });
-    this.set({ phase: failed || job.state !== "succeeded" ? "failed" : "done", done, failed: job.state === "succeeded" ? failed : Math.max(total, this.total) - done, errors });
+    if (job.state !== "succeeded" && job.error && !errors.length) errors.push({ ...job.error, name: "" });
+    const canRetry = job.state === "cancelled" || failed > errors.length || errors.some(maySucceed);
+    this.set({ phase: failed || job.state !== "succeeded" ? "failed" : "done", done, failed: job.state === "succeeded" ? failed : Math.max(total, this.total) - done, canRetry, errors });
   }
 
   async #failedItems() {
     const { items } = await get(`/jobs/${this.batch}/items`, { query: { map: this.map, state: "failed", limit: ERRORS_SHOWN } });
-    return items.map((item) => ({ name: item.name, detail: item.error?.detail ?? "not known why" }));
+    return items.map((item) => ({ detail: "not known why", ...item.error, name: item.name }));
   }
 
   /** The server has the bytes of what it took: only what has failed is done again. */
@@ -235,7 +240,7 @@ export class UploadQueue {
   }
 
   retryable() {
-    return this.entries.filter((entry) => entry.canRetry());
+    return this.entries.filter((entry) => entry.canRetry);
   }
 
   async retryAll() {

@@ -25,6 +25,7 @@ from shared.jobs import Job, JobKind, JobState
 from shared.storage import FolderStore
 from shared.storage.keys import (
     job_work_key,
+    preview_key,
     query_key,
     query_vector_key,
     thumbnail_key,
@@ -95,9 +96,11 @@ def test_a_deleted_photos_bytes_go_at_once_and_its_row_after_the_grace(chunk_map
     add_chunk(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, [photo_id, stays])
     for each in (photo_id, stays):
         chunk_map.store.put(thumbnail_key(each), b"small")
+        chunk_map.store.put(preview_key(each), b"larger")
     chunk_map.delete(photo_id)
     collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
     assert chunk_map.objects("thumbnails/") == {thumbnail_key(stays)}
+    assert chunk_map.objects("previews/") == {preview_key(stays)}
     with chunk_map.catalog.read() as session:
         assert chunk_map.objects("originals/") == {
             get_photo(session, chunk_map.map_id, stays).object_key

@@ -26,6 +26,7 @@ from shared.storage.keys import (
     key_before_trash,
     new_original_key,
     new_vocabulary_key,
+    preview_key,
     query_key,
     query_vector_key,
     thumbnail_key,
@@ -45,6 +46,7 @@ def test_old_orphans_of_every_prefix_go_and_what_is_referred_to_stays(chunk_map:
     orphans = {
         new_original_key(),
         thumbnail_key(new_id()),
+        preview_key(new_id()),
         f"chunks/{chunk_map.generation_id}/{new_id()}.npy",
         f"chunks/{chunk_map.generation_id}/{new_id()}.json",
         f"chunks/{new_id()}/{new_id()}.npy",
@@ -69,6 +71,7 @@ def _live_objects(chunk_map: ChunkMap) -> set[str]:
     """One object of each kind that a row refers to; their keys."""
     photo_id, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"photo")
     chunk_map.store.put(thumbnail_key(photo_id), b"small")
+    chunk_map.store.put(preview_key(photo_id), b"larger")
     add_chunk(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, [photo_id])
     job_id = ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
     chunk_map.store.put(query_vector_key(job_id), b"vector")
@@ -213,8 +216,9 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -
     with chunk_map.catalog.read() as session:
         photo_id = session.scalars(select(Photo.id)).one()
     chunk_map.delete(photo_id)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
-    assert chunk_map.objects("thumbnails/") == set()  # left by a batch that met the deletion
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    # Left by a batch that met the deletion.
+    assert chunk_map.objects("thumbnails/") == chunk_map.objects("previews/") == set()
 
 
 def test_files_that_people_put_beside_the_originals_are_not_removed(chunk_map: ChunkMap) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
+from pydantic import SecretStr, ValidationError
 
-from services.cli.environment import read_settings
-from shared.config.settings import Settings
+from services.cli.environment import is_secret, read_settings
+from shared.config.settings import SECRET_SETTINGS, Settings
 from shared.errors import Misconfigured
 from shared.storage.s3 import Bucket
 
@@ -402,3 +402,49 @@ def test_code_that_is_not_pinned_is_refused_at_the_start(
     monkeypatch: pytest.MonkeyPatch, variable: str, value: str, message: str
 ) -> None:
     assert message in refusal(monkeypatch, **{variable: value})
+
+
+def test_every_secret_may_be_in_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    secrets = {
+        "ADMIN_KEY": "0123456789abcdef",
+        "DATABASE_URL": "postgresql+psycopg://placewise:secret@db/placewise",
+        "REDIS_URL": "redis://:secret@redis:6379/0",
+        "S3_ACCESS_KEY": "placewise",
+        "S3_SECRET_KEY": "secret",
+    }
+    assert set(secrets) == set(SECRET_SETTINGS)
+    hidden = {name for name, field in Settings.model_fields.items() if is_secret(field)}
+    assert hidden <= {name.lower() for name in SECRET_SETTINGS}
+    for name, value in secrets.items():
+        (tmp_path / name).write_text(f"{value}\n")
+        monkeypatch.setenv(f"{name}_FILE", str(tmp_path / name))
+    read = Settings().model_dump()
+    for name, value in secrets.items():
+        found = read[name.lower()]
+        assert (found.get_secret_value() if isinstance(found, SecretStr) else found) == value
+
+
+def test_a_secret_file_may_be_named_in_the_env_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "key").write_text("0123456789abcdef")
+    env_file = tmp_path / "some.env"
+    env_file.write_text(f"ADMIN_KEY_FILE={tmp_path / 'key'}\n")
+    monkeypatch.setitem(Settings.model_config, "env_file", str(env_file))
+    key = Settings().admin_key
+    assert key is not None
+    assert key.get_secret_value() == "0123456789abcdef"
+
+
+def test_a_secret_file_that_cannot_be_read_or_is_ambiguous_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("ADMIN_KEY_FILE", str(tmp_path / "missing"))
+    with pytest.raises(Misconfigured, match=r"ADMIN_KEY_FILE=.*missing: No such file") as error:
+        read_settings()
+    assert error.value.code == "bad_setting"
+    (tmp_path / "missing").write_text("0123456789abcdef")
+    monkeypatch.setenv("ADMIN_KEY", "another-key-of-an-operator")
+    with pytest.raises(Misconfigured, match="both set") as error:
+        read_settings()
+    assert "another-key" not in error.value.detail

@@ -15,6 +15,7 @@ from shared.extractor_config.configs import (
     ExtractorConfig,
     add_extractor_options,
     get_extractor_config,
+    pooled_config,
 )
 from shared.imaging.preprocessing import PREPROCESSINGS as IN_VISION
 
@@ -214,3 +215,27 @@ def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
 def test_extractors_are_chosen_without_torch() -> None:
     code = "import shared.extractor_config.configs, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "pooled"),
+    [
+        ("anyloc-vitg14", "anyloc-vitg14:aggregator=gem"),
+        (
+            "anyloc-vits14:clusters=32,temperature=2,aggregator=soft-vlad",
+            "anyloc-vits14:aggregator=gem",
+        ),
+        (
+            "anyloc-vitb14:aggregator=soft-vlad,facet=key,layer=9,preprocessing=demo1024",
+            "anyloc-vitb14:aggregator=gem,facet=key,layer=9,preprocessing=demo1024",
+        ),
+    ],
+)
+def test_the_pooled_form_of_a_vlad_extractor_keeps_its_local_features(
+    name: str, pooled: str
+) -> None:
+    found = pooled_config(config(name))
+    assert found.name == pooled
+    assert found.local_features == config(name).local_features
+    assert found.preprocessing == config(name).preprocessing
+    assert not found.needs_vocabulary

@@ -90,13 +90,31 @@ def test_only_the_pages_own_files_are_sent(page: TestClient, path: str) -> None:
     assert answer.json()["code"] == "path_not_found"
 
 
-def test_nothing_but_this_server_may_be_loaded(page: TestClient) -> None:
+def test_nothing_but_streets_may_be_loaded_from_another_server(page: TestClient) -> None:
     allowed = policy(page.get("/", headers=HTML))
     assert allowed["default-src"] == "'self'"
-    assert allowed["img-src"] == "'self' blob: data:"
+    assert allowed["img-src"] == "'self' blob: data: https://tile.openstreetmap.org"
     assert not any("unsafe" in value for value in allowed.values())
     for path in ("/docs", "/redoc"):
         assert "script-src" not in policy(page.get(path)), "scripts are this server's alone"
+
+
+def test_without_streets_nothing_may_be_loaded_from_another_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MAP_TILES", "off")
+    page = served(Settings())
+    assert policy(page.get("/", headers=HTML))["img-src"] == "'self' blob: data:"
+    body = page.get("/console/settings.json").json()
+    assert (body["map_tiles"], body["map_attribution"]) == (None, None)
+
+
+def test_the_page_has_its_url_as_a_qr_code(page: TestClient) -> None:
+    answer = page.get("/console/qr.svg", params={"url": "http://192.168.1.23:8000"})
+    assert answer.headers["content-type"] == "image/svg+xml"
+    assert answer.text.startswith("<?xml")
+    for refused in ("javascript:alert(1)", "http://a b", "https://" + "x" * 200):
+        assert page.get("/console/qr.svg", params={"url": refused}).status_code == 422
 
 
 def test_the_tile_server_alone_is_added_to_what_may_be_loaded(
@@ -143,9 +161,14 @@ def test_pages_have_no_script_or_style_in_them(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if path.is_file()])
-def test_no_file_of_the_page_names_another_server(path: Path) -> None:
-    addresses = re.findall(r"https?://[^\s\"'`)]+", path.read_text())
-    assert set(addresses) <= {"http://www.w3.org/2000/svg"}
+def test_no_file_of_the_page_loads_from_another_server(path: Path) -> None:
+    addresses = re.findall(r"https?://[^\s\"'`)?]+", path.read_text())
+    # A link, which is opened only by a click, and names of XML's namespaces.
+    assert set(addresses) <= {
+        "https://www.openstreetmap.org/",
+        "http://www.topografix.com/GPX/1/1",
+        "http://www.w3.org/2000/svg",
+    }
 
 
 def test_every_module_that_is_imported_is_there(page: TestClient) -> None:

@@ -231,6 +231,43 @@ def test_thumbnail_is_a_small_jpeg_of_the_same_shape() -> None:
     assert thumbnail.size == (THUMBNAIL_PIXELS, THUMBNAIL_PIXELS // 2)
 
 
+@pytest.mark.parametrize(
+    ("media", "size", "preview_size"),
+    [
+        ("JPEG", (1601, 800), (1600, 800)),
+        ("JPEG", (1600, 800), None),
+        ("PNG", (800, 2000), (640, 1600)),
+        ("TIFF", (64, 48), (64, 48)),
+        ("BMP", (64, 48), (64, 48)),
+        ("WEBP", (64, 48), None),
+    ],
+)
+def test_photos_that_are_large_or_that_browsers_do_not_show_get_a_preview(
+    media: str, size: tuple[int, int], preview_size: tuple[int, int] | None
+) -> None:
+    data = encoded(Image.new("RGB", size, (1, 2, 3)), media)
+    preview = decode_photo(data, SQUARE, PIXELS, with_preview=True).preview
+    assert decode_photo(data, SQUARE, PIXELS).preview is None
+    if preview_size is None:
+        assert preview is None
+    else:
+        assert preview is not None
+        with Image.open(io.BytesIO(preview)) as image:
+            assert (image.format, image.size) == ("JPEG", preview_size)
+
+
+def test_a_preview_is_upright_and_carries_nothing_that_the_camera_wrote() -> None:
+    exif = private_exif()
+    exif[Base.Orientation] = 6
+    data = encoded(photo_image(1, 2000, 1000), "JPEG", exif=exif)
+    preview = decode_photo(data, SQUARE, PIXELS, with_preview=True).preview
+    assert b"Secret" in data
+    assert preview is not None
+    assert b"Secret" not in preview
+    with Image.open(io.BytesIO(preview)) as image:
+        assert image.size == (800, 1600)
+
+
 def test_small_photos_are_not_enlarged_for_their_thumbnail() -> None:
     decoded = decode_photo(photo_bytes(1), SQUARE, PIXELS)
     assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48)

@@ -4,6 +4,7 @@ import { bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
 import { bytes, count, plural } from "../format.js";
 import { serverSettings } from "../settings.js";
+import { localPicture } from "../photo.js";
 import { UploadQueue } from "../uploads.js";
 import { readTags } from "./photos.js";
 
@@ -12,16 +13,16 @@ const queue = new UploadQueue();
 
 export async function showAdd(view, { signal }) {
   const settings = await serverSettings();
-  const said = saidForm();
+  const details = detailsForm();
   const list = h("ul", { class: "queue" });
   const summary = h("div", { class: "summary" });
   const take = (files) => {
-    const leftOut = queue.add(files, said.read());
+    const leftOut = queue.add(files, details.read());
     if (leftOut) note(`${plural(leftOut, "file")} left out: neither photos nor archives.`);
   };
   const zone = addZone(settings, take);
   takesPastes(take, signal);
-  fill(view, zone, said.element, summary, list);
+  fill(view, zone, details.element, summary, list);
 
   const rows = new Map();
   const draw = () => {
@@ -31,10 +32,15 @@ export async function showAdd(view, { signal }) {
       if (!row) {
         row = new QueueRow(entry);
         rows.set(entry, row);
-        list.prepend(row.element);
       }
       row.draw();
     }
+    // Failures first, then the newest.
+    const order = [...queue.entries].reverse().sort((one, other) => (other.phase === "failed") - (one.phase === "failed"));
+    order.forEach((entry, place) => {
+      const { element } = rows.get(entry);
+      if (list.children[place] !== element) list.insertBefore(element, list.children[place] ?? null);
+    });
     drawSummary(summary);
   };
   queue.onchange = draw;
@@ -57,24 +63,25 @@ function addZone(settings, take) {
       h("h1", {}, "Add photos"),
       h("p", { class: "lead" }, "Drop photos, a folder, or a zip. Coordinates and times are read from each photo."),
       h("div", { class: "row" }, button("Choose photos", () => files.click(), "primary"), button("Choose a folder", () => folder.click(), "not-touch"), files, folder),
-      h("p", { class: "soft small" }, `JPEG, PNG, WebP, BMP, TIFF or HEIC, up to ${bytes(settings.max_file_size)} each`)));
+      h("p", { class: "soft small" }, `JPEG, PNG, WebP, BMP, TIFF or HEIC, up to ${bytes(settings.max_file_size)} each`),
+      h("p", {}, "Photos without coordinates? ", h("a", { href: "#/locate" }, "Locate a folder"))));
   takesDrops(zone, take);
   return zone;
 }
 
 /** What is true of all photos that are added next. */
-function saidForm() {
+function detailsForm() {
   const latitude = h("input", { type: "number", min: -90, max: 90, step: "any" });
   const longitude = h("input", { type: "number", min: -180, max: 180, step: "any" });
   const place = h("input", { maxlength: 500, autocomplete: "off" });
   const tags = h("input", { autocomplete: "off" });
-  const role = h("select", {}, h("option", { value: "" }, "Can be found"), h("option", { value: "query" }, "Labelled queries"));
-  const element = h("details", { class: "card said" }, h("summary", {}, "Say more of the next photos"),
-    h("p", { class: "soft" }, "It holds for every photo that you add from here on. What is left empty is read from the photo."),
+  const role = h("select", {}, h("option", { value: "" }, "Can be found"), h("option", { value: "query" }, "Test photos"));
+  const element = h("details", { class: "card" }, h("summary", {}, "Details for these photos"),
+    h("p", { class: "soft" }, "They hold for every photo that you add from here on. Empty fields are read from the photo."),
     h("div", { class: "filters-more" },
       field("Place", place, "A label, such as a room"), field("Tags", tags, "Separated by commas"),
       field("Latitude", latitude), field("Longitude", longitude),
-      field("Role", role, "Labelled queries are never found: the map is measured with them")));
+      field("Use", role, "Test photos are never found: the map is measured with them")));
   return {
     element,
     read: () => {
@@ -116,17 +123,8 @@ class QueueRow {
     this.progress = h("div", { class: "row-progress" });
     this.retry = button("Try again", () => entry.retry().catch(noteError));
     this.element = h("li", { class: "queue-row" },
-      entry.picture ? this.#preview(entry.picture) : h("span", { class: "pile", "aria-hidden": "true" }, entry.total > 1 ? count(entry.total) : "zip"),
+      entry.picture ? localPicture(entry.picture, { alt: "", width: "72", height: "54" }) : h("span", { class: "pile", "aria-hidden": "true" }, entry.total > 1 ? count(entry.total) : "zip"),
       h("div", { class: "queue-words" }, h("p", { class: "queue-name" }, entry.name), this.state, this.progress, this.errors), this.retry);
-  }
-
-  #preview(file) {
-    const url = URL.createObjectURL(file);
-    const image = h("img", { src: url, alt: "", width: "72", height: "54" });
-    const release = () => URL.revokeObjectURL(url);
-    image.addEventListener("load", release);
-    image.addEventListener("error", release);
-    return image;
   }
 
   draw() {
@@ -139,7 +137,7 @@ class QueueRow {
     if (!busy) fill(this.progress);
     else if (known && total) Object.assign(known, { max: total, value: done });
     else if (!known || known.hasAttribute("value")) fill(this.progress, bar(`${entry.name}: ${entry.words()}`, done, total));
-    fill(this.errors, entry.errors.map(({ name, detail }) => h("li", {}, name && h("strong", {}, name), name && ": ", detail)));
-    this.retry.hidden = !entry.canRetry();
+    fill(this.errors, entry.errors.map(({ name, detail }) => h("li", {}, name && h("strong", {}, name), name && ": ", detail)), entry.unlisted > 0 && h("li", {}, `${count(entry.errors.length)} of ${count(entry.failed)} failures are listed.`));
+    this.retry.hidden = !entry.canRetry;
   }
 }

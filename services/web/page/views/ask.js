@@ -3,9 +3,9 @@
 import { Problem, ask, currentMap, get, idempotencyKey } from "../api.js";
 import { bar, button, fill, h, noteError, say } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
-import { percent, plural, score, whereabouts } from "../format.js";
+import { nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
-import { original, thumbnail } from "../photo.js";
+import { localPicture, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
 import { drawRings, verdict } from "./verdict.js";
 
@@ -18,8 +18,8 @@ export async function showAsk(view, { signal, id }) {
   if (id) {
     const photo = await get(`/uploads/${id}`, { signal });
     const asked = {
-      name: photo.original_filename,
-      picture: () => original(photo, `The photo asked with: ${photo.original_filename}`),
+      name: nameOf(photo),
+      picture: () => preview(photo, `The photo asked with: ${nameOf(photo)}`),
       find: (query, onjob) => findSimilar(`/similarity/${id}`, query, null, onjob, signal),
     };
     fill(view, h("h1", {}, "Which photos show this place?"), answer);
@@ -31,7 +31,7 @@ export async function showAsk(view, { signal, id }) {
     const small = shrinkPhoto(file, map.extractor);
     const asked = {
       name: file.name,
-      picture: () => localPicture(file, signal),
+      picture: () => localPicture(file, { alt: `The photo asked with: ${file.name}` }),
       find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal),
     };
     view.classList.add("asked");
@@ -47,7 +47,7 @@ async function showNewest(newest, signal) {
   const { images } = await get("/search", { query: { limit: NEWEST, role: "database" }, signal });
   fill(newest,
     h("h2", {}, "Or ask with a photo of the map"),
-    h("ul", { class: "mosaic" }, images.map((photo) => h("li", {}, h("a", { href: `#/ask/${photo.image_id}`, "aria-label": `Ask with ${photo.original_filename}` }, thumbnail(photo, ""))))));
+    h("ul", { class: "mosaic" }, images.map((photo) => h("li", {}, h("a", { href: `#/ask/${photo.image_id}`, "aria-label": `Ask with ${nameOf(photo)}` }, thumbnail(photo, ""))))));
 }
 
 function askEntry(map, onfile, signal) {
@@ -82,15 +82,8 @@ function askEntry(map, onfile, signal) {
   return zone;
 }
 
-/** A file of this machine as a picture. */
-function localPicture(file, signal) {
-  const url = URL.createObjectURL(file);
-  signal.addEventListener("abort", () => URL.revokeObjectURL(url));
-  return h("img", { src: url, alt: `The photo asked with: ${file.name}` });
-}
-
 /** The answer to a photo, stored or not; `onjob` is told while it takes longer than a moment. */
-async function findSimilar(path, query, file, onjob, signal) {
+export async function findSimilar(path, query, file, onjob, signal) {
   const form = file ? new FormData() : null;
   form?.append("file", file, file.name);
   let response = await ask(path, {
@@ -127,7 +120,7 @@ async function showAnswer(answer, asked, signal) {
     return;
   }
   if (mine !== questions) return;
-  const photos = found.similar_images;
+  const photos = byProbability(found.similar_images);
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
   const open = (index) => compare(asked, photos, index, signal);
@@ -140,31 +133,51 @@ async function showAnswer(answer, asked, signal) {
       located ? ground : null),
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo is similar enough"),
-      h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index)))))));
+      h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
+      photos.length > 0 && figures(photos, found.word_weights === "applied")));
   say(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
-  if (located) await drawAnswer(openMap, ground, found, open, signal);
+  if (located) await drawAnswer(openMap, ground, found.estimate, photos, open, signal);
 }
 
-async function drawAnswer(openMap, ground, found, open, signal) {
+/** The photos in the order of the number that they are shown with; those of equal probability as they are ranked. */
+const byProbability = (photos) => [...photos].sort((one, other) => other.match_probability - one.match_probability);
+
+async function drawAnswer(openMap, ground, estimate, photos, open, signal) {
   const map = await openMap(ground, "Where the matches were taken", { signal });
-  const { estimate, similar_images: photos } = found;
   drawRings(map, estimate);
   // From the last to the first, so that the best lies on top.
   photos.map((photo, index) => ({ photo, index })).reverse().forEach(({ photo, index }) => {
-    if (photo.latitude !== null) map.numbered(photo.latitude, photo.longitude, index + 1, `${index + 1}: ${photo.original_filename}`, () => open(index));
+    if (photo.latitude !== null) map.numbered(photo.latitude, photo.longitude, index + 1, `${index + 1}: ${nameOf(photo)}`, () => open(index));
   });
   map.fit();
 }
 
 function matchCard(photo, index, onclick) {
-  const probability = photo.match_probability === null ? "" : `${percent(photo.match_probability)} the same place, `;
-  const cosine = score(photo.similarity_score);
-  const where = photo.place && photo.latitude === null ? photo.original_filename : whereabouts({ ...photo, place: null });
-  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}, ${probability}similarity ${cosine}: ${photo.original_filename}` },
+  const name = nameOf(photo);
+  const word = strength(photo.match_probability);
+  const where = photo.place && photo.latitude === null ? name : whereabouts({ ...photo, place: null });
+  const likely = word ? `, ${word} match, ${percent(photo.match_probability)} the same place` : "";
+  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}${likely}: ${name}` },
     thumbnail(photo, ""),
     h("span", { class: "rank", "aria-hidden": "true" }, String(index + 1)),
-    h("span", { class: "match-words" },
-      h("span", { class: "match-name" }, photo.place ?? photo.original_filename),
-      h("span", { class: "figure", title: "Probability of the same place" }, percent(photo.match_probability))),
-    h("span", { class: "soft match-where" }, `similarity ${cosine} · ${where}`));
+    word && h("span", { class: "match-words" },
+      h("span", { class: `strength ${word}` }, word),
+      h("span", { class: "figure", title: "Probability that it shows the same place" }, percent(photo.match_probability))),
+    h("span", { class: "match-name", title: name }, photo.place ?? name),
+    h("span", { class: "soft match-where" }, where));
+}
+
+/** The numbers behind the ranking. */
+function figures(photos, weighted) {
+  const heads = ["", "Photo", "Same place", ...(weighted ? ["Weighted score"] : []), "Similarity"];
+  const numbers = (photo) => [
+    percent(photo.match_probability), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
+  ];
+  return h("details", { class: "card figures" }, h("summary", {}, "Details"),
+    h("p", { class: "soft" }, `Photos come in the order of the probability that they show the same place; it is computed from all similarities${weighted ? ", weighted by what this map trusts" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Similarity is the cosine of two descriptors.`),
+    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Numbers of the matches" }, h("table", {},
+      h("thead", {}, h("tr", {}, heads.map((name, column) => h("th", { scope: "col", class: column > 1 ? "number" : "" }, name || h("span", { class: "heard" }, "Rank"))))),
+      h("tbody", {}, photos.map((photo, index) => h("tr", {},
+        h("td", {}, String(index + 1)), h("td", { class: "name" }, nameOf(photo)),
+        numbers(photo).map((number) => h("td", { class: "number" }, number))))))));
 }

@@ -2,8 +2,9 @@
 
 import { Problem } from "../api.js";
 import { fill, h, openDialog } from "../dom.js";
-import { percent, score, whereabouts } from "../format.js";
-import { original } from "../photo.js";
+import { nameOf, percent, score, strength, whereabouts } from "../format.js";
+import { preview } from "../photo.js";
+import { coordinateTools } from "../places.js";
 
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
 export function compare(asked, photos, index, signal) {
@@ -19,17 +20,18 @@ export function compare(asked, photos, index, signal) {
     const photo = photos[index];
     fill(heading, `Match ${index + 1} of ${photos.length}`);
     const overlay = h("img", { class: "overlay", alt: "", hidden: true });
-    const strength = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
-    strength.addEventListener("input", () => (overlay.style.opacity = strength.value / 100));
+    const opacity = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
+    opacity.addEventListener("input", () => (overlay.style.opacity = opacity.value / 100));
     overlay.style.opacity = 0.7;
     const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Asking what makes them similar…"));
     fill(body,
       h("figure", {}, h("div", { class: "frame" }, asked.picture(), overlay), h("figcaption", {}, asked.name)),
-      h("figure", {}, h("div", { class: "frame" }, original(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename), h("span", { class: "soft" }, ` ${whereabouts(photo)}`))),
+      h("figure", {}, h("div", { class: "frame" }, preview(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${whereabouts(photo)}`)),
+        photo.latitude !== null && coordinateTools(photo.latitude, photo.longitude)),
       h("div", { class: "compare-words" },
         h("div", {},
-          photo.match_probability !== null && h("p", {}, h("span", { class: "figure large" }, percent(photo.match_probability)), h("span", { class: "soft" }, " the same place")),
-          h("p", {}, h("span", { class: "figure" }, score(photo.similarity_score)), h("span", { class: "soft" }, " cosine similarity"))),
+          photo.match_probability !== null && h("p", {}, h("span", { class: `strength ${strength(photo.match_probability)}` }, strength(photo.match_probability)), h("span", { class: "figure large" }, ` ${percent(photo.match_probability)}`), h("span", { class: "soft" }, " the same place")),
+          h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`, photo.weighted_score !== null && `, weighted score ${score(photo.weighted_score)}`))),
         why,
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
@@ -42,7 +44,7 @@ export function compare(asked, photos, index, signal) {
       overlay.hidden = false;
       fill(why,
         h("p", { class: "legend" }, h("span", { class: "swatch for" }), "speaks for this match ", h("span", { class: "swatch against" }), "speaks against it"),
-        h("label", { class: "field inline" }, h("span", {}, "Overlay"), strength));
+        h("label", { class: "field inline" }, h("span", {}, "Overlay"), opacity));
     } catch (error) {
       if (mine !== shown || signal.aborted) return;
       fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "What makes them similar can’t be told now."));

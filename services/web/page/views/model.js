@@ -1,8 +1,8 @@
-// What the map's answers are made with: its vocabulary, its generations, and how good they are.
+// How good the map's answers are, and what they are made with: vocabularies and model versions.
 
 import { ask, currentMap, get, post } from "../api.js";
-import { bar, button, field, fill, h, note, noteError, openDialog } from "../dom.js";
-import { count, percent, plural, when } from "../format.js";
+import { advancedTabs, bar, button, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
+import { count, percent, plural } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 
 const CHANGES = ["fit", "import_vocabulary", "switch", "pca"];
@@ -12,6 +12,7 @@ const STANDING = {
   own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
   provisional: ["Provisional", "The vocabulary was learnt when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
   foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
+  pending: ["Not yet", "Until this map has a vocabulary, its photos are compared by an average of their features. Fit one: nothing improves the answers as much."],
   none: ["None", "This extractor uses no vocabulary."],
 };
 
@@ -28,7 +29,7 @@ export async function showModel(view, { signal }) {
   const [standing, meaning] = STANDING[map.vocabulary] ?? ["Not yet", "The map has no descriptors yet. Photos that wait for a vocabulary are described once one is fitted."];
   const fits = map.vocabulary !== "none";
   fill(view,
-    h("header", { class: "head" }, h("h1", {}, "Model")),
+    h("header", { class: "head" }, h("h1", {}, "Model"), advancedTabs("model")),
     h("section", { class: "card standing" },
       h("div", {}, h("h2", {}, "What answers now"),
         h("dl", { class: "facts" },
@@ -94,7 +95,7 @@ function comparison(evaluations, generations, vocabularies, onmeasure) {
     return h("section", { class: "card" }, head, h("p", {}, "Not measured yet. Placewise asks the map about its own photos, each left out once: how often does another photo of the same place come first? It does so by itself once 20 photos have coordinates or a place."));
   }
   const nameOf = (evaluation) => nameGeneration(generations.find((one) => one.generation_id === evaluation.generation_id), vocabularies);
-  const sets = [["labelled_queries", "Labelled queries"], ["leave_one_out", "The map’s own photos, each left out once"]];
+  const sets = [["labelled_queries", "Test photos"], ["leave_one_out", "The map’s own photos, each left out once"]];
   return h("section", { class: "card" }, head,
     h("p", { class: "soft" }, `Right means within ${after.figures.radius_m} m, or the same place label. R@k: the share of queries with a right photo among the first k.`),
     h("div", { class: "comparisons" }, sets.filter(([set]) => after.figures[set]?.queries).map(([set, title]) =>
@@ -119,7 +120,7 @@ function gain(was, is) {
 }
 
 function nameGeneration(generation, vocabularies) {
-  if (!generation) return "a generation that is gone";
+  if (!generation) return "a deleted model version";
   const vocabulary = vocabularies.find((one) => one.vocabulary_id === generation.vocabulary_id);
   const name = vocabulary ? nameVocabulary(vocabulary) : "no vocabulary";
   return generation.pca_from ? `${name}, PCA ${count(generation.dimension)}` : name;
@@ -129,14 +130,15 @@ const nameVocabulary = (vocabulary) => ({ fitted: "fitted here" })[vocabulary.or
 
 function generationsTable(generations, vocabularies) {
   if (!generations.length) return null;
-  const tone = { active: "succeeded", building: "running" };
-  return h("section", { class: "card" }, h("h2", {}, "Generations"),
-    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Generations" }, h("table", {},
-      h("thead", {}, h("tr", {}, ["State", "Vocabulary", "Dimension", "Photos", "Begun"].map((name) => h("th", { scope: "col", class: ["Dimension", "Photos"].includes(name) ? "number" : "" }, name)))),
+  const states = { active: ["in use", "succeeded"], building: ["being built", "running"], retired: ["replaced", ""], abandoned: ["given up", ""] };
+  const chip = ([words, tone]) => h("span", { class: `chip ${tone}` }, words);
+  return h("section", { class: "card" }, h("h2", {}, "Model versions"),
+    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Model versions" }, h("table", {},
+      h("thead", {}, h("tr", {}, ["State", "Vocabulary", "Dimension", "Photos", "Begun"].map((name) => h("th", { scope: "col", class: { Dimension: "number wide-only", Photos: "number" }[name] ?? "" }, name)))),
       h("tbody", {}, generations.map((one) => h("tr", {},
-        h("td", {}, h("span", { class: `chip ${tone[one.state] ?? ""}` }, one.state)),
+        h("td", {}, chip(states[one.state] ?? [one.state, ""])),
         h("td", {}, nameGeneration(one, vocabularies)),
-        h("td", { class: "number" }, count(one.dimension)), h("td", { class: "number" }, count(one.photos)), h("td", {}, when(one.created_at))))))));
+        h("td", { class: "number wide-only" }, count(one.dimension)), h("td", { class: "number" }, count(one.photos)), h("td", {}, time(one.created_at))))))));
 }
 
 function vocabulariesTable(vocabularies, generations, follow) {
@@ -144,13 +146,13 @@ function vocabulariesTable(vocabularies, generations, follow) {
   const active = generations.find((one) => one.state === "active");
   return h("section", { class: "card" }, h("h2", {}, "Vocabularies"),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Vocabularies" }, h("table", {},
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number" }, "Clusters"), h("th", { scope: "col" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number wide-only" }, "Clusters"), h("th", { scope: "col", class: "wide-only" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
       h("tbody", {}, vocabularies.map((one) => h("tr", {},
-        h("td", {}, nameVocabulary(one)), h("td", { class: "number" }, count(one.clusters)),
-        h("td", {}, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, when(one.created_at)),
+        h("td", {}, nameVocabulary(one)), h("td", { class: "number wide-only" }, count(one.clusters)),
+        h("td", { class: "wide-only" }, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),
         h("td", { class: "row end" },
           button("Download", () => download(one)),
-          active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "answers") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), "Switching the vocabulary")))))))));
+          active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), "Switching the vocabulary")))))))));
 }
 
 async function download(vocabulary) {

@@ -1,31 +1,32 @@
 // One photo: large, where it is, what is said of it, and changing that.
 
 import { ask, currentMap, get } from "../api.js";
-import { button, confirmed, field, fill, h, note } from "../dom.js";
-import { bytes, when } from "../format.js";
+import { button, confirmed, field, fill, h, note, time } from "../dom.js";
+import { bytes, nameOf, when } from "../format.js";
 import { openMap } from "../map.js";
-import { original } from "../photo.js";
+import { preview } from "../photo.js";
+import { coordinates } from "../places.js";
 import { readTags } from "./photos.js";
 
 export async function showPhoto(view, { signal, id }) {
   const photo = await get(`/uploads/${id}`, { signal });
-  document.title = `${photo.original_filename} · ${currentMap()} · Placewise`;
+  document.title = `${nameOf(photo)} · ${currentMap()} · Placewise`;
   const ground = h("div", { class: "ground" });
   const form = editForm(photo);
   const remove = async () => {
-    if (!(await confirmed("Delete this photo?", `${photo.original_filename} is gone from every answer at once, and can’t be brought back.`, "Delete"))) return;
+    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} is gone from every answer at once, and can’t be brought back.`, "Delete"))) return;
     await ask(`/uploads/${id}`, { method: "DELETE" });
-    note(`${photo.original_filename} is deleted.`);
+    note(`${nameOf(photo)} is deleted.`);
     location.hash = "#/photos";
   };
   fill(view,
     h("header", { class: "head" },
-      h("h1", { class: "file-name" }, photo.original_filename),
+      h("h1", { class: "file-name" }, nameOf(photo)),
       h("div", { class: "row" },
         h("a", { class: "button primary", href: `#/ask/${id}` }, "Find similar"),
         button("Delete…", remove, "danger"))),
     h("div", { class: "one-photo" },
-      h("figure", { class: "large-photo" }, original(photo)),
+      h("figure", { class: "large-photo" }, preview(photo)),
       h("div", { class: "beside" },
         h("section", { class: "card" }, form.element),
         h("section", { class: "card" }, ground, h("p", { class: "soft small" }, "Click into the map to move the photo there, then save.")),
@@ -51,10 +52,11 @@ export async function showPhoto(view, { signal, id }) {
 function facts(photo) {
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
-    line("Searchable", photo.role === "query" ? "no: a labelled query" : photo.searchable ? "yes" : "not yet"),
+    line("Searchable", photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet"),
+    photo.latitude !== null && line("Position", coordinates(photo.latitude, photo.longitude)),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
-    line("Added", when(photo.upload_time)),
+    line("Added", time(photo.upload_time)),
     Object.entries(photo.metadata).map(([name, value]) => line(name, typeof value === "string" ? value : JSON.stringify(value))));
 }
 
@@ -65,7 +67,7 @@ function editForm(photo) {
   const longitude = h("input", { type: "number", min: -180, max: 180, step: "any", value: photo.longitude ?? "" });
   const place = h("input", { maxlength: 500, value: photo.place ?? "", autocomplete: "off" });
   const tags = h("input", { value: photo.tags.join(", "), autocomplete: "off" });
-  const role = h("select", {}, h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Labelled query"));
+  const role = h("select", {}, h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photo"));
   role.value = photo.role;
   const save = async () => {
     if (!element.reportValidity()) return;
@@ -81,7 +83,7 @@ function editForm(photo) {
     h("div", { class: "pair" }, field("Latitude", latitude), field("Longitude", longitude)),
     field("Place", place, "A label, where coordinates say little: a room, a shelf"),
     field("Tags", tags, "Separated by commas"),
-    field("Role", role, "A labelled query is never found: the map is measured with it"));
+    field("Use", role, "A test photo is never found: the map is measured with it"));
   const saving = button("Save", save, "primary");
   element.append(h("div", { class: "row end" }, saving));
   return {

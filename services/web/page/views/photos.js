@@ -1,8 +1,8 @@
 // Browse the map's photos: filter them, see where they are, tag and delete several at once.
 
 import { ask, get } from "../api.js";
-import { button, confirmed, field, fill, h, note, noteError, openDialog } from "../dom.js";
-import { count, plural, when, whereabouts } from "../format.js";
+import { button, confirmed, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
+import { count, nameOf, plural, whereabouts } from "../format.js";
 import { openMap } from "../map.js";
 import { thumbnail } from "../photo.js";
 
@@ -16,12 +16,13 @@ export async function showPhotos(view, { signal }) {
   const total = h("p", { class: "total", role: "status" });
   const more = h("div", { class: "more" });
   const ground = h("div", { class: "ground browse", hidden: true });
+  const cut = h("p", { class: "soft small", hidden: true });
   const tools = h("div", { class: "tools", hidden: true });
   let opening = null;
 
   const { form, query, setNear } = filterForm(reload);
   const mapButton = button("Show the map", async () => {
-    ground.hidden = !ground.hidden;
+    ground.hidden = cut.hidden = !ground.hidden;
     mapButton.textContent = ground.hidden ? "Show the map" : "Hide the map";
     mapButton.setAttribute("aria-expanded", String(!ground.hidden));
     if (!ground.hidden) await drawMap();
@@ -29,7 +30,7 @@ export async function showPhotos(view, { signal }) {
   mapButton.setAttribute("aria-expanded", "false");
   fill(view,
     h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
-    form, ground, total, tools, grid, more);
+    form, ground, cut, total, tools, grid, more);
 
   async function reload() {
     chosen.clear();
@@ -57,18 +58,18 @@ export async function showPhotos(view, { signal }) {
   }
 
   function card(photo) {
-    const box = h("input", { type: "checkbox", "aria-label": `Choose ${photo.original_filename}` });
+    const box = h("input", { type: "checkbox", "aria-label": `Choose ${nameOf(photo)}` });
     box.addEventListener("change", () => {
       if (box.checked) chosen.set(photo.image_id, photo);
       else chosen.delete(photo.image_id);
       drawTools();
     });
     return h("article", { class: "photo-card" },
-      h("a", { href: `#/photo/${photo.image_id}`, "aria-label": photo.original_filename }, thumbnail(photo, "")),
+      h("a", { href: `#/photo/${photo.image_id}`, "aria-label": nameOf(photo) }, thumbnail(photo, "")),
       box,
-      photo.role === "query" && h("span", { class: "chip corner" }, "labelled query"),
-      h("p", { class: "photo-name", title: photo.original_filename }, photo.place ?? photo.original_filename),
-      h("p", { class: "soft" }, photo.latitude === null && photo.place ? when(photo.captured_at ?? photo.upload_time) : whereabouts({ ...photo, place: null })),
+      photo.role === "query" && h("span", { class: "chip corner" }, "test photo"),
+      h("p", { class: "photo-name", title: nameOf(photo) }, photo.place ?? nameOf(photo)),
+      h("p", { class: "soft" }, photo.latitude === null && photo.place ? time(photo.captured_at ?? photo.upload_time) : whereabouts({ ...photo, place: null })),
       photo.tags.length > 0 && h("p", { class: "chips" }, photo.tags.map((tag) => h("span", { class: "chip" }, tag))));
   }
 
@@ -121,13 +122,15 @@ export async function showPhotos(view, { signal }) {
     map.clear();
     for (const photo of page.images) {
       if (photo.latitude === null) continue;
-      map.point(photo.latitude, photo.longitude, { kind: photo.role, text: photo.place ?? photo.original_filename, onclick: (event) => {
+      map.point(photo.latitude, photo.longitude, { kind: photo.role, text: photo.place ?? nameOf(photo), onclick: (event) => {
         L.DomEvent.stopPropagation(event);
         location.hash = `#/photo/${photo.image_id}`;
       } });
     }
     const { near } = query();
     if (near) map.circle(...near.split(",").map(Number), "estimate");
+    const all = `${page.total_is_exact ? "" : "more than "}${count(page.total_found)}`;
+    fill(cut, page.next_cursor && `The map shows ${count(page.images.length)} of ${all} photos, the newest. Filter to see others.`);
     map.fit();
   }
 
@@ -150,7 +153,7 @@ function filterForm(onchange) {
   const radius = h("input", { type: "number", min: 1, value: "100" });
   const after = h("input", { type: "date" });
   const before = h("input", { type: "date" });
-  const role = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Labelled queries"));
+  const role = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photos"));
   let timer;
   const changed = () => {
     clearTimeout(timer);
@@ -160,7 +163,7 @@ function filterForm(onchange) {
     field("Name", name), field("Tags", tags),
     h("details", {}, h("summary", {}, "More filters"), h("div", { class: "filters-more" },
       field("Near", near, "Or click into the map"), field("Within metres", radius),
-      field("Taken from", after), field("Taken until", before), field("Role", role))));
+      field("Taken from", after), field("Taken until", before), field("Use", role))));
   return {
     form,
     query: () => ({

@@ -1,9 +1,10 @@
-// Is it well, how full is it, what is it doing, what was asked.
+// The health and the figures of the server, its jobs, the newest searches, and the way in for a phone.
 
-import { get, post } from "../api.js";
-import { button, fill, h } from "../dom.js";
-import { bytes, count, duration, score, when } from "../format.js";
+import { forgetKey, get, hasKey, maySucceed, post } from "../api.js";
+import { button, fill, h, time } from "../dom.js";
+import { bytes, count, duration, score } from "../format.js";
 import { stateInWords } from "../jobs.js";
+import { serverSettings } from "../settings.js";
 
 const LOOK_SECONDS = 5;
 
@@ -21,7 +22,7 @@ export async function showStatus(view, { signal }) {
     drawSearches(drawn.searches, searches);
   };
   await look();
-  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn)));
+  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(await serverSettings())));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
     if (!document.hidden && !drawn.jobs.contains(document.activeElement)) look().catch(() => {});
@@ -49,11 +50,11 @@ function drawFigures(card, stats) {
   fill(card, h("h2", {}, `The map “${stats.map}”`),
     h("div", { class: "tiles" },
       tile(count(stats.total_images), "photos"), tile(count(stats.searchable_images), "searchable"),
-      tile(count(stats.labelled_queries), "labelled queries"), tile(bytes(stats.total_storage_bytes), "stored"),
+      tile(count(stats.labelled_queries), "test photos"), tile(bytes(stats.total_storage_bytes), "stored"),
       tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")));
 }
 
-const KINDS = { index: "Photo", batch: "Batch", describe: "Question", compare: "Comparison", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", evaluate: "Evaluation", reindex: "Describe again", word_weights: "Word weights" };
+const KINDS = { index: "Photo", batch: "Batch", describe: "Question", compare: "Comparison", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", add_model: "New model", evaluate: "Evaluation", reindex: "Describe again", word_weights: "Word weights" };
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {
@@ -61,14 +62,14 @@ function drawJobs(card, jobs, look) {
     return;
   }
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
       h("td", {}, KINDS[job.kind] ?? job.kind),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
-      h("td", { class: "number" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
-      h("td", {}, when(job.created_at)),
+      h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
+      h("td", {}, time(job.created_at)),
       h("td", { class: "row end" },
-        job.state === "failed" && button("Try again", () => post(`/jobs/${job.job_id}/retry`).then(look)),
+        job.state === "failed" && (!job.error || maySucceed(job.error)) && button("Try again", () => post(`/jobs/${job.job_id}/retry`).then(look)),
         ["queued", "running"].includes(job.state) && button("Cancel", () => post(`/jobs/${job.job_id}/cancel`).then(look)))))))));
 }
 
@@ -79,13 +80,31 @@ function drawSearches(card, searches) {
   }
   const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number" }, "Took"), h("th", { scope: "col" }, "When"))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
       const [words, tone] = verdict[one.in_map] ?? ["Open", ""];
       return h("tr", {},
         h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
         h("td", {}, h("span", { class: `chip ${tone}` }, words)),
         h("td", { class: "number" }, one.best_score === null ? "–" : score(one.best_score)),
-        h("td", { class: "number" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, when(one.searched_at)));
+        h("td", { class: "number wide-only" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, time(one.searched_at)));
     })))));
+}
+
+const LOOPBACK = /^(localhost|127\.\d+\.\d+\.\d+|\[::1\])$/;
+
+/** The address of this server for a phone in the same network, and the key of this device. */
+function phoneCard({ lan_url: lanUrl }) {
+  const url = LOOPBACK.test(location.hostname) ? lanUrl : location.origin;
+  return h("section", { class: "card" },
+    h("h2", {}, "On a phone"),
+    url
+      ? h("div", { class: "phone-address" },
+        h("img", { src: `/console/qr.svg?url=${encodeURIComponent(url)}`, alt: `QR code of ${url}`, width: "180", height: "180" }),
+        h("div", {}, h("p", {}, "Scan this code with the camera of a phone in the same network, or open ", h("a", { href: url }, url), " there."), h("p", { class: "soft" }, "The phone asks for the key once, and can remember it.")))
+      : h("p", {}, "Only this machine can reach this server. To use it from a phone, start it with ", h("code", {}, "make run HOST=0.0.0.0"), ". Every call then needs a key, which the first start prints."),
+    hasKey() && h("p", { class: "row" }, "This browser has a key. ", button("Forget the key", () => {
+      forgetKey();
+      location.reload();
+    })));
 }

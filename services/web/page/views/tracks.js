@@ -1,8 +1,8 @@
 // Tracks: a list, and one track on the map with its uncertainty and its frames.
 
 import { ask, get } from "../api.js";
-import { button, confirmed, field, fill, h } from "../dom.js";
-import { count, degrees, metres, percent, plural, when } from "../format.js";
+import { advancedTabs, button, confirmed, field, fill, h, time } from "../dom.js";
+import { count, degrees, metres, percent, plural } from "../format.js";
 
 const PHOTOS_SHOWN = 1000; // of the map, behind the track
 const FRAMES_SHOWN = 500; // in the table
@@ -22,13 +22,13 @@ async function showList(view, signal) {
   const { tracks } = await get("/tracks", { query: { limit: 100 }, signal });
   const none = h("section", { class: "card empty" }, h("h2", {}, "No tracks yet"), h("p", {}, "A track follows a camera through the map, frame by frame: ", h("code", {}, "placewise track PHOTOS_OR_VIDEO"), ", or ", h("code", {}, "POST /tracks"), "."));
   const rows = tracks.map((track) => h("tr", {},
-    h("td", {}, h("a", { href: `#/tracks/${track.track_id}` }, when(track.created_at))),
+    h("td", {}, h("a", { href: `#/tracks/${track.track_id}` }, time(track.created_at))),
     h("td", { class: "number" }, count(track.version)),
     h("td", {}, track.state ? chip(track.state.status) : "–"),
     h("td", { class: "number" }, percent(track.state?.probability)),
     h("td", { class: "name" }, whereabouts(track.state))));
   fill(view,
-    h("header", { class: "head" }, h("h1", {}, "Tracks")),
+    h("header", { class: "head" }, h("h1", {}, "Tracks"), advancedTabs("tracks")),
     tracks.length ? h("section", { class: "card" }, table("Tracks", heads("Begun", "Frames", "Status", "Probability", "Last place"), rows)) : none);
 }
 
@@ -55,6 +55,7 @@ async function drawTrack(element, track, signal) {
   const { frames } = track;
   const located = frames.filter(({ state }) => state && state.latitude !== null);
   const ground = h("div", { class: "ground browse" });
+  const cut = h("p", { class: "soft small" });
   const followed = frames.filter((frame) => statusOf(frame) === "tracking").length;
   const rows = frames.slice(-FRAMES_SHOWN).reverse().map((frame) => h("tr", {},
     h("td", {}, new Date(frame.captured_at).toLocaleTimeString("en-GB")),
@@ -66,17 +67,18 @@ async function drawTrack(element, track, signal) {
   const shown = frames.length > FRAMES_SHOWN ? `; the last ${count(FRAMES_SHOWN)} are listed` : "";
   fill(element,
     h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, track.pending > 0 && `${plural(track.pending, "frame")} wait.`),
-    located.length > 0 && ground,
+    located.length > 0 && [ground, cut],
     h("section", { class: "card" }, h("h2", {}, "Frames"), table("Frames", heads("Time", "Photo", "Status", "Probability", "Place", "On the map"), rows)));
-  if (located.length) await drawPath(ground, frames, signal);
+  if (located.length) await drawPath(ground, cut, frames, signal);
 }
 
 /** The track over the map's photos: a circle of 68 % and a point for each frame, and lines between those that are not lost. */
-async function drawPath(ground, frames, signal) {
-  const [{ openMap }, { images }] = await Promise.all([
+async function drawPath(ground, cut, frames, signal) {
+  const [{ openMap }, { images, next_cursor: more, total_found: total, total_is_exact: exact }] = await Promise.all([
     import("../map.js"),
     get("/search", { query: { role: "database", limit: PHOTOS_SHOWN }, signal }),
   ]);
+  fill(cut, more && `Behind the track are ${count(images.length)} of ${exact ? "" : "more than "}${count(total)} photos of the map, the newest.`);
   const map = await openMap(ground, "The track over the photos of the map", { signal });
   for (const photo of images) {
     if (photo.latitude !== null) map.point(photo.latitude, photo.longitude, { kind: "behind", radius: 3 });

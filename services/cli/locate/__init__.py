@@ -1,0 +1,1 @@
+"""`placewise locate`: positions for the photos of a folder that have none."""

@@ -1,0 +1,199 @@
+"""The journal of `placewise locate --write`: every change of a file can be undone, byte by byte.
+
+The folder `.placewise-locate` beside the photos holds the journal and the files as they were. A
+file is changed in this order: its new content is written into the folder; the present file gets a
+second name there (a hard link, or else a copy); the journal gets a line with the SHA-256 of both;
+the new content replaces the file. A process that is killed in between leaves the file as it was or
+as the journal says, never half of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from services.cli.output import printable_path
+from shared.errors import Conflict, Misconfigured, NotFound
+
+FOLDER = ".placewise-locate"
+JOURNAL, BACKUPS, STAGED = "journal.jsonl", "before", "new"
+
+
+@dataclass(frozen=True, slots=True)
+class UndoReport:
+    """What `undo` has done; paths are relative to the folder."""
+
+    restored: list[str]
+    removed: list[str]
+    changed_since: list[str]
+    """files that something else has changed since; they are left as they are"""
+
+
+class UndoJournal:
+    """Replaces files below a folder so that `undo` can restore them. Use `open_journal`."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._folder = root / FOLDER
+        self._journal = self._folder / JOURNAL
+        for name in (BACKUPS, STAGED):
+            (self._folder / name).mkdir(exist_ok=True)
+        lines = _read_lines(self._journal)
+        # Without an incomplete last line, which a killed process has left.
+        _write_synced(self._journal, b"".join(_to_line(line) for line in lines))
+        self._journaled = {line["path"] for line in lines}
+
+    def stage(self, path: Path, content: bytes | None = None) -> Path:
+        """Return a file for the new content of `path`: with this content, or a copy of the file."""
+        staged = self._folder / STAGED / path.name
+        staged.unlink(missing_ok=True)
+        if content is None:
+            shutil.copy2(path, staged)
+        else:
+            staged.write_bytes(content)
+            if path.exists():
+                shutil.copymode(path, staged)
+        return staged
+
+    def install(self, path: Path, staged: Path) -> None:
+        """Replace `path`, which may not exist yet, by a staged file."""
+        path = path.resolve()  # a link stays a link
+        _sync(staged)
+        name = os.path.relpath(path, self._root)
+        line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
+        if name not in self._journaled and line["before"] is not None:
+            line["backup"] = f"{len(list((self._folder / BACKUPS).iterdir())) + 1:06d}"
+            _link_or_copy(path, self._folder / BACKUPS / str(line["backup"]))
+            _sync(self._folder / BACKUPS)
+        with self._journal.open("ab") as file:
+            file.write(_to_line(line))
+            file.flush()
+            os.fsync(file.fileno())
+        self._journaled.add(name)
+        staged.replace(path)
+        _sync(path.parent)
+
+
+@contextmanager
+def open_journal(root: Path) -> Iterator[UndoJournal]:
+    """Open the journal of a folder, or begin one.
+
+    Raises:
+        Conflict: `locate_in_progress`.
+        Misconfigured: `out_unwritable`.
+    """
+    with _exclusive(root):
+        yield UndoJournal(root)
+
+
+def undo(root: Path) -> UndoReport:
+    """Restore all files that the journal of a folder names, and remove the journal.
+
+    A file that something else has changed since stays as it is, and so does the journal then.
+
+    Raises:
+        NotFound: `nothing_to_undo`.
+        Conflict: `locate_in_progress`.
+        Misconfigured: `out_unwritable`.
+    """
+    folder = root / FOLDER
+    if not (folder / JOURNAL).exists():
+        raise NotFound("nothing_to_undo", f"{printable_path(root)} has no journal of changes.")
+    report = UndoReport([], [], [])
+    with _exclusive(root):
+        first: dict[str, dict[str, Any]] = {}
+        written: dict[str, set[str]] = {}
+        for line in _read_lines(folder / JOURNAL):
+            first.setdefault(line["path"], line)
+            written.setdefault(line["path"], set()).add(line["after"])
+        for name, line in first.items():
+            path = root / name
+            present = _sha256(path)
+            if present == line["before"]:
+                continue
+            if present not in written[name]:
+                report.changed_since.append(name)
+            elif line["backup"] is None:
+                path.unlink()
+                report.removed.append(name)
+            else:
+                staged = folder / STAGED / path.name
+                staged.unlink(missing_ok=True)
+                _link_or_copy(folder / BACKUPS / line["backup"], staged)
+                staged.replace(path)
+                report.restored.append(name)
+            if path.parent.exists():
+                _sync(path.parent)
+        if not report.changed_since:
+            (folder / JOURNAL).unlink()
+            shutil.rmtree(folder)
+    return report
+
+
+@contextmanager
+def _exclusive(root: Path) -> Iterator[None]:
+    folder = root / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+        with FileLock(folder / "lock", timeout=0):
+            yield
+    except Timeout as error:
+        raise Conflict(
+            "locate_in_progress",
+            f"Another `placewise locate` changes files in {printable_path(root)}.",
+        ) from error
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"Can't change files in {printable_path(root)}: {error}."
+        ) from error
+
+
+def _read_lines(journal: Path) -> list[dict[str, Any]]:
+    """Return the lines of a journal; an incomplete last line stands for no change."""
+    data = journal.read_bytes() if journal.exists() else b""
+    return [json.loads(line) for line in data.split(b"\n")[:-1]]
+
+
+def _to_line(line: dict[str, Any]) -> bytes:
+    # File names that are no UTF-8 are read back as they were.
+    return json.dumps(line).encode() + b"\n"
+
+
+def _sha256(path: Path) -> str | None:
+    if not path.exists():
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without hard links
+        shutil.copy2(source, target)
+        _sync(target)
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_bytes(content)
+    _sync(partial)
+    partial.replace(path)
+
+
+def _sync(path: Path) -> None:
+    """Force a file or folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,149 @@
+"""Writes accepted proposals: XMP sidecars, EXIF, a CSV table or GPX waypoints."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from xml.etree import ElementTree
+
+from services.cli.locate.exif_writers import find_exif_writer, write_exif
+from services.cli.locate.sidecars import add_position, find_sidecar, sidecar_path
+from services.cli.locate.undo_journal import UndoJournal, open_journal
+from services.cli.output import printable_path
+from shared.errors import PlacewiseError
+from shared.geotagging.fusion import Proposal
+
+GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
+CSV_NAME, GPX_NAME = "placewise-locations.csv", "placewise-locations.gpx"
+
+
+class Target(StrEnum):
+    SIDECAR = "sidecar"
+    EXIF = "exif"
+    CSV = "csv"
+    GPX = "gpx"
+
+
+@dataclass(frozen=True, slots=True)
+class Location:
+    """An accepted proposal: coordinates, or the label of a place, or both."""
+
+    path: Path
+    name: str
+    """relative to the folder"""
+    time: datetime | None
+    """UTC; None if it or its zone is unknown"""
+    proposal: Proposal | None
+    place: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class WriteReport:
+    """What was written; paths are relative to the folder."""
+
+    written: list[str] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    """reasons by photo"""
+
+
+def write_locations(folder: Path, target: Target, locations: Sequence[Location]) -> WriteReport:
+    """Write proposals, with a journal that undoes it.
+
+    Args:
+        folder: The folder that the photos are in.
+        target: What to write.
+        locations: The proposals. Those without coordinates can only be written to a CSV table.
+
+    Raises:
+        Misconfigured: `no_exif_writer`, `out_unwritable`.
+        Conflict: `locate_in_progress`.
+    """
+    report = WriteReport()
+    positions = [(each, each.proposal) for each in locations if each.proposal is not None]
+    if target != Target.CSV:
+        missing = [each.name for each in locations if each.proposal is None]
+        report.skipped.update(dict.fromkeys(missing, "has a place only, which --write csv writes"))
+    write_one = _photo_writer(target)
+    with open_journal(folder) as journal:
+        if write_one is None:
+            name, content = (
+                (CSV_NAME, _to_csv(locations))
+                if target == Target.CSV
+                else (GPX_NAME, _to_gpx(positions))
+            )
+            journal.install(folder / name, journal.stage(folder / name, content))
+            report.written.append(name)
+        else:
+            for location, proposal in positions:
+                try:
+                    path = write_one(journal, location.path, proposal)
+                except PlacewiseError as error:
+                    report.skipped[location.name] = error.detail
+                else:
+                    report.written.append(printable_path(path.relative_to(folder)))
+    return report
+
+
+def _photo_writer(target: Target) -> Callable[[UndoJournal, Path, Proposal], Path] | None:
+    """Return what writes the position of one photo and returns the path of the written file."""
+    if target == Target.SIDECAR:
+        return _write_sidecar
+    if target != Target.EXIF:
+        return None
+    exif_writer = find_exif_writer()
+
+    def write(journal: UndoJournal, photo: Path, proposal: Proposal) -> Path:
+        staged = journal.stage(photo)
+        write_exif(exif_writer, staged, proposal.latitude, proposal.longitude, proposal.radius_68_m)
+        journal.install(photo, staged)
+        return photo
+
+    return write
+
+
+def _write_sidecar(journal: UndoJournal, photo: Path, proposal: Proposal) -> Path:
+    there = find_sidecar(photo)
+    path = there or sidecar_path(photo)
+    content = add_position(
+        there.read_bytes() if there else None,
+        proposal.latitude,
+        proposal.longitude,
+        proposal.radius_68_m,
+    )
+    journal.install(path, journal.stage(path, content))
+    return path
+
+
+def _to_csv(locations: Sequence[Location]) -> bytes:
+    """Return a table that `placewise index --csv` reads."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("filename", "latitude", "longitude", "place"))
+    for each in locations:
+        position = (each.proposal.latitude, each.proposal.longitude) if each.proposal else ("", "")
+        writer.writerow((each.name, *position, each.place or ""))
+    return text.getvalue().encode()
+
+
+def _to_gpx(positions: Sequence[tuple[Location, Proposal]]) -> bytes:
+    root = ElementTree.Element(
+        "gpx", {"xmlns": GPX_NAMESPACE, "version": "1.1", "creator": "Placewise"}
+    )
+    for location, proposal in positions:
+        degrees = {"lat": f"{proposal.latitude:.7f}", "lon": f"{proposal.longitude:.7f}"}
+        point = ElementTree.SubElement(root, "wpt", degrees)
+        if location.time is not None:
+            time = location.time.isoformat().replace("+00:00", "Z")
+            ElementTree.SubElement(point, "time").text = time
+        ElementTree.SubElement(point, "name").text = location.name
+        ElementTree.SubElement(point, "desc").text = (
+            f"{100 * proposal.probability:.1f} % within {proposal.radius_m:.0f} m: "
+            f"{proposal.reason}"
+        )
+    ElementTree.indent(root)
+    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -1,0 +1,1 @@
+"""Positions of photos without coordinates, from the picture, time neighbours and GPX tracks."""

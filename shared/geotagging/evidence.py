@@ -1,0 +1,224 @@
+"""What one source says about where a photo was taken, as a mixture of Gaussians on a plane.
+
+*Picture*: the place model's probabilities of its circles (`shared/evaluation/places/probability`),
+and the other photos that look similar, by the power law of `shared/tracks/evidence`.
+
+*Neighbours in time* and *GPX*: positions of known times before and after the photo, of the same
+camera or of a track. In between the position is interpolated. Between two known times the camera
+moved no faster than the motion model allows, so at dt seconds from a known position the standard
+deviation is that position's accuracy plus half the maximum speed times dt, as in the kernel of
+`shared/tracks/filter`. The two sides are combined by their inverse variances. If the camera moved
+faster between both, this speed counts. OUTLIER_SHARE of such positions are wrong: a clock that was
+set wrong, a photo that another person took, a wrong fix.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, insort
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+
+from shared.geodesy import distance_m
+from shared.geotagging.mixture import Mixture, Plane
+from shared.tracks.evidence import rank_shares
+
+SPACING_M = 12.0
+"""Standard deviation between a photo and the most similar one of the map"""
+FIX_ACCURACY_M = 12.0
+"""Standard deviation of a position in a photo or a GPX track"""
+OUTLIER_SHARE = 0.02
+MAX_SIGMA_M = 1000.0
+"""Known times from which the camera may have moved farther say nothing"""
+
+
+@dataclass(frozen=True, slots=True)
+class SimilarPosition:
+    """Position of a photo of the map that looks similar."""
+
+    latitude: float
+    longitude: float
+    score: float
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class ProbableCircle:
+    """A level of an estimate: a circle, and the probability that it contains the position."""
+
+    latitude: float
+    longitude: float
+    radius_m: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class PictureEvidence:
+    """What a search of the map says about a photo."""
+
+    similar: Sequence[SimilarPosition]
+    """best first, those with coordinates"""
+    circles: Sequence[ProbableCircle]
+    """around the estimated position, finest first; empty without an estimate"""
+    not_in_map: float
+    """probability that the map has no photo of the place"""
+    photo_count: int
+    """number of photos of the map"""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPosition:
+    """Where a camera or a traveller was at a time."""
+
+    time: datetime
+    latitude: float
+    longitude: float
+    name: str = ""
+    """of the photo; empty for a point of a GPX track"""
+
+
+@dataclass(frozen=True, slots=True)
+class DatedPhoto:
+    """A photo with what its file says about when, where and by which camera it was taken."""
+
+    name: str
+    time: datetime | None
+    """UTC, or the camera's clock as if it were UTC"""
+    time_zone_is_known: bool
+    camera: str | None
+    latitude: float | None
+    longitude: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class InterpolatedPosition:
+    """Where a photo was taken according to known positions before and after it."""
+
+    latitude: float
+    longitude: float
+    sigma_m: float
+    """standard deviation in each direction"""
+    nearest: KnownPosition
+    """in time"""
+    seconds: float
+    """from the nearest to the photo; negative if the photo was taken before"""
+
+
+def picture_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
+    """Return the density of the position according to the picture.
+
+    The probability that lies between two circles goes to the similar photos there, and what these
+    do not explain to a Gaussian that has most of its weight within the outer circle. The photos
+    outside of all circles share what is left with the photos of the map that were not found.
+    """
+    scores = np.array([photo.score for photo in evidence.similar], dtype=np.float64)
+    shares, rest = rank_shares(scores, max(evidence.photo_count, len(scores)))
+    at = [plane.to_metres(photo.latitude, photo.longitude) for photo in evidence.similar]
+    if not evidence.circles:
+        known = 1 - evidence.not_in_map
+        components = [
+            (mean, SPACING_M, known * share)
+            for mean, share in zip(at, shares.tolist(), strict=True)
+        ]
+        return Mixture.of(components, evidence.not_in_map + known * rest)
+    centre = plane.to_metres(evidence.circles[0].latitude, evidence.circles[0].longitude)
+    away = np.array([math.dist(mean, centre) for mean in at], dtype=np.float64)
+    finest = evidence.circles[0]
+    outside = away > finest.radius_m
+    others = max(0.0, 1 - finest.probability - evidence.not_in_map)
+    weights = others * shares / max(float(shares[outside].sum()) + rest, 1e-12) * outside
+    components = [(centre, finest.radius_m / 2, finest.probability)]
+    components += [
+        (mean, SPACING_M, weight) for mean, weight in zip(at, weights.tolist(), strict=True)
+    ]
+    for inner, outer in zip(evidence.circles, evidence.circles[1:], strict=False):
+        ring = (away > inner.radius_m) & (away <= outer.radius_m)
+        missing = outer.probability - inner.probability - float(weights[ring].sum())
+        components.append((centre, outer.radius_m / 2, max(0.0, missing)))
+    explained = sum(weight for _, _, weight in components)
+    return Mixture.of(components, max(evidence.not_in_map, 1 - explained))
+
+
+def interpolate_position(
+    known: Sequence[KnownPosition], time: datetime, max_speed_mps: float
+) -> InterpolatedPosition | None:
+    """Interpolate the position at a time.
+
+    Args:
+        known: In the order of their times.
+        time: Comparable with the times of `known`.
+        max_speed_mps: Maximum speed of the motion in m/s.
+
+    Returns:
+        None if no known time is near enough to say anything (MAX_SIGMA_M).
+    """
+    index = bisect_left(known, time, key=lambda position: position.time)
+    sides = [*known[max(index - 1, 0) : index], *known[index : index + 1]]
+    if not sides:
+        return None
+    gaps = [abs((time - side.time).total_seconds()) for side in sides]
+    speed = max_speed_mps
+    share = 0.0
+    if len(sides) == 2 and sum(gaps) > 0:
+        moved = distance_m(
+            sides[0].latitude, sides[0].longitude, sides[1].latitude, sides[1].longitude
+        )
+        speed = max(speed, moved / sum(gaps))
+        share = gaps[0] / sum(gaps)
+    sigmas = [FIX_ACCURACY_M + speed * gap / 2 for gap in gaps]
+    sigma = sum(sigma**-2 for sigma in sigmas) ** -0.5
+    if sigma > MAX_SIGMA_M:
+        return None
+    plane = Plane(sides[0].latitude, sides[0].longitude)
+    east, north = plane.to_metres(sides[-1].latitude, sides[-1].longitude)
+    nearest = sides[gaps.index(min(gaps))]
+    return InterpolatedPosition(
+        *plane.to_degrees(share * east, share * north),
+        sigma,
+        nearest,
+        (time - nearest.time).total_seconds(),
+    )
+
+
+class TimeNeighbours:
+    """The photos with time and coordinates, by the camera whose times and way they show.
+
+    The times of one camera can be compared without their time zone, but not with times in UTC.
+
+    Args:
+        photos: All photos of a folder, in any order.
+        together: Whether the people with the cameras travelled together.
+    """
+
+    def __init__(self, photos: Sequence[DatedPhoto], together: bool) -> None:
+        self._together = together
+        self._known: dict[tuple[str, bool] | None, list[KnownPosition]] = {}
+        for photo in photos:
+            if photo.time is None or photo.latitude is None or photo.longitude is None:
+                continue
+            position = KnownPosition(photo.time, photo.latitude, photo.longitude, photo.name)
+            known = self._known.setdefault(self._clock(photo), [])
+            insort(known, position, key=lambda each: each.time)
+        self._known.pop(None, None)
+
+    def position_of(self, photo: DatedPhoto, max_speed_mps: float) -> InterpolatedPosition | None:
+        """Interpolate the position of a photo without coordinates; None if nothing is known."""
+        known = self._known.get(self._clock(photo), ())
+        if photo.time is None:
+            return None
+        return interpolate_position(known, photo.time, max_speed_mps)
+
+    def _clock(self, photo: DatedPhoto) -> tuple[str, bool] | None:
+        """Return what photos with comparable times have in common; None for unknown cameras."""
+        if self._together:
+            return "", photo.time_zone_is_known
+        return None if photo.camera is None else (photo.camera, photo.time_zone_is_known)
+
+
+def position_mixture(position: InterpolatedPosition, plane: Plane) -> Mixture:
+    """Return the density of the position according to positions of known times."""
+    mean = plane.to_metres(position.latitude, position.longitude)
+    return Mixture.of([(mean, position.sigma_m, 1 - OUTLIER_SHARE)], OUTLIER_SHARE)

@@ -1,0 +1,119 @@
+"""Proposes where a photo was taken: the product of what its sources say, and why.
+
+The sources are taken as independent given the position. Neighbours in time that have no coordinates
+themselves do not count: photos of one burst look alike, so that their pictures are one evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+from shared.geodesy import distance_m
+from shared.geotagging.evidence import (
+    InterpolatedPosition,
+    PictureEvidence,
+    picture_mixture,
+    position_mixture,
+)
+from shared.geotagging.mixture import REGION_RADIUS_M, Mixture, Plane
+
+CONTRADICTION = 0.5
+"""Probability of a source for elsewhere from which it is named as contradicting"""
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """Where a photo was probably taken."""
+
+    latitude: float
+    longitude: float
+    radius_m: float
+    probability: float
+    """that the photo was taken within `radius_m` of the position"""
+    radius_68_m: float
+    reason: str
+
+
+def propose_position(
+    picture: PictureEvidence | None,
+    neighbours: InterpolatedPosition | None,
+    track: InterpolatedPosition | None,
+    radius_m: float,
+) -> Proposal | None:
+    """Combine what is known about a photo.
+
+    Args:
+        picture: The search of a map with the photo.
+        neighbours: Interpolated between photos with coordinates.
+        track: Interpolated on a GPX track.
+        radius_m: Radius of the proposal.
+
+    Returns:
+        The most probable circle; None if no source has a position.
+    """
+    plane = _plane(picture, neighbours, track)
+    if plane is None:
+        return None
+    sources: list[tuple[Mixture, str, str]] = []
+    if picture is not None:
+        mixture = picture_mixture(picture, plane)
+        sources.append((mixture, "", "the picture looks like elsewhere"))
+    if neighbours is not None:
+        text = f"taken {_after(neighbours.seconds)} {neighbours.nearest.name}"
+        sources.append((position_mixture(neighbours, plane), text, f"not where it was {text}"))
+    if track is not None:
+        text = f"GPX track, {_after(track.seconds)} a point"
+        sources.append((position_mixture(track, plane), text, "not on the GPX track"))
+    product = reduce(Mixture.times, (mixture for mixture, _, _ in sources))
+    centre, probability = product.best_circle(radius_m)
+    latitude, longitude = plane.to_degrees(*centre)
+    reasons = []
+    for mixture, supports, contradicts in sources:
+        within = mixture.probability_within(centre, radius_m)
+        if within > (radius_m / REGION_RADIUS_M) ** 2:
+            reasons.append(supports or _looks_like(picture, latitude, longitude, radius_m))
+        elif 1 - mixture.uniform - within > CONTRADICTION:
+            reasons.append(contradicts)
+    return Proposal(
+        round(latitude, 7),
+        round(longitude, 7),
+        radius_m,
+        probability,
+        product.radius_m(centre, 0.68),
+        "; ".join(reasons),
+    )
+
+
+def _plane(
+    picture: PictureEvidence | None,
+    neighbours: InterpolatedPosition | None,
+    track: InterpolatedPosition | None,
+) -> Plane | None:
+    """Return a plane around a position that some source has; None if there is none."""
+    for known in (track, neighbours):
+        if known is not None:
+            return Plane(known.latitude, known.longitude)
+    if picture is not None and picture.circles:
+        return Plane(picture.circles[0].latitude, picture.circles[0].longitude)
+    if picture is not None and picture.similar:
+        return Plane(picture.similar[0].latitude, picture.similar[0].longitude)
+    return None
+
+
+def _looks_like(
+    picture: PictureEvidence | None, latitude: float, longitude: float, radius_m: float
+) -> str:
+    photos: Sequence[str] = [
+        photo.name
+        for photo in (picture.similar if picture else ())
+        if distance_m(latitude, longitude, photo.latitude, photo.longitude) <= radius_m
+    ]
+    return f"looks like {photos[0]}" if photos else "the picture"
+
+
+def _after(seconds: float) -> str:
+    length = abs(seconds)
+    text = f"{length:.0f} s" if length < 99.5 else f"{length / 60:.0f} min"
+    return f"{text} {'before' if seconds < 0 else 'after'}"

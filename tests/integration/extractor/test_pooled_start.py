@@ -1,0 +1,167 @@
+"""Maps that begin with GeM-pooled descriptors until they have a vocabulary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select
+
+from services.extractor.generation_resolver import reindex_outdated_generations
+from services.extractor.worker import ExtractorWorker
+from services.steward.tasks.model_changes import auto_fit_vocabularies
+from shared.catalog.database.session import Catalog
+from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
+from shared.catalog.maps import Map
+from shared.catalog.vocabularies import vocabulary_standing
+from shared.config.settings import Settings
+from shared.descriptors.vocabulary import encode_centres, parse_centres
+from shared.jobs import Job, JobKind, JobState
+from shared.storage import FolderStore
+from shared.storage.keys import new_vocabulary_key
+from tests.integration.in_process_api import Service
+from tests.integration.workplace import Workplace, expected_row, same
+from tests.support.catalog_rows import set_columns
+from tests.support.photos import photo_bytes
+from tests.support.vit import random_weights, save
+
+VLAD = "test-tiny-vlad"
+POOLED = "test-tiny-vlad:aggregator=gem"
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    path = tmp_path / "dinov2_vits14_pretrain.pth"
+    monkeypatch.setenv("DINO_WEIGHTS", str(path))
+    return path
+
+
+@pytest.fixture
+def settings(weights: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    monkeypatch.delenv("POOL_WITHOUT_VOCABULARY")
+    found = Settings()
+    assert found.pool_without_vocabulary, "it is the default"
+    return found
+
+
+@pytest.fixture
+def pooled(vlads: Workplace) -> Workplace:
+    """A map of four photos, described before it has a vocabulary."""
+    vlads.upload(*range(4))
+    vlads.drain()
+    return vlads
+
+
+def extractors(workplace: Workplace) -> tuple[str, str, str]:
+    """Extractor of the map, that of its active generation, and the standing of its vocabulary."""
+    with workplace.catalog.read() as session:
+        generation = workplace.active()
+        map_ = session.get_one(Map, workplace.map_id)
+        return map_.extractor, generation.extractor, vocabulary_standing(session, generation)
+
+
+def newest_job(workplace: Workplace, kind: JobKind) -> UUID | None:
+    with workplace.catalog.read() as session:
+        of_kind = select(Job.id).where(Job.kind == kind).order_by(Job.id.desc())
+        return session.scalars(of_kind.limit(1)).first()
+
+
+def test_the_first_photo_is_described_by_pooling_the_same_local_features(
+    pooled: Workplace,
+) -> None:
+    assert extractors(pooled) == (VLAD, POOLED, "pending")
+    assert pooled.searchable() == 4
+    rows = pooled.rows()
+    assert any(same(row, expected_row(POOLED, photo_bytes(2))) for row in rows.values())
+    query = pooled.ask(photo_bytes(9))
+    pooled.drain()
+    assert pooled.job(query).state == JobState.SUCCEEDED
+
+
+def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_answer(
+    pooled: Workplace,
+) -> None:
+    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 5)
+    assert newest_job(pooled, JobKind.FIT) is None
+    photo_ids = pooled.upload(4)
+    pooled.drain()
+    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 5)
+    fit = newest_job(pooled, JobKind.FIT)
+    assert fit is not None
+
+    def answers_meanwhile() -> None:
+        if pooled.job(fit).state in UNFINISHED_STATES:
+            assert extractors(pooled) == (VLAD, POOLED, "pending")
+            assert pooled.searchable() == 5
+
+    assert pooled.finish(fit, answers_meanwhile).state == JobState.SUCCEEDED
+    assert extractors(pooled) == (VLAD, VLAD, "provisional")
+    assert pooled.searchable() == 5
+    assert len(pooled.rows()[photo_ids[0]]) == 16 * pooled.active().spec["clusters"]
+
+
+def test_an_imported_vocabulary_ends_the_pooling(pooled: Workplace, store: FolderStore) -> None:
+    centres = parse_centres(expected_row("test-tiny-avg", photo_bytes(1))[None])
+    key = new_vocabulary_key()
+    store.put(key, encode_centres(centres))
+    job = pooled.start(JobKind.IMPORT, object_key=key, filename="centres.npy")
+    assert pooled.finish(job).state == JobState.SUCCEEDED
+    assert extractors(pooled) == (VLAD, VLAD, "foreign")
+
+
+def test_describing_the_photos_again_leaves_the_vocabulary_pending(
+    pooled: Workplace,
+) -> None:
+    generation = pooled.active()
+    spec = {**generation.spec, "decoder": "of another release"}
+    with pooled.catalog.write() as session:
+        outdated = session.get_one(type(generation), generation.id)
+        outdated.spec, outdated.spec_fingerprint = spec, "0" * 64
+    started = reindex_outdated_generations(pooled.catalog, pooled.worker._models)
+    assert started == 1
+    switch = newest_job(pooled, JobKind.SWITCH)
+    assert switch is not None
+    assert pooled.finish(switch).state == JobState.SUCCEEDED
+    assert pooled.active().id != generation.id
+    assert extractors(pooled) == (VLAD, POOLED, "pending")
+
+
+def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabulary(
+    pooled: Workplace,
+) -> None:
+    job = pooled.start(JobKind.SWITCH, vocabulary_id=None, extractor=POOLED)
+    assert pooled.finish(job).state == JobState.SUCCEEDED
+    assert extractors(pooled) == (POOLED, POOLED, "none")
+    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 1)
+    assert newest_job(pooled, JobKind.FIT) is None
+
+
+def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(
+    vlads: Workplace, make_worker: Callable[[], ExtractorWorker]
+) -> None:
+    (photo_id,) = vlads.upload(1)
+    set_columns(vlads.catalog, vlads.job_of(photo_id).id, waiting_for=WaitingFor.VOCABULARY)
+    vlads.drain()
+    assert vlads.job_of(photo_id).state == JobState.QUEUED
+    make_worker().warm_up()
+    vlads.drain()
+    assert vlads.searchable() == 1
+
+
+def test_a_dinov2_map_answers_from_its_first_photo_and_says_that_its_vocabulary_is_pending(
+    service: Service, catalog: Catalog, weights: Path
+) -> None:
+    from shared.descriptors.backbones.dinov2 import SHAPES
+
+    save(random_weights(SHAPES["vits14"], blocks=1), weights)
+    extractor = "anyloc-vits14:clusters=2,layer=0"
+    service.json("POST", "/maps", 201, json={"name": "city", "extractor": extractor})
+    first, _ = service.indexed(1, 2, map_name="city")
+    answer = service.json("POST", f"/similarity/{first}", params={"map": "city"})
+    assert answer["vocabulary"] == "pending"
+    assert len(answer["similar_images"]) == 1
+    stats = service.json("GET", "/database/stats", params={"map": "city"})
+    assert (stats["vocabulary"], stats["feature_dimension"]) == ("pending", 384)
+    assert service.json("GET", "/maps/city")["extractor"] == extractor

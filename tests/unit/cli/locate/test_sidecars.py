@@ -1,0 +1,117 @@
+"""XMP sidecars: coordinates are added and read back, and nothing else changes."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pyexiv2
+import pytest
+from PIL import Image
+
+from services.cli.locate.sidecars import (
+    EXIF,
+    add_position,
+    embedded_xmp,
+    find_sidecar,
+    read_position,
+)
+from shared.errors import Unprocessable
+from tests.support.photos import photo_image
+
+DARKTABLE = b"""<?xml version="1.0" encoding="UTF-8"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/" x:xmptk="XMP Core 4.4.0-Exiv2">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="uuid:1"
+    xmlns:xmp="http://ns.adobe.com/xap/1.0/"
+    xmlns:darktable="http://darktable.sf.net/"
+   xmp:Rating="4"
+   darktable:history_end="0">
+   <darktable:history><rdf:Seq/></darktable:history><!-- a comment -->
+  </rdf:Description>
+ </rdf:RDF>
+</x:xmpmeta>
+"""
+PLACES = [(48.8583736, 2.2944813), (-33.8567844, 151.2152967), (-0.0000001, -179.9999999), (0, 0)]
+
+
+@pytest.mark.parametrize(("latitude", "longitude"), PLACES)
+def test_coordinates_are_read_back_within_a_decimetre(latitude: float, longitude: float) -> None:
+    for existing in (None, DARKTABLE):
+        sidecar = add_position(existing, latitude, longitude, 12.0)
+        assert read_position(sidecar) == pytest.approx((latitude, longitude), abs=1e-6)
+
+
+def test_a_sidecar_is_edited_and_not_replaced() -> None:
+    edited = add_position(DARKTABLE, *PLACES[0], 12.0)
+    begin = edited.index(b"<rdf:Description rdf:about", DARKTABLE.index(b"<rdf:Description") + 1)
+    end = edited.index(b"</rdf:RDF>")
+    assert edited[:begin] + edited[end:] == DARKTABLE
+    assert b'rdf:about="uuid:1"' in edited[begin:end], "the same subject"
+    assert b'exif:GPSLatitude="48,51.502416N"' in edited
+
+
+def test_coordinates_that_are_there_are_not_changed() -> None:
+    sidecar = add_position(None, *PLACES[0], 12.0)
+    with pytest.raises(Unprocessable) as refusal:
+        add_position(sidecar, *PLACES[1], 12.0)
+    assert refusal.value.code == "has_coordinates"
+    as_element = DARKTABLE.replace(
+        b"<!-- a comment -->",
+        f'<e:GPSLatitude xmlns:e="{EXIF}">48,51.5N</e:GPSLatitude>'.encode(),
+    )
+    with pytest.raises(Unprocessable):
+        add_position(as_element, *PLACES[1], 12.0)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [b"", b"<x/>", b"no XML", DARKTABLE[:200], DARKTABLE.decode().encode("utf-16")],
+)
+def test_what_is_no_sidecar_is_refused(broken: bytes) -> None:
+    with pytest.raises(Unprocessable) as refusal:
+        add_position(broken or b" ", *PLACES[0], 12.0)
+    assert refusal.value.code == "bad_sidecar"
+    assert read_position(broken) is None
+
+
+def test_a_property_that_is_there_is_not_written_twice() -> None:
+    with_datum = DARKTABLE.replace(
+        b'xmp:Rating="4"', f'xmlns:exif="{EXIF}" exif:GPSMapDatum="WGS-84"'.encode()
+    )
+    assert add_position(with_datum, *PLACES[0], 12.0).count(b"GPSMapDatum") == 1
+
+
+def test_the_sidecar_with_the_whole_name_comes_first(tmp_path: Path) -> None:
+    photo = tmp_path / "a.jpg"
+    assert find_sidecar(photo) is None
+    (tmp_path / "a.xmp").write_bytes(DARKTABLE)
+    assert find_sidecar(photo) == tmp_path / "a.xmp"
+    (tmp_path / "a.jpg.xmp").write_bytes(DARKTABLE)
+    assert find_sidecar(photo) == tmp_path / "a.jpg.xmp"
+
+
+def test_coordinates_in_the_xmp_of_a_photo_are_read() -> None:
+    photo = io.BytesIO()
+    photo_image(1).save(photo, "JPEG", xmp=add_position(None, *PLACES[0], 12.0))
+    xmp = embedded_xmp(photo)
+    assert xmp is not None
+    assert read_position(xmp) == pytest.approx(PLACES[0], abs=1e-6)
+    assert embedded_xmp(io.BytesIO(b"no photo")) is None
+    plain = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(plain, "PNG")
+    assert embedded_xmp(plain) is None
+
+
+@pytest.mark.parametrize("existing", [None, DARKTABLE])
+def test_exiv2_reads_the_sidecar_as_darktable_and_digikam_do(
+    existing: bytes | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.jpg.xmp"
+    path.write_bytes(add_position(existing, *PLACES[1], 12.4))
+    with pyexiv2.Image(str(path)) as sidecar:
+        values = sidecar.read_xmp()
+    assert values["Xmp.exif.GPSLatitude"] == "33,51.407064S"
+    assert values["Xmp.exif.GPSLongitude"] == "151,12.917802E"
+    assert values["Xmp.exif.GPSHPositioningError"] == "12/1"
+    assert values.get("Xmp.xmp.Rating") == ("4" if existing else None)
