@@ -51,6 +51,10 @@ def query(
     tags: Annotated[
         str | None, typer.Option(help="Only photos that have all of these comma-separated tags.")
     ] = None,
+    tags_like: Annotated[
+        str | None,
+        typer.Option(help="Only photos whose tags contain all of these comma-separated parts."),
+    ] = None,
     word_weights: Annotated[
         bool,
         typer.Option(
@@ -101,6 +105,7 @@ def query(
                 captured_before=captured_before,
                 place=place,
                 tags=tags,
+                tags_like=tags_like,
                 word_weights=None if word_weights else False,
                 certainty=certainty,
             )

@@ -221,7 +221,7 @@ def frame_of(map_: SequenceMap, time_: datetime, scores: Rows) -> FrameEvidence:
             RankedPhoto(score, map_.locations[p]) for p, score in zip(order, found, strict=True)
         ]
         estimate = map_.model.estimate(
-            ranking, _neighbours(map_, int(order[0])), map_.scheme, 0.95, map_.scheme.radii_m[0]
+            ranking, own_neighbours(map_, int(order[0])), map_.scheme, 0.95, map_.scheme.radii_m[0]
         )
         if estimate is not None:
             not_in_map = estimate.not_in_map
@@ -232,7 +232,8 @@ def frame_of(map_: SequenceMap, time_: datetime, scores: Rows) -> FrameEvidence:
     )
 
 
-def _neighbours(map_: SequenceMap, photo: int) -> list[RankedPhoto]:
+def own_neighbours(map_: SequenceMap, photo: int) -> list[RankedPhoto]:
+    """Return the ranking of a photo of the map, without it."""
     scores = map_.rows @ map_.rows[photo]
     scores[photo] = -np.inf
     order = np.argsort(-scores, kind="stable")[: min(EVIDENCE_DEPTH, len(scores) - 1)]

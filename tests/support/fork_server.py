@@ -37,6 +37,7 @@ MODULES = (
     "services.steward.batches.worker",
     "services.steward.evaluation_worker",
     "services.steward.scheduler",
+    "services.trainer.run",
     "shared.jobs.celery_wakeups",
     "shared.storage.open_store",
     "shared.descriptors.extractor",

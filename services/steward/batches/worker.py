@@ -49,7 +49,7 @@ from shared.catalog.jobs import WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
-from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
+from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES, photo_suffix
 from shared.ingest.photo_metadata import parse_relative_path
 from shared.ingest.store_photo import PhotoQuota, StoreResult, insert_photo, retry_on_conflict
 from shared.ingest.validation import (
@@ -105,7 +105,8 @@ class BatchItemImporter:
             Unavailable, OSError: The object store can't be reached.
         """
         uploaded = job.params["source"] == BatchSource.FILES
-        key = item.object_key if uploaded and item.object_key else new_original_key()
+        new_key = new_original_key(photo_suffix(item.name))
+        key = item.object_key if uploaded and item.object_key else new_key
         try:
             stored_upload = (
                 self._received_upload(item) if uploaded else self._copy_to_store(job, item, key)

@@ -83,7 +83,7 @@ function askEntry(map, onfile, signal) {
 }
 
 /** The answer to a photo, stored or not; `onjob` is told while it takes longer than a moment. */
-async function findSimilar(path, query, file, onjob, signal) {
+export async function findSimilar(path, query, file, onjob, signal) {
   const form = file ? new FormData() : null;
   form?.append("file", file, file.name);
   let response = await ask(path, {
