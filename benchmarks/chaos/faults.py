@@ -12,7 +12,7 @@ from redis import Redis
 
 from benchmarks.fleet import Fleet
 from benchmarks.fleet.fault_injection import MessageDuplicator, ProxyMode
-from tests.support.servers.daemon import Daemon
+from tests.support.servers.handle import Handle
 
 # Services whose clock is wrong during the whole run, by so many seconds. S3 servers reject what is
 # signed with a clock that is off by more than 900.
@@ -108,7 +108,7 @@ def _duplicate_messages(fleet: Fleet, seconds: float) -> Iterator[None]:
         time.sleep(seconds)
 
 
-def _stop_server(choose: Callable[[Fleet], Daemon | None]) -> _FaultContext:
+def _stop_server(choose: Callable[[Fleet], Handle | None]) -> _FaultContext:
     @contextlib.contextmanager
     def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
         server = choose(fleet)

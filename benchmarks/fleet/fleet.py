@@ -30,7 +30,8 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
-from tests.support.servers.daemon import Daemon, free_ports
+from tests.support.servers.daemon import free_ports
+from tests.support.servers.handle import Handle
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ class Servers:
     s3_proxy: FaultProxy
 
     @property
-    def processes(self) -> dict[str, Daemon]:
+    def processes(self) -> dict[str, Handle]:
         """Server processes by name."""
         found = {
             "PostgreSQL": self.postgres.process,

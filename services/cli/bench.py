@@ -26,6 +26,7 @@ DEV_PACKAGES = (
     "faiss",
     "psutil",
     "pytest",
+    "testcontainers",
     "threadpoolctl",
 )
 

@@ -10,12 +10,13 @@ import signal
 import socket
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
+
+from tests.support.servers.handle import wait_until
 
 START_SECONDS = 60.0
 STOP_SECONDS = 60.0  # SeaweedFS takes half of it
@@ -86,26 +87,9 @@ def has_ended(process: psutil.Process) -> bool:
         return True
 
 
-def wait_until(
-    answers: Callable[[], bool], seconds: float, failed: Callable[[], str | None], name: str
-) -> None:
-    """AssertionError when it does not answer in time, or `failed` says why it never will."""
-    deadline = time.monotonic() + seconds
-    while not answers():
-        reason = failed()
-        if reason is not None:
-            raise AssertionError(f"{name} ended: {reason}")
-        if time.monotonic() > deadline:
-            raise AssertionError(f"{name} did not answer in {seconds:g} s")
-        time.sleep(0.02)
-
-
 @dataclass
 class Daemon:
-    """One server, which keeps its port and its data until it is closed.
-
-    `folder` is its own, and goes with it.
-    """
+    """One server. `folder` is its own, and goes with it."""
 
     name: str
     command: Sequence[str]
@@ -116,7 +100,6 @@ class Daemon:
     _watcher: subprocess.Popen[bytes] | None = field(default=None, init=False)
 
     def start(self) -> None:
-        """Start it (again) and wait until it answers."""
         with self._log.open("ab") as log:
             process = self._process = subprocess.Popen(
                 self.command,
@@ -140,14 +123,12 @@ class Daemon:
         )
 
     def stop(self) -> None:
-        """End it in good order."""
         process = self._running()
         process.send_signal(self.stop_signal)
         process.wait(timeout=STOP_SECONDS)
         self._ended()
 
     def kill(self) -> None:
-        """SIGKILL; returns when all its processes have ended."""
         process = self._running()
         # PostgreSQL's backends end by themselves, but later: until then it can't start again.
         family = list(self._family()) if process.poll() is None else []
@@ -164,7 +145,6 @@ class Daemon:
         self._ended()
 
     def pause(self) -> None:
-        """SIGSTOP: connections stand, nothing is answered."""
         for process in self._family():
             process.suspend()
 
@@ -176,7 +156,6 @@ class Daemon:
         return cpu_seconds_of(self._running().pid)
 
     def close(self) -> None:
-        """End it for good, and remove its data."""
         if self._process is not None:
             self.kill()
         shutil.rmtree(self.folder, ignore_errors=True)

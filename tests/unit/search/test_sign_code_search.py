@@ -19,7 +19,7 @@ from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import Mode, SearchResponse
-from tests.support.servers.daemon import wait_until
+from tests.support.servers.handle import wait_until
 from tests.unit.search.search_rows import (
     Case,
     answer,
