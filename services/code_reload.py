@@ -13,7 +13,7 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("placewise", "services", "shared")
+CODE_FOLDERS = tuple(ROOT / package for package in ("placewise", "services", "shared"))
 
 
 def can_reload() -> bool:
@@ -22,8 +22,7 @@ def can_reload() -> bool:
 
 
 def watch_code(
-    on_change: Callable[[], object],
-    folders: Iterable[Path] = tuple(ROOT / package for package in PACKAGES),
+    on_change: Callable[[], object], folders: Iterable[Path] = CODE_FOLDERS
 ) -> threading.Event:
     """Call `on_change` once, in a thread of its own, when a Python file below the folders changes.
 

@@ -36,6 +36,7 @@ from services.trainer.run_folder import (
     create_run_folder,
     find_run,
     load_resumed_arguments,
+    lock_folder,
 )
 from services.trainer.summary import build_summary, print_data_sets
 from services.trainer.training_loop import TrainingLoop, TrainingRun
@@ -132,7 +133,8 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     prepared = TrainingRun(
         arguments, device, training_set, sets.validation, model, folder, history, checkpoints
     )
-    return _train(prepared, sets, display, stop)
+    with contextlib.nullcontext() if arguments.fast_dev_run else lock_folder(folder):
+        return _train(prepared, sets, display, stop)
 
 
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
@@ -149,10 +151,18 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
 
     Raises:
         NotFound: `run_not_found`.
-        Conflict: `run_differs`, for changed photos or a change that `--resume` does not allow.
+        Conflict: `run_differs`, for changed photos or a change that `--resume` does not allow;
+            `run_in_use`, while another process trains it.
         Unprocessable: `run_unreadable`, `checkpoint_unreadable`. Also raises what `run` raises.
     """
     folder, checkpoint = find_run(path)
+    with lock_folder(folder):
+        return _resume(folder, checkpoint, changes, display, stop)
+
+
+def _resume(
+    folder: Path, checkpoint: Path, changes: Json, display: Display, stop: StopRequest
+) -> Json:
     arguments = load_resumed_arguments(folder, changes)
     if arguments.experiment_phase == "test":
         raise InvalidRequest(

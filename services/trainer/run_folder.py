@@ -3,6 +3,7 @@
 config.yaml           every argument, resolved
 history.json          metrics of the epochs so far; `--resume` needs it
 metrics.json          summary, written at the end
+run.lock              locked while a process trains
 checkpoints/          the best checkpoints, and last.ckpt
 predictions_SET.npy   (queries, 20) database indices of each test set, best first
 predictions/epochNN/  the same of each validation, with `save_val_predictions`
@@ -11,13 +12,16 @@ csv/  tensorboard/    output of the loggers
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from services.trainer.arguments import TrainingArguments, build_arguments, load_yaml, to_plain_dict
 from services.trainer.checkpointing import format_folder, safe_filename
@@ -25,6 +29,7 @@ from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 
 CHECKPOINTS_FOLDER = "checkpoints"
 CONFIG_FILE = "config.yaml"
+LOCK_FILE = "run.lock"
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FOLDER = "predictions"
 VALIDATION_KS = (1, 5, 10, 15, 20)
@@ -99,6 +104,26 @@ def find_run(resume: Path) -> tuple[Path, Path]:
                 "first step has no checkpoint.",
             )
     return folder, checkpoint
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock the folder of a run or grid for this process while the block runs.
+
+    Raises:
+        Conflict: `run_in_use`.
+    """
+    lock = FileLock(folder / LOCK_FILE, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise Conflict(
+            "run_in_use", f"Another process trains in {folder}. Wait for it, or stop it."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:

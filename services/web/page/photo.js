@@ -45,7 +45,9 @@ async function show(image) {
     }
     // Until the preview is made, the original is shown, where the browser can.
     const { job_id: jobId } = await response.json();
-    await draw(image, await ask(original)).finally(() => waited || showWhenMade(image, jobId).catch(noteError));
+    await draw(image, await ask(original)).finally(() => {
+      if (!waited) showWhenMade(image, jobId).catch(noteError);
+    });
   } catch {
     image.classList.add("missing");
     image.alt = `${image.alt} (can't be loaded)`;

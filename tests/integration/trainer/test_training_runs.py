@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 from services.cli.main import build_app
 from services.trainer import run
 from services.trainer.arguments import build_arguments, load_yaml
+from services.trainer.grid import GridPlan, run_grid
 from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
+from services.trainer.run_folder import lock_folder
 from shared.descriptors.backbones.trained import TrainedBackbone
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
@@ -325,6 +327,16 @@ def test_damaged_and_foreign_files_of_a_run_are_clear_errors(copy: Path, places:
     assert refusal_of_resume(copy)[0] == "run_unreadable"
     config.write_text("lr: [")
     assert refusal_of_resume(copy)[0] == "bad_config"
+
+
+def test_a_run_or_grid_that_another_process_trains_is_left_alone(copy: Path) -> None:
+    with lock_folder(copy):
+        code, detail = refusal_of_resume(copy, max_epochs=3)
+    assert code == "run_in_use"
+    assert str(copy) in detail
+    plan, nothing = GridPlan((), {}), lambda outcomes: None
+    with lock_folder(copy), pytest.raises(Conflict, match="Another process"):
+        run_grid(plan, copy, NullDisplay(), StopRequest(), nothing)
 
 
 def test_a_compiled_network_learns_the_same_and_leaves_an_ordinary_checkpoint(
