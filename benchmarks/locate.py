@@ -1,7 +1,7 @@
 """`placewise locate` on generated walks: photos proposed, and how many of them are right.
 
     placewise datasets synth CITY --places 300 --rides 500 --no-ladder --no-train
-    python -m benchmarks.locate CITY [--seeds 10]
+    python -m benchmarks.locate CITY [--seeds 10] [--share 0.15]
 
 The rides of the city are slowed down to walks; where a ride jumps to another street, half an hour
 passes. A photo is taken at a random share of the frames, and a random half of the photos loses its
@@ -46,7 +46,6 @@ START = datetime(2026, 5, 1, tzinfo=UTC)
 SECONDS_A_FRAME = 6.0  # of 6 to 10 m
 JUMP_M = 50.0
 JUMP_SECONDS = 1800.0
-PHOTO_SHARE = 0.15
 POINT_FRAMES = 5
 POINT_NOISE_M = 5.0
 CLOCK_ERROR_SECONDS = 10.0
@@ -68,13 +67,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("city", type=Path)
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--share", type=float, default=0.15, help="frames that are photos")
     arguments = parser.parse_args()
     map_, rides = describe_rides(arguments.city)
     for name, frames, scores in rides:
         pictures = [picture_of(map_, row) for row in scores]
         judged: dict[str, list[Judged]] = {}
         for seed in range(arguments.seeds):
-            for source, proposals in locate_walk(frames, pictures, seed).items():
+            for source, proposals in locate_walk(frames, pictures, seed, arguments.share).items():
                 judged.setdefault(source, []).extend(proposals)
         print_table(figures_table(name, judged))
 
@@ -128,7 +128,7 @@ def picture_of(map_: SequenceMap, scores: NDArray[np.float32]) -> PictureEvidenc
 
 
 def locate_walk(
-    frames: Sequence[DatasetPhoto], pictures: Sequence[PictureEvidence], seed: int
+    frames: Sequence[DatasetPhoto], pictures: Sequence[PictureEvidence], seed: int, share: float
 ) -> dict[str, list[Judged]]:
     """Draw photos of a walk, and judge what is proposed for those without coordinates."""
     rng = np.random.default_rng(seed)
@@ -145,7 +145,7 @@ def locate_walk(
         )
         for point in known[::POINT_FRAMES]
     ]
-    taken = np.flatnonzero(rng.random(len(frames)) < PHOTO_SHARE)
+    taken = np.flatnonzero(rng.random(len(frames)) < share)
     stripped = rng.random(len(taken)) < 0.5
     located = [known[number] for number in taken[~stripped].tolist()]
     speed = MOTION_MODELS["walk"].max_speed_mps

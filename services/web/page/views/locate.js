@@ -49,7 +49,7 @@ export async function showLocate(view, { signal }) {
     h("section", { class: "card filters-more" },
       field("The photographer moved by", motion),
       field("Accept from", least, "Probability in %"),
-      field("Cameras travelled together", together, "Photos of a phone then show where a camera was, too")),
+      h("label", { class: "check" }, together, h("span", {}, "The cameras travelled together: photos of a phone show where a camera was"))),
     progress, result);
 }
 
