@@ -60,7 +60,7 @@ class PictureEvidence:
     """What a search of the map says about a photo."""
 
     similar: Sequence[SimilarPosition]
-    """best first, those with coordinates"""
+    """those with coordinates"""
     circles: Sequence[ProbableCircle]
     """around the estimated position, finest first; empty without an estimate"""
     not_in_map: float
@@ -114,7 +114,7 @@ def picture_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
     do not explain to a Gaussian that has most of its weight within the outer circle. The photos
     outside of all circles share what is left with the photos of the map that were not found.
     """
-    # Answers are in the order of the match probability, which can differ from that of the scores.
+    # Clients of the API may have another order, such as that of the match probability.
     similar = sorted(evidence.similar, key=lambda photo: photo.score, reverse=True)
     scores = np.array([photo.score for photo in similar], dtype=np.float64)
     shares, rest = rank_shares(scores, max(evidence.photo_count, len(scores)))

@@ -113,7 +113,7 @@ def test_a_picture_of_another_place_than_the_maps_proposes_nothing() -> None:
 
 
 def test_similar_photos_count_by_their_scores_in_any_order() -> None:
-    """Answers are in the order of the match probability."""
+    """The page orders matches by their probability."""
     similar = picture((0, 0, 0.9), (900, 0, 0.5), (1800, 0, 0.4)).similar
     by_score, reversed_ = (
         proposed(PictureEvidence(photos, [], 0.02, 1000)) for photos in (similar, similar[::-1])
