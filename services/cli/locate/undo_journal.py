@@ -42,7 +42,7 @@ class UndoJournal:
     """Replaces files below a folder so that `undo` can restore them. Use `open_journal`."""
 
     def __init__(self, root: Path) -> None:
-        self._root = root
+        self._root = root.resolve()  # paths are relative to it
         self._folder = root / FOLDER
         self._journal = self._folder / JOURNAL
         for name in (BACKUPS, STAGED):
@@ -50,7 +50,9 @@ class UndoJournal:
         lines = _read_lines(self._journal)
         # Without an incomplete last line, which a killed process has left.
         _write_synced(self._journal, b"".join(_to_line(line) for line in lines))
-        self._journaled = {line["path"] for line in lines}
+        self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
+        for line in lines:
+            self._remember(line)
 
     def stage(self, path: Path, content: bytes | None = None) -> Path:
         """Return a file for the new content of `path`: with this content, or a copy of the file."""
@@ -70,7 +72,8 @@ class UndoJournal:
         _sync(staged)
         name = os.path.relpath(path, self._root)
         line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
-        if name not in self._journaled and line["before"] is not None:
+        is_known = line["before"] in self._known.get(name, ())
+        if not is_known and line["before"] is not None:  # new, or changed by something else since
             line["backup"] = f"{len(list((self._folder / BACKUPS).iterdir())) + 1:06d}"
             _link_or_copy(path, self._folder / BACKUPS / str(line["backup"]))
             _sync(self._folder / BACKUPS)
@@ -78,9 +81,12 @@ class UndoJournal:
             file.write(_to_line(line))
             file.flush()
             os.fsync(file.fileno())
-        self._journaled.add(name)
+        self._remember(line)
         staged.replace(path)
         _sync(path.parent)
+
+    def _remember(self, line: dict[str, Any]) -> None:
+        self._known.setdefault(line["path"], set()).update((line["before"], line["after"]))
 
 
 @contextmanager
@@ -98,7 +104,8 @@ def open_journal(root: Path) -> Iterator[UndoJournal]:
 def undo(root: Path) -> UndoReport:
     """Restore all files that the journal of a folder names, and remove the journal.
 
-    A file that something else has changed since stays as it is, and so does the journal then.
+    A file that something else has changed since stays as it is, and so does the journal then. One
+    that was changed between two writes is restored to what it was before the second.
 
     Raises:
         NotFound: `nothing_to_undo`.
@@ -110,13 +117,15 @@ def undo(root: Path) -> UndoReport:
         raise NotFound("nothing_to_undo", f"{printable_path(root)} has no journal of changes.")
     report = UndoReport([], [], [])
     with _exclusive(root):
-        first: dict[str, dict[str, Any]] = {}
+        originals: dict[str, dict[str, Any]] = {}
         written: dict[str, set[str]] = {}
         for line in _read_lines(folder / JOURNAL):
-            first.setdefault(line["path"], line)
+            if line["backup"] is not None:
+                originals[line["path"]] = line
+            originals.setdefault(line["path"], line)
             written.setdefault(line["path"], set()).add(line["after"])
-        for name, line in first.items():
-            path = root / name
+        for name, line in originals.items():
+            path = root.resolve() / name
             present = _sha256(path)
             if present == line["before"]:
                 continue

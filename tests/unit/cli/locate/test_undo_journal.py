@@ -112,6 +112,28 @@ def test_a_file_that_was_changed_since_is_left_as_it_is(folder: Path) -> None:
     assert not (folder / FOLDER).exists()
 
 
+def test_a_change_between_two_writes_is_not_lost_by_undo(folder: Path) -> None:
+    for name in ("old.xmp", "new.xmp"):
+        write(folder, name, b"first")
+        (folder / name).write_bytes(b"edited by its owner")
+        write(folder, name, b"second")
+        write(folder, name, b"third")
+    report = undo(folder)
+    assert (sorted(report.restored), report.removed) == (["new.xmp", "old.xmp"], [])
+    for name in ("old.xmp", "new.xmp"):
+        assert (folder / name).read_bytes() == b"edited by its owner"
+
+
+def test_undo_finds_the_files_of_a_folder_behind_a_link(folder: Path, tmp_path: Path) -> None:
+    before = contents(folder)
+    link = tmp_path / "deep" / "er" / "link"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(folder)
+    write_two(link)
+    assert undo(link).changed_since == []
+    assert contents(folder) == before
+
+
 def test_a_kill_at_any_moment_leaves_what_undo_repairs(folder: Path) -> None:
     before = contents(folder)
     killed = 0
