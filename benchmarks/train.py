@@ -28,9 +28,9 @@ from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything
 from services.trainer.data import (
     Batch,
+    PhotoTransform,
     PlaceBatchSampler,
     PlaceDataset,
-    apply_randaugment,
     load_batches,
     to_tensor,
 )
@@ -48,7 +48,6 @@ from shared.descriptors.vpr_models.model import VprModel
 from shared.evaluation.bootstrap import cluster_queries, paired_differences
 from shared.evaluation.ranking import evaluate_recall
 from shared.evaluation.retrieval_metrics import compute_hits
-from shared.imaging.decode import decode_resized
 from shared.synthetic_city.plan import CityOptions
 
 if TYPE_CHECKING:
@@ -230,6 +229,7 @@ def _training_arguments(
 
 
 IMAGE_PIXELS = 224
+TRANSFORM = PhotoTransform((IMAGE_PIXELS, IMAGE_PIXELS))
 STORED_PHOTO_SIZE = (960, 1280)
 """height and width of a photo as cameras and street view give them"""
 DISTINCT_PHOTOS = 32
@@ -307,16 +307,16 @@ def _draw_photos(folder: Path) -> list[Path]:
 def _decode_full(path: Path) -> None:
     with Image.open(path) as image:
         small = image.convert("RGB").resize((IMAGE_PIXELS, IMAGE_PIXELS), Image.Resampling.BILINEAR)
-    to_tensor(apply_randaugment(small, 0))
+    to_tensor(TRANSFORM.augment(small, 0))
 
 
 def _decode_draft(path: Path) -> None:
-    to_tensor(apply_randaugment(decode_resized(path, (IMAGE_PIXELS, IMAGE_PIXELS)), 0))
+    to_tensor(TRANSFORM.load(path, 0))
 
 
 def _batches(places: list[TrainingPlace], workers: int, device: Device) -> Iterator[Batch]:
     sampler = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
-    dataset = PlaceDataset(sampler, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
+    dataset = PlaceDataset(sampler, TRANSFORM, fail_on_undecodable=True)
     pin_memory = device.accelerator == "gpu"
     return load_batches(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
 

@@ -234,6 +234,30 @@ class DeletedTrack(Answer):
     deleted_track_id: UUID
 
 
+class PhotoHeader(Answer):
+    """What a photo's header says about when, where and by which camera it was taken."""
+
+    captured_at: datetime | None
+    """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
+    time_zone_is_known: bool
+    camera: str | None
+    latitude: float | None
+    longitude: float | None
+
+
+class Proposal(Answer):
+    """Where a photo was probably taken; coordinates are None if nothing is known about it."""
+
+    name: str
+    latitude: float | None
+    longitude: float | None
+    radius_m: float
+    probability: float
+    """that it was taken within `radius_m`"""
+    radius_68_m: float | None
+    reason: str
+
+
 class Progress(Answer):
     """Progress counters of a job."""
 

@@ -34,6 +34,8 @@ from placewise.answers import (
     OnePhoto,
     OneTrack,
     Photo,
+    PhotoHeader,
+    Proposal,
     RemovedModel,
     Search,
     Similar,
@@ -59,6 +61,7 @@ from placewise.protocol import (
 )
 from shared.errors import Unavailable, Unprocessable
 
+HEADER_BYTES = 256 * 1024
 Id = UUID | str
 Work = Uploaded | Started | Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
@@ -182,7 +185,8 @@ class AsyncClient(AsyncTransport):
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
+                (comma-separated);
                 `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
                 share of answers that must be right.
         """
@@ -206,6 +210,38 @@ class AsyncClient(AsyncTransport):
                 pass
             answer = await self._call("GET", answer["result_url"].removeprefix(API))
         return Similar(**answer)
+
+    async def read_header(self, photo: str | Path) -> PhotoHeader:
+        """Read when, where and by which camera a photo was taken from the begin of its file.
+
+        Raises:
+            Unprocessable: `undecodable_photo`.
+        """
+        with open_file(Path(photo)) as file:
+            begin = file.read(HEADER_BYTES)
+        headers = {"Content-Type": "application/octet-stream"}
+        return PhotoHeader(
+            **await self._call("POST", "/photo-headers", content=begin, headers=headers)
+        )
+
+    async def propose_positions(
+        self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
+    ) -> list[Proposal]:
+        """Propose where photos were taken that have no coordinates. Nothing is stored.
+
+        Args:
+            photos: The photos of a folder, with and without coordinates: `name`, and the fields of
+                `read_header` as JSON; those without coordinates may have what `similar` answered,
+                as `search` with `similar`, `circles` and `not_in_map`.
+            track: Points of a GPX track: `time`, `latitude`, `longitude`.
+            options: `radius_m`, `motion` (`walk`, `bicycle`, `car`, `train`), `together`.
+
+        Returns:
+            The proposals for the photos without coordinates, in their order.
+        """
+        body = {"photos": list(photos), "track": list(track), **options}
+        answer = await self._call("POST", "/positions", json=body)
+        return [Proposal(**each) for each in answer["proposals"]]
 
     async def begin_track(
         self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any

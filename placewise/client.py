@@ -33,6 +33,8 @@ from placewise.answers import (
     OnePhoto,
     OneTrack,
     Photo,
+    PhotoHeader,
+    Proposal,
     RemovedModel,
     Search,
     Similar,
@@ -58,6 +60,7 @@ from placewise.protocol import (
 from placewise.transport import Transport
 from shared.errors import Unavailable, Unprocessable
 
+HEADER_BYTES = 256 * 1024
 Id = UUID | str
 Work = Uploaded | Started | Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
@@ -177,7 +180,8 @@ class Client(Transport):
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags` and `ids` (comma-separated);
+                `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
+                (comma-separated);
                 `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
                 share of answers that must be right.
         """
@@ -201,6 +205,36 @@ class Client(Transport):
                 pass
             answer = self._call("GET", answer["result_url"].removeprefix(API))
         return Similar(**answer)
+
+    def read_header(self, photo: str | Path) -> PhotoHeader:
+        """Read when, where and by which camera a photo was taken from the begin of its file.
+
+        Raises:
+            Unprocessable: `undecodable_photo`.
+        """
+        with open_file(Path(photo)) as file:
+            begin = file.read(HEADER_BYTES)
+        headers = {"Content-Type": "application/octet-stream"}
+        return PhotoHeader(**self._call("POST", "/photo-headers", content=begin, headers=headers))
+
+    def propose_positions(
+        self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
+    ) -> list[Proposal]:
+        """Propose where photos were taken that have no coordinates. Nothing is stored.
+
+        Args:
+            photos: The photos of a folder, with and without coordinates: `name`, and the fields of
+                `read_header` as JSON; those without coordinates may have what `similar` answered,
+                as `search` with `similar`, `circles` and `not_in_map`.
+            track: Points of a GPX track: `time`, `latitude`, `longitude`.
+            options: `radius_m`, `motion` (`walk`, `bicycle`, `car`, `train`), `together`.
+
+        Returns:
+            The proposals for the photos without coordinates, in their order.
+        """
+        body = {"photos": list(photos), "track": list(track), **options}
+        answer = self._call("POST", "/positions", json=body)
+        return [Proposal(**each) for each in answer["proposals"]]
 
     def begin_track(
         self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any

@@ -43,7 +43,7 @@ def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
 
 def migrate_catalog(settings: Settings) -> UUID:
     """Migrate the catalog's schema to this release; returns the id of the installation."""
-    configure_logging(settings, "migrate")
+    configure_logging(settings, "migrate", to_file=False)
     with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
         migrate(catalog)
         with catalog.write() as session:

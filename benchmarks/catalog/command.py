@@ -79,13 +79,21 @@ class FakeSearch:
 
 
 def run_all_calls(
-    catalog: Catalog, filled: SyntheticCatalog, explainer: Explainer, folder: Path
+    catalog: Catalog,
+    filled: SyntheticCatalog,
+    explainer: Explainer,
+    folder: Path,
+    name_part: str = "",
 ) -> Iterator[str]:
-    """Make every call once on the largest map; yields the name of each call before it is made."""
+    """Make every call whose name contains `name_part` once on the largest map.
+
+    Yields the name of each call before it is made.
+    """
     for name, do in _all_calls(catalog, filled, folder):
-        yield name
-        with explainer.call(name):
-            do()
+        if name_part in name:
+            yield name
+            with explainer.call(name):
+                do()
 
 
 def _all_calls(

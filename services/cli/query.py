@@ -28,7 +28,6 @@ from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 MAX_CLUSTERS_SHOWN = 3  # per explanation
 BAR_WIDTH = 20  # characters
 CALIBRATION_SOURCES = {
-    "prior": "on generated maps; `placewise evaluate` fits them to this map",
     "own_photos": "on photos of this map",
     "labelled_queries": "on labelled queries",
 }
@@ -51,6 +50,10 @@ def query(
     place: Annotated[str | None, typer.Option(help="Only photos with this place label.")] = None,
     tags: Annotated[
         str | None, typer.Option(help="Only photos that have all of these comma-separated tags.")
+    ] = None,
+    tags_like: Annotated[
+        str | None,
+        typer.Option(help="Only photos whose tags contain all of these comma-separated parts."),
     ] = None,
     word_weights: Annotated[
         bool,
@@ -102,6 +105,7 @@ def query(
                 captured_before=captured_before,
                 place=place,
                 tags=tags,
+                tags_like=tags_like,
                 word_weights=None if word_weights else False,
                 certainty=certainty,
             )

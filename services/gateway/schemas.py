@@ -167,7 +167,7 @@ class EstimateResponse(ResponseModel):
     levels: list[EstimateLevelResponse] = Field(
         [],
         description="levels of the estimate, finest first; each contains the finer ones and is at "
-        "least as probable",
+        "least as probable; empty before the first evaluation of 20 or more photos with a place",
     )
     answer_level: int | None = Field(
         None,
@@ -187,8 +187,8 @@ class EstimateResponse(ResponseModel):
     radius_95_m: float | None = Field(None, description="the same with 95 %")
     calibration_source: str | None = Field(
         None,
-        description="what the probabilities were fitted on: `prior` (generated maps), "
-        "`own_photos` or `labelled_queries` of this map; null without levels",
+        description="what the probabilities were fitted on: `own_photos` or `labelled_queries` of "
+        "this map; null without levels",
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shared.catalog.photos import PhotoFilterValues
 from shared.geodesy import distances_m
 from shared.place_paths import is_within_level
-from shared.search_api.photo_filter import Box, PhotoFilter
+from shared.search_api.photo_filter import Box, PhotoFilter, is_part_of_tag
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNKNOWN_TIME = np.datetime64("NaT", "us")
@@ -237,6 +237,9 @@ def build_row_mask(
         mask &= _mask_of_rows(np.concatenate([NO_ROWS, *under]), len(mask))
     for tag in photo_filter.tags:
         mask &= _mask_of_rows(photos.rows_by_tag.get(tag, NO_ROWS), len(mask))
+    for part in photo_filter.tags_like:
+        like = [rows for tag, rows in photos.rows_by_tag.items() if is_part_of_tag(part, tag)]
+        mask &= _mask_of_rows(np.concatenate([NO_ROWS, *like]), len(mask))
     if exclude:
         mask[_find_rows(photos, exclude)] = False
     if photo_filter.captured_after is not None:

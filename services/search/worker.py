@@ -32,7 +32,7 @@ from services.search.query_batcher import QueryBatcher
 from services.search.residency import GpuResidency, MemoryBudget, open_search_device
 from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
@@ -198,6 +198,7 @@ class SearchWorker:
     def _sync_until_stopped(
         self, stop: threading.Event, states: Collection[GenerationState]
     ) -> None:
+        poll = ChangePoll(self._catalog)
         outage = OutageLog(f"search sync of {' and '.join(states)} generations")
         while not stop.is_set():
             try:
@@ -207,7 +208,7 @@ class SearchWorker:
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
                 log.error("sync failed, loaded snapshots go on serving queries: %s", error)
-            stop.wait(self._settings.search_follow_seconds)
+            poll.wait(stop, self._settings.search_follow_seconds)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Sync every generation of these states to its map's version; drop deleted generations."""

@@ -1,4 +1,7 @@
-"""The steward's scheduler: runs each periodic maintenance task at its interval, in one thread."""
+"""The steward's scheduler: runs each periodic maintenance task at its interval.
+
+Short tasks share one thread. A task that reads a whole map or the whole store has its own.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +35,7 @@ from services.steward.tasks.maintenance import (
     update_statistics_of_large_maps,
 )
 from services.steward.tasks.model_changes import (
+    QueuedChunks,
     advance_model_changes,
     auto_fit_vocabularies,
     remove_dead_search_workers,
@@ -39,7 +43,7 @@ from services.steward.tasks.model_changes import (
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.schema import sqlite_file
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
@@ -104,14 +108,19 @@ class PeriodicTask:
     interval_seconds: float
     """Pause between the end of a run and the next one."""
     run: Callable[[], object]
+    own_thread: bool = False
+    """Whether it can take so long that the others must not wait for it."""
     next_run: float = field(default=0.0)
     """By `time.monotonic`."""
+    commits_seen: int = field(default=-1)
+    """`CommitSignal.count` before its last run."""
 
 
 class Scheduler:
     """Runs the periodic tasks when they are due.
 
-    A failed task is logged and runs again after its interval.
+    A failed task is logged and runs again after its interval. The heartbeat is that of the thread
+    with the short tasks.
     """
 
     def __init__(
@@ -123,9 +132,11 @@ class Scheduler:
         metrics: StewardMetrics | None = None,
     ) -> None:
         self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
+        self._catalog = catalog
         self._outage = OutageLog("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         merge_retries = ReadRetries()
+        queued_chunks: QueuedChunks = {}
 
         def counted(task: str) -> DeletionCountingStore:
             return DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
@@ -151,7 +162,7 @@ class Scheduler:
             PeriodicTask(
                 "advance model changes",
                 0.5,
-                lambda: advance_model_changes(catalog, wakeups),
+                lambda: advance_model_changes(catalog, wakeups, queued_chunks),
             ),
             PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
@@ -164,7 +175,10 @@ class Scheduler:
                 lambda: auto_fit_vocabularies(catalog, wakeups, settings.auto_fit_photos),
             ),
             PeriodicTask(
-                "count large maps", 10.0, lambda: update_statistics_of_large_maps(catalog)
+                "count large maps",
+                10.0,
+                lambda: update_statistics_of_large_maps(catalog),
+                own_thread=True,
             ),
             PeriodicTask(
                 "compact",
@@ -172,6 +186,7 @@ class Scheduler:
                 lambda: metrics.slots_merged.inc(
                     merge_small_chunks(catalog, store, settings.compact_chunks, merge_retries)
                 ),
+                own_thread=True,
             ),
             self._journal,
             PeriodicTask(
@@ -212,6 +227,7 @@ class Scheduler:
                 "collect orphans",
                 3600.0,
                 lambda: _collect_orphans(catalog, store, settings, metrics),
+                own_thread=True,
             ),
             PeriodicTask(
                 "free trash",
@@ -222,13 +238,33 @@ class Scheduler:
 
     def run(self, stop: threading.Event) -> None:
         """Run due tasks until `stop` is set; then write the pending rows to the journal."""
+        threads = [
+            threading.Thread(target=self._run_alone, args=(task, stop), name=task.name)
+            for task in self.tasks
+            if task.own_thread
+        ]
+        for thread in threads:
+            thread.start()
+        shared = [task for task in self.tasks if not task.own_thread]
         while not stop.is_set():
-            for task in self.tasks:
+            commits = self._catalog.commits.count
+            for task in shared:
                 if time.monotonic() >= task.next_run and not stop.is_set():
                     self._run_task(task)
                     self._heartbeat.beat()
+                    task.commits_seen = commits
             stop.wait(SCHEDULER_TICK_SECONDS)
+            if self._catalog.is_sqlite and all(task.commits_seen == commits for task in shared):
+                self._catalog.wait_for_commit(stop, commits, IDLE_SECONDS)
         self._run_task(self._journal)
+        for thread in threads:
+            thread.join()
+
+    def _run_alone(self, task: PeriodicTask, stop: threading.Event) -> None:
+        poll = ChangePoll(self._catalog)
+        while not stop.is_set():
+            self._run_task(task)
+            poll.wait(stop, task.interval_seconds)
 
     def _run_task(self, task: PeriodicTask) -> None:
         started, outcome = time.monotonic(), "done"

@@ -108,6 +108,9 @@ class TrainingArguments(BaseModel):
     image_size: HeightWidth = _argument(
         DATA, (320, 320), "Height and width of training photos, in pixels."
     )
+    interpolation: Literal["bilinear", "bicubic"] = _argument(
+        DATA, "bilinear", "Resizing of photos, which the trained model keeps: bilinear or bicubic."
+    )
     num_workers: int = _argument(
         DATA, 8, "Number of data loader processes. 0: load in the main process.", ge=0
     )
@@ -115,11 +118,16 @@ class TrainingArguments(BaseModel):
     augmentation: Literal["randaugment", "none"] = _argument(
         DATA, "randaugment", "Data augmentation of training photos: randaugment or none."
     )
+    randaugment_magnitude: int = _argument(
+        DATA, 9, "Strength of randaugment's three operations, from 0 to 30.", ge=0, le=30
+    )
     on_bad_image: Literal["skip", "error"] = _argument(
         DATA, "skip", "Photos that cannot be decoded: skip (and report them) or error."
     )
 
-    backbone_arch: str = _argument(MODEL, "resnet18", "Name of the backbone.")
+    backbone_arch: str = _argument(
+        MODEL, "resnet18", "Name of the backbone, or package.module:function of your own."
+    )
     pretrained: bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
     weights: Path | None = _argument(
         MODEL,
@@ -136,7 +144,9 @@ class TrainingArguments(BaseModel):
     backbone_norm: bool = _argument(
         MODEL, True, "Apply the final norm of DINOv2 and Swin. False for BoQ's published DINOv2."
     )
-    agg_arch: str = _argument(MODEL, "AVG", "Name of the aggregator.")
+    agg_arch: str = _argument(
+        MODEL, "AVG", "Name of the aggregator, or package.module:Class of your own."
+    )
     agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
         MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."
     )
@@ -165,8 +175,12 @@ class TrainingArguments(BaseModel):
         OPTIMISATION, 1, "Random seed of weights, sampling and augmentation.", ge=0
     )
 
-    loss_name: str = _argument(LOSS, "MultiSimilarityLoss", "Name of the loss.")
-    miner_name: str = _argument(LOSS, "MultiSimilarityMiner", "Name of the miner, or none.")
+    loss_name: str = _argument(
+        LOSS, "MultiSimilarityLoss", "Name of the loss, or package.module:Class of your own."
+    )
+    miner_name: str = _argument(
+        LOSS, "MultiSimilarityMiner", "Name of the miner, package.module:Class, or none."
+    )
     miner_margin: float = _argument(
         LOSS, 0.1, "Margin of TripletMarginMiner, epsilon of MultiSimilarityMiner."
     )
@@ -179,12 +193,18 @@ class TrainingArguments(BaseModel):
         ("sfxs_test", "tokyoxs_test"),
         "Test sets of the phases test and all. If omitted: those found in the folder.",
     )
+    val_image_size: HeightWidth | None = _argument(
+        EVALUATION,
+        None,
+        "Height and width of validation photos, which the trained model keeps. If omitted: "
+        "image_size.",
+    )
     test_image_size: Annotated[
         Literal["same", "native"] | HeightWidth, BeforeValidator(parse_image_size)
     ] = _argument(
         EVALUATION,
         "same",
-        "Test photo size: same as image_size, native (batches of one), or H W pixels.",
+        "Test photo size: same as in validation, native (batches of one), or H W pixels.",
     )
     faiss_gpu: bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
     check_val_every_n_epoch: int = _argument(
@@ -204,6 +224,12 @@ class TrainingArguments(BaseModel):
         RUN, None, "Checkpoint to test (phase test) or to initialise training from."
     )
     default_root_dir: str = _argument(RUN, "./LOGS/", "Root folder of the runs.")
+    compatible: bool = _argument(
+        RUN,
+        False,
+        "Train and test as the GSV-Cities script did where an argument means something else here: "
+        "adam is AdamW, no layer is frozen, tests at native size, warm-up before milestones.",
+    )
     run_name: str | None = _argument(
         RUN, None, "Folder name of this run. If omitted: a timestamp and the model's name."
     )
@@ -248,14 +274,22 @@ class TrainingArguments(BaseModel):
     precision: Annotated[int | str, BeforeValidator(parse_literal)] = _argument(
         MACHINE, 32, "Floating-point precision: 32, 16-mixed or bf16-mixed."
     )
+    compile: bool = _argument(
+        MACHINE, False, "Compile the network with torch.compile. Sums may differ in last digits."
+    )
     reload_dataloaders_every_n_epochs: int = _argument(
         DATA, 1, "Reshuffle the places every n epochs. 0: shuffle once.", ge=0
     )
 
-    @field_validator("image_size")
+    @property
+    def evaluation_size(self) -> tuple[int, int]:
+        """Height and width of validation photos, and of the photos that the trained model takes."""
+        return self.val_image_size or self.image_size
+
+    @field_validator("image_size", "val_image_size")
     @classmethod
-    def _check_image_size(cls, size: tuple[int, int]) -> tuple[int, int]:
-        if min(size) < MIN_IMAGE_PIXELS:
+    def _check_image_size(cls, size: tuple[int, int] | None) -> tuple[int, int] | None:
+        if size is not None and min(size) < MIN_IMAGE_PIXELS:
             raise ValueError(f"height and width must be {MIN_IMAGE_PIXELS} pixels or more")
         return size
 
@@ -388,7 +422,7 @@ def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     for layer in layers:
         merged.update(layer)
     try:
-        return TrainingArguments(**merged)
+        return _apply_compatibility(TrainingArguments(**merged))
     except ValidationError as error:
         messages = [
             f"--{detail['loc'][0]}: {detail['msg'].removeprefix('Value error, ')}"
@@ -398,6 +432,18 @@ def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
         raise InvalidRequest("bad_argument", "; ".join(dict.fromkeys(messages))) from error
 
 
+def _apply_compatibility(arguments: TrainingArguments) -> TrainingArguments:
+    """Under `compatible`, replace the values that had another effect in the GSV-Cities script."""
+    if not arguments.compatible:
+        return arguments
+    changes: dict[str, Any] = {"layers_to_freeze": -1}
+    if arguments.optimizer == "adam":
+        changes["optimizer"] = "adamw"
+    if "test_image_size" not in arguments.model_fields_set:
+        changes["test_image_size"] = "native"
+    return arguments.model_copy(update=changes)
+
+
 def to_plain_dict(arguments: TrainingArguments) -> dict[str, Any]:
     """Return every argument as JSON-compatible values."""
     plain: dict[str, Any] = arguments.model_dump(mode="json")
@@ -405,8 +451,13 @@ def to_plain_dict(arguments: TrainingArguments) -> dict[str, Any]:
 
 
 def save_yaml(arguments: TrainingArguments, path: Path) -> None:
-    """Write every argument to a YAML file that `--config` accepts, to reproduce the run."""
+    """Write every argument to a YAML file that `--config` accepts, to reproduce the run.
+
+    A run that is killed meanwhile keeps the file that it had.
+    """
     import yaml
 
     text = yaml.safe_dump(to_plain_dict(arguments), sort_keys=False, allow_unicode=True)
-    path.write_text("# Every argument of this run: placewise train --config THIS\n" + text)
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text("# Every argument of this run: placewise train --config THIS\n" + text)
+    partial.replace(path)

@@ -27,7 +27,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.errors import InvalidRequest
+from shared.descriptors.weight_files import TENSOR_READ_ERRORS, first_error_line
+from shared.errors import InvalidRequest, Unprocessable
 
 FIELD = r"\{(?P<name>[^{}:]+)(?P<format>:[^{}]*)?\}"
 # A field with its label and brackets: `_R1[...]`, `-loss=...`.
@@ -215,6 +216,33 @@ class TopKCheckpoints:
             os.fsync(file.fileno())
         partial.replace(path)
         return path
+
+
+REQUIRED_STATE = {"state_dict", "optimizer_states", "global_step", "last_loss"}
+
+
+def load_training_state(path: Path) -> dict[str, Any]:
+    """Load a checkpoint that holds the full training state, to resume from.
+
+    Raises:
+        Unprocessable: `checkpoint_unreadable` if it is damaged or holds weights alone.
+    """
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    except TENSOR_READ_ERRORS as error:
+        reason = f"it is damaged ({first_error_line(error)})"
+        raise _not_resumable_error(path, reason) from error
+    if not isinstance(stored, dict) or not stored.keys() >= REQUIRED_STATE:
+        raise _not_resumable_error(path, "it does not hold the full training state")
+    return stored
+
+
+def _not_resumable_error(path: Path, reason: str) -> Unprocessable:
+    return Unprocessable(
+        "checkpoint_unreadable",
+        f"--resume can't continue from {path}: {reason}. Resume from another checkpoint with the "
+        "full state, or start a new run (--model_path takes the weights of a checkpoint).",
+    )
 
 
 def seed_everything(seed: int) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -106,22 +107,37 @@ class PlaceBatchSampler:
 
 
 RANDAUGMENT_OPERATIONS = 3
-RANDAUGMENT_MAGNITUDE = 9
-
-_randaugment = tv.RandAugment(
-    num_ops=RANDAUGMENT_OPERATIONS,
-    magnitude=RANDAUGMENT_MAGNITUDE,
-    interpolation=tv.InterpolationMode.BILINEAR,
-)
 
 
-def apply_randaugment(image: Image.Image, seed: int) -> Image.Image:
-    """Apply RandAugment (Cubuk et al. 2020) with three operations, deterministic for a seed."""
-    # RandAugment draws from the global generator, which the training steps also use.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        augmented: Image.Image = _randaugment(image)
-    return augmented
+@dataclass(frozen=True, slots=True)
+class PhotoTransform:
+    """How a training photo is resized and augmented."""
+
+    size: tuple[int, int]
+    """height and width in pixels"""
+    interpolation: str = "bilinear"
+    """of the resize and the augmentation: `bilinear` or `bicubic`"""
+    magnitude: int | None = 9
+    """strength of RandAugment, from 0 to 30; None: no augmentation"""
+
+    def load(self, path: Path, seed: int) -> Image.Image:
+        """Decode, resize and augment a photo; raises what `decode_resized` raises."""
+        resampling = Image.Resampling[self.interpolation.upper()]
+        image = decode_resized(path, self.size, resampling=resampling)
+        return image if self.magnitude is None else self.augment(image, seed)
+
+    def augment(self, image: Image.Image, seed: int) -> Image.Image:
+        """Apply RandAugment (Cubuk et al. 2020) with three operations, deterministic for a seed."""
+        randaugment = tv.RandAugment(
+            num_ops=RANDAUGMENT_OPERATIONS,
+            magnitude=self.magnitude,
+            interpolation=tv.InterpolationMode(self.interpolation),
+        )
+        # RandAugment draws from the global generator, which the training steps also use.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            augmented: Image.Image = randaugment(image)
+        return augmented
 
 
 def to_tensor(image: Image.Image) -> Tensor:
@@ -166,14 +182,12 @@ class PlaceDataset(Dataset[Batch]):
     def __init__(
         self,
         sampler: PlaceBatchSampler,
-        image_size: tuple[int, int],
+        transform: PhotoTransform,
         *,
-        augment: bool = True,
         fail_on_undecodable: bool,
     ) -> None:
         self._places = sampler.places
-        self._image_size = image_size
-        self._augment = augment
+        self._transform = transform
         self._fail_on_undecodable = fail_on_undecodable
 
     def __getitem__(self, sample: PlaceSample) -> Batch:
@@ -183,16 +197,14 @@ class PlaceDataset(Dataset[Batch]):
         for position, index in enumerate(sample.photos):
             path = place.photos[index]
             try:
-                image = decode_resized(path, self._image_size)
+                image = self._transform.load(path, sample.seed + position)
             except Unprocessable as error:
                 if self._fail_on_undecodable:
                     raise _undecodable_photo_error(str(path), error.detail) from error
                 undecodable.append((str(path), error.detail))
                 continue
-            if self._augment:
-                image = apply_randaugment(image, sample.seed + position)
             photos.append(to_tensor(image))
-        empty = torch.empty((0, 3, *self._image_size))
+        empty = torch.empty((0, 3, *self._transform.size))
         return Batch(
             torch.stack(photos) if photos else empty,
             torch.full((len(photos),), place.place_id, dtype=torch.int64),
@@ -242,6 +254,8 @@ def load_batches(
 
 
 def _init_worker(worker_id: int) -> None:
-    # The parent handles Ctrl-C: it saves the run, then ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The parent handles them: it saves the run, then ends its workers. Ctrl-C, timeout and systemd
+    # signal the whole process group.
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, signal.SIG_IGN)
     torch.set_num_threads(1)

@@ -42,7 +42,12 @@ from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
 from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
-from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE
+from services.trainer.run_folder import (
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    METRICS_FILE,
+    lock_folder,
+)
 from shared.errors import Conflict, InvalidRequest, PlacewiseError
 
 RESERVED_ARGUMENTS = ("default_root_dir", "run_name")
@@ -257,7 +262,20 @@ def run_grid(
 
     Raises:
         RunStopped: a stop was requested; also raises what `load_outcome` raises.
+        Conflict: `run_in_use`, while another process executes the grid.
     """
+    out.mkdir(parents=True, exist_ok=True)
+    with lock_folder(out):
+        return _run_unfinished(plan, out, display, stop, after_each)
+
+
+def _run_unfinished(
+    plan: GridPlan,
+    out: Path,
+    display: Display,
+    stop: StopRequest,
+    after_each: Callable[[list[RunOutcome]], None],
+) -> list[RunOutcome]:
     outcomes = [load_outcome(planned, out) for planned in plan.runs]
     for index, outcome in enumerate(outcomes):
         planned = outcome.run

@@ -17,6 +17,8 @@ from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 from torch.nn.functional import softplus
 
+from services.trainer.own_modules import make_own_module
+from shared.descriptors.vpr_models.config import is_own_module
 from shared.errors import Unprocessable
 
 
@@ -110,9 +112,12 @@ def make_loss(name: str) -> nn.Module:
     returned; None uses all pairs of the batch.
 
     Args:
-        name: a key of LOSSES, in any case, with or without `Loss`.
+        name: a key of LOSSES, in any case, with or without `Loss`; or `package.module:Class`.
 
     Raises:
         Unprocessable: `unknown_loss`.
+        InvalidRequest: `own_module_unfit`.
     """
+    if is_own_module(name):
+        return make_own_module("loss_name", name)
     return LOSSES[match_name(name, tuple(LOSSES), suffix="Loss", argument="loss_name")]()

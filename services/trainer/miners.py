@@ -18,6 +18,8 @@ from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 
 from services.trainer.losses import match_name
+from services.trainer.own_modules import make_own_module
+from shared.descriptors.vpr_models.config import is_own_module
 
 NO_MINER = "none"
 MAX_BLOCK_VALUES = 1 << 22  # 16 MB of float32
@@ -93,7 +95,8 @@ def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
     the batch: pairs (a1, p, a2, n) or triplets (a, p, n).
 
     Args:
-        name: a key of MINERS, in any case, with or without `Miner`; `none` or None for no miner.
+        name: a key of MINERS, in any case, with or without `Miner`; `package.module:Class`; `none`
+            or None for no miner.
         margin: epsilon of MultiSimilarityMiner (cosine) or margin of TripletMarginMiner (distance);
             ignored by the other miners, as in the GSV-Cities code.
 
@@ -102,9 +105,12 @@ def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
 
     Raises:
         Unprocessable: `unknown_miner`.
+        InvalidRequest: `own_module_unfit`.
     """
     if name is None or name.strip().lower() == NO_MINER:
         return None
+    if is_own_module(name):
+        return make_own_module("miner_name", name)
     known = (*MINERS, NO_MINER)
     return MINERS[match_name(name, known, suffix="Miner", argument="miner_name")](margin)
 

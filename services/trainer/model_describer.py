@@ -17,7 +17,7 @@ from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.evaluation.ranking import Rows, refused_photos_error
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.decode import decode_photo
-from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
+from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing, squeeze_name
 
 
 class ModelDescriber:
@@ -29,8 +29,9 @@ class ModelDescriber:
         model: (B, 3, H, W) float32, ImageNet-normalised -> (B, D).
         device: device of the network.
         image_size: (height, width) to which photos are resized without keeping the aspect ratio,
-            bilinear and antialiased, as in training. None keeps each photo's size; photos of equal
-            size form a batch.
+            antialiased, as in training. None keeps each photo's size; photos of equal size form a
+            batch.
+        interpolation: `bilinear` or `bicubic`.
         batch_photos: number of photos read and described at a time.
         max_pixels: larger photos are refused.
 
@@ -45,6 +46,7 @@ class ModelDescriber:
         device: torch.device,
         image_size: tuple[int, int] | None,
         *,
+        interpolation: str = "bilinear",
         batch_photos: int = 32,
         max_pixels: int = 50_000_000,
     ) -> None:
@@ -53,7 +55,7 @@ class ModelDescriber:
         self._batch_photos = batch_photos
         self._max_pixels = max_pixels
         self.preprocessing = (
-            get_preprocessing(f"resize{image_size[0]}x{image_size[1]}")
+            get_preprocessing(squeeze_name(image_size, interpolation))
             if image_size is not None
             else Preprocessing("native", 1, True, max_pixels, (480, 640), _keep_size)
         )

@@ -18,6 +18,7 @@ def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
     """Build the model configuration from the arguments; raises what `VprModelConfig.parse` does."""
     return VprModelConfig.parse(
         {name: getattr(arguments, name) for name in VprModelConfig.model_fields}
+        | {"image_size": arguments.evaluation_size}
     )
 
 

@@ -28,11 +28,10 @@ from services.trainer.arguments import TrainingArguments, to_plain_dict
 from services.trainer.checkpointing import CheckpointNameTemplate, TopKCheckpoints
 from services.trainer.dataset_selection import EvaluationSets
 from services.trainer.run_control import Display
-from services.trainer.run_folder import CHECKPOINTS_FOLDER
+from services.trainer.run_folder import CHECKPOINTS_FOLDER, VALIDATION_KS
 from shared.datasets.dataset import TrainingSet
 from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.exact_knn import has_faiss_gpu
-from shared.evaluation.ranking import DEFAULT_KS
 
 PRECISION_ALIASES = {
     "32": "32-true",
@@ -204,18 +203,34 @@ def check_environment(arguments: TrainingArguments, display: Display) -> Device:
 
 
 def list_changed_meanings(arguments: TrainingArguments) -> list[str]:
-    """Return a line for each argument whose value had another effect in the GSV-Cities code."""
+    """Return a line for each argument whose value had another effect in the GSV-Cities code.
+
+    With `compatible`, they have that effect: one line says what that is.
+    """
+    if arguments.compatible:
+        effect = (
+            f"--compatible: --optimizer {arguments.optimizer} --layers_to_freeze "
+            f"{arguments.layers_to_freeze} --test_image_size {arguments.test_image_size}; "
+            "milestones within the warm-up have no effect."
+        )
+        return [effect]
     notes = []
     if arguments.optimizer == "adam" and arguments.weight_decay > 0:
         notes.append(
             "--optimizer adam is Adam. The GSV-Cities script ran AdamW by this name: for the same "
-            "training use --optimizer adamw."
+            "training use --optimizer adamw or --compatible."
         )
     if arguments.experiment_phase != "train" and arguments.test_image_size == "same":
-        height, width = arguments.image_size
+        height, width = arguments.evaluation_size
         notes.append(
             f"Test photos are resized to {height} x {width} pixels. The GSV-Cities script tested "
-            "them at their own size: for the same figures use --test_image_size native."
+            "them at their own size: for the same figures use --test_image_size native or "
+            "--compatible."
+        )
+    if arguments.layers_to_freeze >= 0 and arguments.experiment_phase != "test":
+        notes.append(
+            f"--layers_to_freeze {arguments.layers_to_freeze} freezes layers. The GSV-Cities "
+            "script froze none: for the same training use --layers_to_freeze -1 or --compatible."
         )
     return notes
 
@@ -254,7 +269,7 @@ def make_checkpoints(
     Raises:
         InvalidRequest: `unknown_metric`, `bad_argument`.
     """
-    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in DEFAULT_KS]
+    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in VALIDATION_KS]
     if not metrics:
         display.warn("There is no validation set: only last.ckpt is saved.")
     elif arguments.monitor not in metrics:

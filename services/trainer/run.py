@@ -18,6 +18,7 @@ from services.trainer.dataset_selection import (
     summarise_training_set,
 )
 from services.trainer.model_factory import make_model
+from services.trainer.own_modules import register_own_modules
 from services.trainer.resolve import (
     check_environment,
     check_loggers,
@@ -35,6 +36,7 @@ from services.trainer.run_folder import (
     create_run_folder,
     find_run,
     load_resumed_arguments,
+    lock_folder,
 )
 from services.trainer.summary import build_summary, print_data_sets
 from services.trainer.training_loop import TrainingLoop, TrainingRun
@@ -49,12 +51,13 @@ Json = dict[str, Any]
 def find_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
     """Return every reason for which a run can't start on this machine, each once.
 
-    Checks the device, the loggers, the data sets and the network; missing pretrained weights are
-    downloaded if possible.
+    Checks the device, the loggers, the data sets, own modules and the network; missing pretrained
+    weights are downloaded if possible.
     """
     checks: list[Callable[[], object]] = [
         lambda: resolve_device(arguments),
         lambda: check_loggers(arguments.logger),
+        lambda: register_own_modules(arguments),
         lambda: select_evaluation_sets(arguments),
     ]
     if arguments.experiment_phase == "test":
@@ -83,6 +86,7 @@ def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:
 def _listing_all_obstacles(arguments: TrainingArguments) -> Iterator[None]:
     """Replace the first error of the start by one that lists all obstacles."""
     try:
+        register_own_modules(arguments)
         yield
     except PlacewiseError as error:
         obstacles = find_obstacles(arguments)
@@ -129,7 +133,8 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     prepared = TrainingRun(
         arguments, device, training_set, sets.validation, model, folder, history, checkpoints
     )
-    return _train(prepared, sets, display, stop)
+    with contextlib.nullcontext() if arguments.fast_dev_run else lock_folder(folder):
+        return _train(prepared, sets, display, stop)
 
 
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
@@ -146,11 +151,26 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
 
     Raises:
         NotFound: `run_not_found`.
-        Conflict: `run_differs`, for changed photos or a change that `--resume` does not allow. Also
-            raises what `run` raises.
+        Conflict: `run_differs`, for changed photos or a change that `--resume` does not allow;
+            `run_in_use`, while another process trains it.
+        Unprocessable: `run_unreadable`, `checkpoint_unreadable`. Also raises what `run` raises.
     """
     folder, checkpoint = find_run(path)
+    with lock_folder(folder):
+        return _resume(folder, checkpoint, changes, display, stop)
+
+
+def _resume(
+    folder: Path, checkpoint: Path, changes: Json, display: Display, stop: StopRequest
+) -> Json:
     arguments = load_resumed_arguments(folder, changes)
+    if arguments.experiment_phase == "test":
+        raise InvalidRequest(
+            "bad_argument",
+            "--resume continues training. Test a checkpoint with --experiment_phase test "
+            "--model_path CHECKPOINT.",
+        )
+    register_own_modules(arguments)
     device = check_environment(arguments, display)
     training_set, history = select_training_set(arguments), TrainingHistory.load(folder)
     if history.training_set["fingerprint"] != training_set.fingerprint:
@@ -166,7 +186,6 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
         (score, name) for score, name in history.best if (checkpoints.folder / name).is_file()
     ]
     model = make_model(arguments, display, resuming=True)
-    save_yaml(arguments, folder / CONFIG_FILE)
     prepared = TrainingRun(
         arguments, device, training_set, sets.validation, model, folder, history, checkpoints
     )
@@ -196,6 +215,9 @@ def _train(
             validator.sanity_check(prepared.model, sets.validation, 1)
             display.info("One batch of training and validation succeeded; no files were written.")
             return {"fast_dev_run": True}
+        if resume_from is not None:
+            save_yaml(arguments, folder / CONFIG_FILE)
+            loop.repeat_interrupted_validation()
         loop.fit(
             make_loggers(arguments.logger, folder, to_plain_dict(arguments), loop.completed_steps)
         )
@@ -234,7 +256,12 @@ def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRe
         device = check_environment(arguments, display)
         checkpoint = _load_tested(arguments)
         if "image_size" not in arguments.model_fields_set:
-            arguments = arguments.model_copy(update={"image_size": checkpoint.config.image_size})
+            arguments = arguments.model_copy(
+                update={
+                    "image_size": checkpoint.config.image_size,
+                    "interpolation": checkpoint.config.interpolation,
+                }
+            )
         sets = select_evaluation_sets(arguments)
     if arguments.show_data_stats:
         print_data_sets(None, sets, display)

@@ -3,6 +3,7 @@
 config.yaml           every argument, resolved
 history.json          metrics of the epochs so far; `--resume` needs it
 metrics.json          summary, written at the end
+run.lock              locked while a process trains
 checkpoints/          the best checkpoints, and last.ckpt
 predictions_SET.npy   (queries, 20) database indices of each test set, best first
 predictions/epochNN/  the same of each validation, with `save_val_predictions`
@@ -11,12 +12,16 @@ csv/  tensorboard/    output of the loggers
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from services.trainer.arguments import TrainingArguments, build_arguments, load_yaml, to_plain_dict
 from services.trainer.checkpointing import format_folder, safe_filename
@@ -24,14 +29,18 @@ from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 
 CHECKPOINTS_FOLDER = "checkpoints"
 CONFIG_FILE = "config.yaml"
+LOCK_FILE = "run.lock"
 METRICS_FILE = "metrics.json"
 PREDICTIONS_FOLDER = "predictions"
+VALIDATION_KS = (1, 5, 10, 15, 20)
+"""k of the recalls in `metrics.json`, in checkpoint names and as `monitor`"""
 
 # Arguments that --resume may change: the length of the run, the machine, evaluation and output. All
 # others determine the training itself, and `metrics.json` states them for the whole run.
 RESUMABLE_ARGUMENTS = {
     "max_epochs", "max_steps",
-    "accelerator", "devices", "precision", "num_workers", "faiss_gpu", "weights", "on_bad_image",
+    "accelerator", "devices", "precision", "compile", "num_workers", "faiss_gpu", "weights",
+    "on_bad_image",
     "data_root", "eval_roots", "val_set_names", "test_set_names", "test_image_size",
     "check_val_every_n_epoch", "num_sanity_val_steps", "save_val_predictions", "experiment_phase",
     "default_root_dir", "run_name", "logger", "log_every_n_steps", "show_data_stats",
@@ -97,6 +106,26 @@ def find_run(resume: Path) -> tuple[Path, Path]:
     return folder, checkpoint
 
 
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock the folder of a run or grid for this process while the block runs.
+
+    Raises:
+        Conflict: `run_in_use`.
+    """
+    lock = FileLock(folder / LOCK_FILE, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise Conflict(
+            "run_in_use", f"Another process trains in {folder}. Wait for it, or stop it."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
     """Load a run's arguments and apply changes.
 
@@ -117,6 +146,34 @@ def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArg
             "(--model_path takes the weights of this one).",
         )
     return after
+
+
+def check_trained_arguments(
+    arguments: TrainingArguments, trained: Mapping[str, Any], checkpoint: Path
+) -> None:
+    """Check that a checkpoint was trained with the arguments of the run that resumes from it.
+
+    Args:
+        arguments: the run's arguments.
+        trained: the arguments that the checkpoint stores. Older releases stored fewer.
+        checkpoint: named in the error.
+
+    Raises:
+        Conflict: `run_differs`, naming each argument that decides the training and differs.
+    """
+    plain = to_plain_dict(arguments)
+    differing = [
+        f"{name} ({trained[name]} -> {plain[name]})"
+        for name in plain.keys() & trained.keys() - RESUMABLE_ARGUMENTS
+        if trained[name] != plain[name]
+    ]
+    if differing:
+        raise Conflict(
+            "run_differs",
+            f"{checkpoint} was trained with other arguments than {CONFIG_FILE} has: "
+            f"{', '.join(sorted(differing))}. Restore {CONFIG_FILE}, or start a new run "
+            "(--model_path takes the weights of the checkpoint).",
+        )
 
 
 def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
@@ -187,6 +244,8 @@ class TrainingHistory:
             stored = json.loads((folder / HISTORY_FILE).read_text())
             stored["epochs"] = [EpochRecord(**epoch) for epoch in stored["epochs"]]
             stored["best"] = [(score, name) for score, name in stored["best"]]
+            if "fingerprint" not in stored["training_set"]:
+                raise KeyError("training_set")
             return cls(**stored)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise Unprocessable(

@@ -20,6 +20,7 @@ from services.trainer.run_control import Display
 from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
 from shared.datasets.dataset import TrainingSet
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.descriptors.vpr_models.config import is_own_module
 from shared.evaluation.ranking import RecallEvaluation
 from shared.evaluation.results import predictions_path
 
@@ -128,6 +129,8 @@ def _next_commands(arguments: TrainingArguments, sets: EvaluationSets, report: J
         f"--data {shlex.quote(str(sets.roots[name]))} --set {name} --out report"
         for name, predictions in list(report["predictions"].items())[:1]
     ]
+    if is_own_module(arguments.backbone_arch) or is_own_module(arguments.agg_arch):
+        return show_predictions  # only the trainer imports the network's code
     return [
         *show_predictions,
         f"placewise evaluate --data {root} --checkpoint {best}",

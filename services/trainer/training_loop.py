@@ -20,18 +20,34 @@ from lightning.fabric import Fabric
 from lightning.pytorch.loggers import Logger
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpointing import TopKCheckpoints, restore_rng_state, rng_state
-from services.trainer.data import Batch, PlaceBatchSampler, PlaceDataset, load_batches
+from services.trainer.checkpointing import (
+    TopKCheckpoints,
+    load_training_state,
+    restore_rng_state,
+    rng_state,
+)
+from services.trainer.data import (
+    Batch,
+    PhotoTransform,
+    PlaceBatchSampler,
+    PlaceDataset,
+    load_batches,
+)
 from services.trainer.losses import make_loss
 from services.trainer.miners import batch_accuracy, make_miner
 from services.trainer.resolve import Device, portable_arguments
 from services.trainer.run_control import Display, StopRequest
-from services.trainer.run_folder import PREDICTIONS_FOLDER, EpochRecord, TrainingHistory
+from services.trainer.run_folder import (
+    PREDICTIONS_FOLDER,
+    EpochRecord,
+    TrainingHistory,
+    check_trained_arguments,
+)
 from services.trainer.validation import Validator, flatten_recalls, write_predictions
 from shared.datasets.dataset import EvaluationSet, TrainingSet
 from shared.descriptors.vpr_models.checkpoint import STATE_DICT_PREFIX, checkpoint_state
 from shared.descriptors.vpr_models.model import VprModel
-from shared.errors import Unprocessable
+from shared.errors import Conflict, Unprocessable
 
 MAX_BAD_PHOTO_WARNINGS = 10
 
@@ -52,10 +68,15 @@ def make_optimizer(
 def learning_rate(step: int, steps_per_epoch: int, arguments: TrainingArguments) -> float:
     """Return the learning rate of a step, from 0: linear warm-up times step decay.
 
-    It depends on the step alone, so that a resumed run needs no scheduler state.
+    It depends on the step alone, so that a resumed run needs no scheduler state. With `compatible`,
+    a milestone within the warm-up has no effect, because the GSV-Cities code overwrote it.
     """
     warmup = min(1.0, (step + 1) / max(1, arguments.warmpup_steps))
-    passed = sum(step // steps_per_epoch >= milestone for milestone in arguments.milestones)
+    first = arguments.warmpup_steps if arguments.compatible else 0
+    passed = sum(
+        step // steps_per_epoch >= milestone and milestone * steps_per_epoch >= first
+        for milestone in arguments.milestones
+    )
     return arguments.lr * warmup * float(arguments.lr_mult**passed)
 
 
@@ -107,8 +128,13 @@ class TrainingLoop:
         )
         self._dataset = PlaceDataset(
             self._sampler,
-            arguments.image_size,
-            augment=arguments.augmentation == "randaugment",
+            PhotoTransform(
+                arguments.image_size,
+                arguments.interpolation,
+                arguments.randaugment_magnitude
+                if arguments.augmentation == "randaugment"
+                else None,
+            ),
             fail_on_undecodable=arguments.on_bad_image == "error",
         )
         self._loss = make_loss(arguments.loss_name)
@@ -119,8 +145,10 @@ class TrainingLoop:
             precision=run.device.precision,
         )
         self._precision = self._fabric.strategy.precision
+        network: Any = torch.compile(run.model) if arguments.compile else run.model
         self._network, self._optimizer = self._fabric.setup(
-            run.model, make_optimizer(run.model.parameters(), arguments)
+            network,
+            make_optimizer(run.model.parameters(), arguments),
         )
         last_step = arguments.max_epochs * len(self._sampler)
         self._last_step = min(last_step, arguments.max_steps or last_step)
@@ -134,14 +162,33 @@ class TrainingLoop:
         return self._step
 
     def restore(self, checkpoint: Path) -> None:
-        """Restore the full training state, and repeat a validation that was interrupted."""
-        stored = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        self._run.model.load_state_dict(
-            {
-                name.removeprefix(STATE_DICT_PREFIX): tensor
-                for name, tensor in stored["state_dict"].items()
-            }
+        """Restore the full training state.
+
+        Raises:
+            Conflict: `run_differs`, if the checkpoint belongs to a run with other arguments, or the
+                run ends before it. Also raises what `load_training_state` raises.
+        """
+        stored = load_training_state(checkpoint)
+        check_trained_arguments(
+            self._arguments, stored.get("hyper_parameters", {}).get("training", {}), checkpoint
         )
+        if stored["global_step"] > self._last_step:
+            raise Conflict(
+                "run_differs",
+                f"{checkpoint} was trained for {stored['global_step']} steps, but the run ends "
+                f"after {self._last_step} ({len(self._sampler)} in an epoch). Give a larger "
+                "--max_epochs or --max_steps, or resume from an earlier checkpoint.",
+            )
+        tensors = {
+            name.removeprefix(STATE_DICT_PREFIX): tensor
+            for name, tensor in stored["state_dict"].items()
+        }
+        try:
+            self._run.model.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise Conflict(
+                "run_differs", f"{checkpoint} is of another network than the run: {error}"
+            ) from error
         self._optimizer.load_state_dict(stored["optimizer_states"][0])
         self._precision.load_state_dict(stored.get("MixedPrecision", {}))
         self._step = self._last_saved_step = stored["global_step"]
@@ -150,7 +197,11 @@ class TrainingLoop:
         restore_rng_state(stored.get("rng_state") or stored["callbacks"]["TrainingCallback"])
         history = self._run.history
         history.epochs = [each for each in history.epochs if each.step <= self._step]
-        if self._is_validation_due() and all(each.step != self._step for each in history.epochs):
+
+    def repeat_interrupted_validation(self) -> None:
+        """Validate if the run was stopped between the end of an epoch and its validation."""
+        recorded = {each.step for each in self._run.history.epochs}
+        if self._is_validation_due() and self._step not in recorded:
             self._validate([])
 
     def fit(self, loggers: Sequence[Logger]) -> None:

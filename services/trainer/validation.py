@@ -13,6 +13,7 @@ from services.trainer.arguments import TrainingArguments
 from services.trainer.model_describer import ModelDescriber
 from services.trainer.resolve import Device
 from services.trainer.run_control import StopRequest
+from services.trainer.run_folder import VALIDATION_KS
 from shared.datasets.dataset import EvaluationSet
 from shared.evaluation.ranking import RecallEvaluation, evaluate_recall
 from shared.evaluation.results import predictions_path
@@ -25,7 +26,7 @@ ProgressCallback = Callable[[str, int, int], None]
 class Validator:
     """Computes the recalls of a network on evaluation sets.
 
-    Validation photos are resized to `image_size`, test photos to `test_image_size`.
+    Validation photos are resized to `val_image_size`, test photos to `test_image_size`.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class Validator:
         Args:
             model: (B, 3, H, W) float32 -> (B, D); its training mode is restored afterwards.
             sets: the evaluation sets.
-            for_tests: use `test_image_size` instead of `image_size`.
+            for_tests: use `test_image_size` instead of `val_image_size`.
 
         Returns:
             Rankings and recalls by set name.
@@ -56,9 +57,13 @@ class Validator:
         Raises:
             RunStopped: a stop was requested; also raises what describing and searching raise.
         """
-        size = self._test_size() if for_tests else self._arguments.image_size
+        size = self._test_size() if for_tests else self._arguments.evaluation_size
         describe = ModelDescriber(
-            model, self._device.torch_device, size, batch_photos=1 if size is None else BATCH_PHOTOS
+            model,
+            self._device.torch_device,
+            size,
+            interpolation=self._arguments.interpolation,
+            batch_photos=1 if size is None else BATCH_PHOTOS,
         )
         evaluations = {}
         for each in sets:
@@ -68,7 +73,11 @@ class Validator:
                 self._on_progress(f"{name}: {what}", done, total)
 
             evaluations[each.name] = evaluate_recall(
-                describe, each, faiss_gpu=self._device.faiss_gpu, on_progress=on_progress
+                describe,
+                each,
+                ks=VALIDATION_KS,
+                faiss_gpu=self._device.faiss_gpu,
+                on_progress=on_progress,
             )
         return evaluations
 
@@ -94,7 +103,7 @@ class Validator:
     def _test_size(self) -> tuple[int, int] | None:
         size = self._arguments.test_image_size
         if size == "same":
-            return self._arguments.image_size
+            return self._arguments.evaluation_size
         return None if size == "native" else size
 
 

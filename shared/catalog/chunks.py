@@ -38,6 +38,7 @@ class Chunk(Base):
     rows: Mapped[int] = mapped_column(sa.Integer)
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     sha256: Mapped[str] = mapped_column(sa.String(64))
+    # Whether compaction wrote it.
     sealed: Mapped[bool] = mapped_column(sa.Boolean, default=False)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)

@@ -21,6 +21,7 @@ from shared.catalog.database.base import (
     db_distance_m,
     filename_trigrams,
     json_array_has,
+    json_array_has_part,
 )
 from shared.catalog.photos import Photo, PhotoRole
 from shared.geodesy import latitude_bounds, longitude_half_width
@@ -90,6 +91,7 @@ def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> 
     if photo_filter.ids is not None:
         conditions.append(photo.id.in_(photo_filter.ids))
     conditions.extend(json_array_has(photo.tags, tag) for tag in photo_filter.tags)
+    conditions.extend(json_array_has_part(photo.tags, part) for part in photo_filter.tags_like)
     return conditions
 
 

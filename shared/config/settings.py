@@ -25,6 +25,7 @@ from shared.config.extractor_settings import ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
 from shared.config.shards import Shard
+from shared.config.sizes import Size
 from shared.config.storage_settings import StorageSettings
 from shared.errors import Misconfigured
 
@@ -51,11 +52,21 @@ class ServiceSettings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="listening port; 0 picks a free port")
     debug: bool = Field(
         False,
-        description="log every request and every rejected request; responses stay the same",
+        description="log every request and every rejected request, and restart the embedded server "
+        "of a checkout when its code changes; responses stay the same",
     )
     log_format: Literal["text", "json"] = Field(
         "text", description="log format; json writes one JSON object per line"
     )
+    log_file: Path | None = Field(
+        None,
+        description="file of the log of one service, beside stderr; services on one machine need "
+        "different files; unset: stderr only",
+    )
+    log_file_size: Size = Field(
+        10_000_000, gt=0, description="bytes at which LOG_FILE is rotated: renamed to LOG_FILE.1"
+    )
+    log_files: int = Field(5, ge=1, description="rotated log files that are kept")
     metrics_port: int | None = Field(
         None,
         ge=0,

@@ -85,7 +85,7 @@ class StorageSettings(BaseSettings):
     # Compaction and garbage collection.
     slot_rows: int = Field(1000, ge=2, description="rows of a sealed chunk")
     compact_chunks: int = Field(
-        8, ge=2, description="chunks of an open slot that trigger a compaction"
+        8, ge=2, description="new chunks of an open slot that trigger a compaction"
     )
     superseded_grace_seconds: float = Field(
         600.0, ge=0, description="time after which a compacted chunk is deleted, seconds"

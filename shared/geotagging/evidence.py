@@ -15,7 +15,7 @@ set wrong, a photo that another person took, a wrong fix.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -78,6 +78,19 @@ class KnownPosition:
     longitude: float
     name: str = ""
     """of the photo; empty for a point of a GPX track"""
+
+
+@dataclass(frozen=True, slots=True)
+class DatedPhoto:
+    """A photo with what its file says about when, where and by which camera it was taken."""
+
+    name: str
+    time: datetime | None
+    """UTC, or the camera's clock as if it were UTC"""
+    time_zone_is_known: bool
+    camera: str | None
+    latitude: float | None
+    longitude: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +181,41 @@ def interpolate_position(
         nearest,
         (time - nearest.time).total_seconds(),
     )
+
+
+class TimeNeighbours:
+    """The photos with time and coordinates, by the camera whose times and way they show.
+
+    The times of one camera can be compared without their time zone, but not with times in UTC.
+
+    Args:
+        photos: All photos of a folder, in any order.
+        together: Whether the people with the cameras travelled together.
+    """
+
+    def __init__(self, photos: Sequence[DatedPhoto], together: bool) -> None:
+        self._together = together
+        self._known: dict[tuple[str, bool] | None, list[KnownPosition]] = {}
+        for photo in photos:
+            if photo.time is None or photo.latitude is None or photo.longitude is None:
+                continue
+            position = KnownPosition(photo.time, photo.latitude, photo.longitude, photo.name)
+            known = self._known.setdefault(self._clock(photo), [])
+            insort(known, position, key=lambda each: each.time)
+        self._known.pop(None, None)
+
+    def position_of(self, photo: DatedPhoto, max_speed_mps: float) -> InterpolatedPosition | None:
+        """Interpolate the position of a photo without coordinates; None if nothing is known."""
+        known = self._known.get(self._clock(photo), ())
+        if photo.time is None:
+            return None
+        return interpolate_position(known, photo.time, max_speed_mps)
+
+    def _clock(self, photo: DatedPhoto) -> tuple[str, bool] | None:
+        """Return what photos with comparable times have in common; None for unknown cameras."""
+        if self._together:
+            return "", photo.time_zone_is_known
+        return None if photo.camera is None else (photo.camera, photo.time_zone_is_known)
 
 
 def position_mixture(position: InterpolatedPosition, plane: Plane) -> Mixture:

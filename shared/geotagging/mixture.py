@@ -136,12 +136,14 @@ class Mixture:
     def _points(self) -> tuple[FloatArray, FloatArray]:
         """Return (n * SAMPLES, 2) points of equal weight within each Gaussian, and their weights.
 
-        They lie on a sunflower spiral at the quantiles of the Rayleigh distribution of the radius.
+        They lie on a sunflower spiral at the quantiles of the Rayleigh distribution of the radius,
+        and opposite, so that their mean is that of the Gaussian.
         """
-        shares = (np.arange(SAMPLES) + 0.5) / SAMPLES
-        radii = np.sqrt(-2 * np.log1p(-shares))
-        angles = np.arange(SAMPLES) * math.pi * (3 - math.sqrt(5))
+        numbers = np.arange(SAMPLES // 2)
+        radii = np.sqrt(-2 * np.log1p(-(2 * numbers + 1) / SAMPLES))
+        angles = numbers * math.pi * (3 - math.sqrt(5))
         spiral = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+        spiral = np.concatenate([spiral, -spiral])
         points = self.means[:, None] + self.sigmas[:, None, None] * spiral[None]
         return points.reshape(-1, 2), np.repeat(self.weights / SAMPLES, SAMPLES)
 

@@ -183,11 +183,15 @@ MAX_TRAINING_PIXELS = 100_000_000
 
 
 def decode_resized(
-    path: Path, size: tuple[int, int], max_pixels: int = MAX_TRAINING_PIXELS
+    path: Path,
+    size: tuple[int, int],
+    max_pixels: int = MAX_TRAINING_PIXELS,
+    *,
+    resampling: Image.Resampling = Image.Resampling.BILINEAR,
 ) -> Image.Image:
     """Decode a photo to upright RGB of `size` (height, width), ignoring the aspect ratio.
 
-    The resize is antialiased bilinear.
+    The resize is antialiased.
 
     Raises:
         Unprocessable: `undecodable_photo`, `too_many_pixels`; the message has the reason but not
@@ -202,7 +206,7 @@ def decode_resized(
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
                 upright = _apply_exif_orientation(image, _to_rgb(image))
-            return upright.resize((width, height), Image.Resampling.BILINEAR)
+            return upright.resize((width, height), resampling)
     except UnidentifiedImageError as error:
         raise Unprocessable(
             "undecodable_photo", f"it is not {ACCEPTED_PHOTOS}, or its header is damaged"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from enum import StrEnum
+from pathlib import PurePosixPath
 from typing import BinaryIO
 
 from PIL import Image
@@ -67,6 +68,12 @@ PHOTO_SIGNATURE_BYTES = 16  # enough to detect every accepted format
 
 # Disabled: check_pixel_count checks our own limit before anything is decoded.
 Image.MAX_IMAGE_PIXELS = None
+
+
+def photo_suffix(filename: str) -> str:
+    """Return the lower-case ending of a photo's file name, `.jpg`; empty if it is no photo's."""
+    suffix = PurePosixPath(filename).suffix.lower()
+    return suffix if suffix in PHOTO_SUFFIXES else ""
 
 
 def detect_media_type(first_bytes: bytes) -> str | None:

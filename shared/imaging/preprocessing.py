@@ -150,9 +150,20 @@ class Preprocessing:
         return {"name": self.name, "version": self.version}
 
 
-def _squeeze(image: Image.Image, height: int, width: int) -> Pixels:
-    """Resize ignoring the aspect ratio: bilinear, antialiased when shrinking, rounded."""
-    return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+def squeeze_name(size: tuple[int, int], interpolation: str) -> str:
+    """Return the name of the resize to (height, width), `bilinear` or `bicubic`."""
+    suffix = "" if interpolation == "bilinear" else f"-{interpolation}"
+    return f"resize{size[0]}x{size[1]}{suffix}"
+
+
+def _squeeze(
+    image: Image.Image,
+    height: int,
+    width: int,
+    resampling: Image.Resampling = Image.Resampling.BILINEAR,
+) -> Pixels:
+    """Resize ignoring the aspect ratio: antialiased when shrinking, rounded."""
+    return np.asarray(image.resize((width, height), resampling))
 
 
 def _fit_area(image: Image.Image, height: int, width: int) -> Pixels:
@@ -163,7 +174,8 @@ def _fit_area(image: Image.Image, height: int, width: int) -> Pixels:
     """
     ratio = min(max(image.width / image.height, 1 / MAX_ASPECT_RATIO), MAX_ASPECT_RATIO)
     sides = math.sqrt(height * width / ratio), math.sqrt(height * width * ratio)
-    return _squeeze(image, *(max(1, round(side / STRIDE)) * STRIDE for side in sides))
+    height, width = (max(1, round(side / STRIDE)) * STRIDE for side in sides)
+    return _squeeze(image, height, width)
 
 
 def _demo1024(image: Image.Image) -> Pixels:
@@ -252,25 +264,28 @@ PREPROCESSINGS = {
 
 
 def get_preprocessing(name: str) -> Preprocessing:
-    """Return the preprocessing `name`; `resizeHEIGHTxWIDTH` exists for every size.
+    """Return the preprocessing `name`.
+
+    `resizeHEIGHTxWIDTH` and `resizeHEIGHTxWIDTH-bicubic` exist for every size.
 
     Raises Misconfigured (`unknown_preprocessing`).
     """
     if name in PREPROCESSINGS:
         return PREPROCESSINGS[name]
-    size = re.fullmatch(r"resize([0-9]+)x([0-9]+)", name)
+    size = re.fullmatch(r"resize([0-9]+)x([0-9]+)(-bicubic)?", name)
     if size is None:
         raise Misconfigured(
             "unknown_preprocessing",
             f"Unknown preprocessing {name!r}. Valid names: {', '.join(sorted(PREPROCESSINGS))}, "
-            "resizeHEIGHTxWIDTH.",
+            "resizeHEIGHTxWIDTH, resizeHEIGHTxWIDTH-bicubic.",
         )
     height, width = int(size[1]), int(size[2])
+    resampling = Image.Resampling.BICUBIC if size[3] else Image.Resampling.BILINEAR
     return Preprocessing(
         name,
         1,
         True,
         height * width,
         (height, width),
-        partial(_squeeze, height=height, width=width),
+        partial(_squeeze, height=height, width=width, resampling=resampling),
     )

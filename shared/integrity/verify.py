@@ -17,7 +17,7 @@ from enum import StrEnum
 from functools import partial
 from uuid import UUID
 
-from sqlalchemy import delete, select
+from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Chunk, Descriptor
@@ -332,13 +332,16 @@ def discard_chunk(session: Session, chunk_id: UUID) -> int:
     increment_map_version(session, generation.map_id)
     if generation.state == GenerationState.ACTIVE:
         return _queue_photos(session, photo_ids)
-    # In a generation being built, the steward queues photos that have neither a row nor a job.
+    # In a generation being built, the steward queues the photos of cancelled jobs again.
     session.execute(
-        delete(Job).where(
+        update(Job)
+        .where(
             Job.kind == JobKind.REINDEX,
             Job.generation_id == generation.id,
             Job.photo_id.in_(photo_ids),
         )
+        .values(state=JobState.CANCELLED)
+        .execution_options(synchronize_session=False)
     )
     return len(photo_ids)
 

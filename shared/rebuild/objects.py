@@ -246,7 +246,8 @@ def recover_originals(
             if _is_known(session, key):
                 continue
         try:
-            received = StoredUpload.read(store, key, f"{key.removeprefix(ORIGINALS)}.photo")
+            name = key.removeprefix(ORIGINALS)
+            received = StoredUpload.read(store, key, name if "." in name else f"{name}.photo")
             incoming = validate_photo(store, received, settings.max_image_pixels)
         except NotFound:
             continue  # deleted since it was listed

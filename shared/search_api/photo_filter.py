@@ -6,6 +6,7 @@ The same filter restricts a similarity search (inside the scan) and a metadata s
 from __future__ import annotations
 
 from datetime import datetime
+from string import ascii_lowercase, ascii_uppercase
 from typing import Annotated
 from uuid import UUID
 
@@ -13,6 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from shared.geodesy import flush_to_zero
 
+_ASCII_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
 Coordinate = Annotated[float, AfterValidator(flush_to_zero)]
 
 
@@ -69,6 +71,8 @@ class PhotoFilter(_FilterModel):
     """A level of label paths, which the photo's label is or lies below."""
     tags: tuple[str, ...] = ()
     """The photo must have all of these tags."""
+    tags_like: tuple[str, ...] = ()
+    """Each must be a part of one of the photo's tags; ASCII letters match in either case."""
     ids: tuple[UUID, ...] | None = None
     """The photo must be one of these; an empty tuple matches no photo."""
 
@@ -79,3 +83,15 @@ class PhotoFilter(_FilterModel):
 
 
 NO_FILTER = PhotoFilter()
+
+
+def is_part_of_tag(part: str, tag: str) -> bool:
+    """Whether the tag contains the part. Only ASCII letters match in either case.
+
+    Folding of other letters differs between Python, PostgreSQL and SQLite.
+    """
+    return _ascii_lower(part) in _ascii_lower(tag)
+
+
+def _ascii_lower(text: str) -> str:
+    return text.translate(_ASCII_LOWER)

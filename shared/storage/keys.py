@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import date
 from uuid import UUID
 
@@ -106,9 +107,14 @@ def check_import_prefix(prefix: str) -> None:
         )
 
 
-def new_original_key() -> str:
-    """Return a new key for an uploaded photo; file names of users never become keys."""
-    return f"{ORIGINALS}{new_id()}"
+def new_original_key(suffix: str = "") -> str:
+    """Return a new key for an uploaded photo; file names of users never become keys.
+
+    Args:
+        suffix: Ending of the file, such as `.jpg` (`shared.imaging.file_formats.photo_suffix`), so
+            that other programs open the files of UPLOAD_DIR.
+    """
+    return f"{ORIGINALS}{new_id()}{suffix}"
 
 
 def incoming_key(upload_id: UUID) -> str:
@@ -119,12 +125,16 @@ def incoming_key(upload_id: UUID) -> str:
 def is_original_key(key: str) -> bool:
     """Return whether `new_original_key` created the key.
 
-    Operators may put other files into UPLOAD_DIR.
+    Operators may put other files into UPLOAD_DIR. Those of the AnyLoc similarity service are named
+    by a random UUID and a suffix; ours with a suffix have a UUIDv7.
     """
+    name, dot, suffix = key.removeprefix(ORIGINALS).partition(".")
     try:
-        return key == f"{ORIGINALS}{UUID(key.removeprefix(ORIGINALS))}"
+        photo_id = UUID(name)
     except ValueError:
         return False
+    is_ours = not dot or (photo_id.version == 7 and re.fullmatch("[a-z]{3,4}", suffix) is not None)
+    return is_ours and key == f"{ORIGINALS}{photo_id}{dot}{suffix}"
 
 
 def thumbnail_key(photo_id: UUID) -> str:

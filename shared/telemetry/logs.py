@@ -13,9 +13,13 @@ import json
 import logging
 import re
 from datetime import UTC, datetime
-from typing import Any
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+from typing import Any, TextIO
 
+from shared.config.private_files import append_to_private_file, make_private_folder
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
@@ -111,18 +115,52 @@ def _extra(record: logging.LogRecord) -> dict[str, Any]:
     }
 
 
-def configure_logging(settings: Settings, service: str) -> None:
-    """Log to stderr in the format of LOG_FORMAT, with debug lines of Placewise if DEBUG is set.
+class _PrivateRotatingFileHandler(RotatingFileHandler):
+    """A rotating log file that only the current user can read."""
+
+    def _open(self) -> TextIO:  # type: ignore[override]
+        return append_to_private_file(Path(self.baseFilename))
+
+
+def configure_logging(settings: Settings, service: str, *, to_file: bool = True) -> None:
+    """Log to stderr and LOG_FILE in the format of LOG_FORMAT, with debug lines if DEBUG is set.
 
     Replaces the existing handlers of the root logger.
+
+    Args:
+        settings: The settings.
+        service: Name of the service, in each line.
+        to_file: Write to LOG_FILE. Commands that may run beside a server do not, because only one
+            process can rotate a file.
+
+    Raises:
+        Misconfigured: `bad_setting`, if LOG_FILE can't be written.
     """
-    handler = logging.StreamHandler()
-    handler.addFilter(_ContextFilter(service))
-    handler.setFormatter(_JsonFormatter() if settings.log_format == "json" else _TextFormatter())
+    handlers: list[logging.Handler] = [logging.StreamHandler()]
+    if to_file and settings.log_file is not None:
+        handlers.append(_open_log_file(settings, settings.log_file))
+    for handler in handlers:
+        handler.addFilter(_ContextFilter(service))
+        handler.setFormatter(
+            _JsonFormatter() if settings.log_format == "json" else _TextFormatter()
+        )
     root = logging.getLogger()
-    root.handlers[:] = [handler]
+    for previous in root.handlers:
+        if isinstance(previous, _PrivateRotatingFileHandler):
+            previous.close()
+    root.handlers[:] = handlers
     root.setLevel(logging.INFO)
     for name in OWN_LOGGERS:
         logging.getLogger(name).setLevel(logging.DEBUG if settings.debug else logging.INFO)
     for name in QUIET_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
+
+
+def _open_log_file(settings: Settings, file: Path) -> logging.Handler:
+    try:
+        make_private_folder(file.parent)
+        return _PrivateRotatingFileHandler(
+            file, maxBytes=settings.log_file_size, backupCount=settings.log_files, encoding="utf-8"
+        )
+    except OSError as error:
+        raise Misconfigured("bad_setting", f"LOG_FILE={file}: {error.strerror}") from None

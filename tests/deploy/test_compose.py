@@ -91,6 +91,21 @@ def test_each_choice_of_profiles_is_read_and_has_what_it_says(
     assert set(services(SERVICES, project, values, ())) == chosen
 
 
+def test_the_embedded_placewise_runs_on_a_gpu_where_its_service_is_named(project: Path) -> None:
+    found = services(EMBEDDED, project, {}, ("gpu",))
+    assert set(services(EMBEDDED, project, {}, ())) == {"placewise"}
+    assert set(found) == {"placewise", "placewise-gpu"}
+    gpu = found["placewise-gpu"]
+    (device,) = gpu["deploy"]["resources"]["reservations"]["devices"]
+    assert (device["driver"], device["capabilities"]) == ("nvidia", ["gpu"])
+    assert gpu["environment"] == {**found["placewise"]["environment"], "DEVICE": "cuda"}
+    assert gpu["build"]["args"]["TORCH_INDEX"] == ""
+    assert gpu["image"] != found["placewise"]["image"]
+    # The data stay where they are.
+    for shared in ("volumes", "ports", "command"):
+        assert gpu[shared] == found["placewise"][shared]
+
+
 @pytest.mark.parametrize("missing", sorted(REQUIRED))
 def test_without_a_secret_nothing_starts_and_the_answer_says_what_to_do(
     missing: str, tmp_path: Path, values: dict[str, str]
@@ -169,7 +184,7 @@ def test_each_image_is_built_for_the_command_that_it_runs(all_services: dict[str
     built = {name: s["build"]["args"] for name, s in all_services.items() if "build" in s}
     for name, arguments in built.items():
         service = re.sub(r"-(gpu|\d)$", "", name)
-        assert arguments["SERVICE"] == extras.get(name, service)
+        assert arguments["SERVICE"] == extras.get(service, service)
     assert "/cpu" in built["extractor"]["TORCH_INDEX"]
     assert built["extractor-gpu"]["TORCH_INDEX"] == ""
     assert all_services["extractor"]["image"] != all_services["extractor-gpu"]["image"]
@@ -203,7 +218,7 @@ def test_only_the_gateway_flower_and_grafana_listen_to_the_machine_and_only_on_l
     all_services: dict[str, Json],
 ) -> None:
     open_to = {name: s["ports"] for name, s in all_services.items() if s.get("ports")}
-    assert set(open_to) == {"gateway", "flower", "grafana", "placewise"}
+    assert set(open_to) == {"gateway", "flower", "grafana", "placewise", "placewise-gpu"}
     for ports in open_to.values():
         assert {port["host_ip"] for port in ports} == {"127.0.0.1"}
 

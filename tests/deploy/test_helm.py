@@ -363,6 +363,14 @@ def test_a_changed_setting_replaces_the_pods_that_read_it() -> None:
     assert all(before[part] != after[part] for part in before)
 
 
+def test_numbers_and_switches_reach_the_settings_as_they_are_written() -> None:
+    settings = {**example("cpu")["settings"], "MAX_FILE_SIZE": 250_000_000, "S3_SECURE": False}
+    found = parse_manifests(run_helm({"settings": {**settings, "CERTAINTY": 0.9, "DEBUG": "yes"}}))
+    (config,) = (one["data"] for one in found if one["kind"] == "ConfigMap")
+    names = ("MAX_FILE_SIZE", "S3_SECURE", "CERTAINTY", "DEBUG")
+    assert [config[name] for name in names] == ["250000000", "false", "0.9", "yes"]
+
+
 def test_backups_go_to_a_volume_that_outlives_the_release() -> None:
     (backup,) = of_kind("production", "CronJob")
     assert backup["spec"]["concurrencyPolicy"] == "Forbid"

@@ -13,6 +13,7 @@ import httpx2
 import pytest
 
 from placewise.client import Client
+from services.http_server import lan_url
 from shared.config.embedded_home import server_address_file
 from shared.errors import Unauthorized
 from tests.support.photos import photo_bytes
@@ -55,6 +56,15 @@ def objects(server: ServerProcess) -> set[Path]:
 
 
 # --- calls -----------------------------------------------------------------------------------
+
+
+def test_the_start_and_the_page_name_the_address_for_a_phone(
+    server: ServerProcess, stranger: httpx2.Client
+) -> None:
+    url = lan_url("0.0.0.0", stranger.base_url.port or 80)
+    assert url is not None, "this machine has no network"
+    assert f"phone:    {url} " in server.log()
+    assert stranger.get("/console/settings.json").json()["lan_url"] == url
 
 
 def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:

@@ -73,6 +73,9 @@ def test_photos_are_imported_and_found_by_their_original_names(
     assert [photo["original_filename"] for photo in images(server, tags="rain,night")] == [
         "Piazza Castello.jpg"
     ]
+    # As `tags` matched in the old service: in part, in either case.
+    assert images(server, tags_like="AI,nig") == images(server, tags="rain,night")
+    assert images(server, tags="rai") == []
     similar = server.ask(photo_bytes(10), top_k=1).json()["similar_images"]
     assert similar[0]["original_filename"] == "Piazza Castello.jpg"
 

@@ -16,9 +16,10 @@ def test_original_photos_lie_in_the_upload_dir(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     with ServerProcess(tmp_path / "home", upload_dir=photos) as server:
         file_id = server.indexed(photo_bytes(1))
-        server.indexed(photo_bytes(2))
+        server.indexed(photo_bytes(2), "Market Street.PNG")
         stored = [path for path in photos.iterdir() if not path.name.startswith(".")]
         assert {path.read_bytes() for path in stored} == {photo_bytes(1), photo_bytes(2)}
+        assert sorted(path.suffix for path in stored) == [".jpg", ".png"]
         assert not (server.home / "objects" / "originals").exists()
         assert server.stop() == 0
 

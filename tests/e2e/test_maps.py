@@ -174,6 +174,7 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
         ("DELETE", f"/uploads/{here}"),
         ("GET", f"/uploads/{here}/image"),
         ("GET", f"/uploads/{here}/thumbnail"),
+        ("GET", f"/uploads/{here}/preview"),
         ("POST", f"/similarity/{here}"),
     ):
         fields = {"place": "x"} if method == "PATCH" else None

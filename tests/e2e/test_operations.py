@@ -35,6 +35,7 @@ CALLS = {
     f"DELETE {API}/uploads/{{file_id}}",
     f"GET {API}/uploads/{{file_id}}/image",
     f"GET {API}/uploads/{{file_id}}/thumbnail",
+    f"GET {API}/uploads/{{file_id}}/preview",
     f"GET {API}/vocabularies",
     f"POST {API}/vocabularies",
     f"POST {API}/vocabularies/import",

@@ -63,6 +63,7 @@ def test_a_photo_tells_all_that_is_known_of_it(server: ServerProcess, file_id: s
         "image_path": url(file_id, "/image"),
         "image_url": url(file_id, "/image"),
         "thumbnail_url": url(file_id, "/thumbnail"),
+        "preview_url": url(file_id, "/preview"),
         "original_filename": "yard.jpg",
         "relative_path": None,
         "file_size": len(photo_bytes(1)),

@@ -9,9 +9,12 @@ import pytest
 from benchmarks.chaos import run_chaos
 from benchmarks.chaos.faults import all_faults
 
-# The same kind as another one, on another process or connection: `placewise bench chaos` has them.
+# What another one does, too, or does on another process: `placewise bench chaos` has them.
 ANOTHER_OF_ITS_KIND = {
     "kill -9 of search-1-0",
+    "FLUSHALL",  # a Redis that is stopped loses everything, too
+    "PostgreSQL killed and started",  # one that is stopped is killed and stays away
+    "connections to PostgreSQL refused",  # as those to a server that is stopped
     "connections to PostgreSQL cut",
     "connections to PostgreSQL slow",
     "connections to Redis refused",

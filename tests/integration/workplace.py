@@ -15,7 +15,7 @@ from sqlalchemy import select
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import QueuedChunks, advance_model_changes
 from shared.catalog.chunks import count_searchable
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
@@ -61,6 +61,7 @@ class Workplace:
     make_worker: Callable[[], ExtractorWorker]
     wakeups: InProcessWakeups = field(default_factory=InProcessWakeups)
     _worker: ExtractorWorker | None = None
+    _queued_chunks: QueuedChunks = field(default_factory=dict)
 
     # --- what clients do ---
 
@@ -100,7 +101,7 @@ class Workplace:
         return self.worker.drain(threading.Event())
 
     def advance(self) -> None:
-        advance_model_changes(self.catalog, self.wakeups)
+        advance_model_changes(self.catalog, self.wakeups, self._queued_chunks)
 
     def finish(self, job_id: UUID, each_round: Callable[[], None] = lambda: None) -> Job:
         """Drain and steward until the job has ended; the job."""

@@ -53,6 +53,7 @@ PHOTO: dict[str, Any] = {
     "role": "database",
     "image_url": "/image",
     "thumbnail_url": "/thumbnail",
+    "preview_url": "/preview",
 }
 UPLOADED: dict[str, Any] = {
     "file_id": PHOTO_ID,

@@ -7,6 +7,7 @@ fork would copy the locks that they hold.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import importlib
 import json
@@ -36,6 +37,7 @@ MODULES = (
     "services.steward.batches.worker",
     "services.steward.evaluation_worker",
     "services.steward.scheduler",
+    "services.trainer.run",
     "shared.jobs.celery_wakeups",
     "shared.storage.open_store",
     "shared.descriptors.extractor",
@@ -87,7 +89,11 @@ def serve(control: socket.socket) -> dict[str, Any] | None:
 
 
 def run(request: dict[str, Any]) -> None:
-    """Run the command in this process. The interpreter handles what the program raises."""
+    """Run the command in this process, and end it without taking down what was imported.
+
+    Freeing the imported modules would copy their pages: 0.5 s of CPU for each process. The
+    interpreter handles what else the program raises.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -95,7 +101,18 @@ def run(request: dict[str, Any]) -> None:
     program, *_ = sys.argv = request["command"]
     sys.path[0] = str(Path(program).parent)
     # As the interpreter does it: spawned children look for the program in sys.modules["__main__"].
-    runpy.run_path(program, run_name="__main__")
+    code = 0
+    try:
+        runpy.run_path(program, run_name="__main__")
+    except SystemExit as ended:
+        if not isinstance(ended.code, int | None):
+            raise
+        code = ended.code or 0
+    threading._shutdown()  # type: ignore[attr-defined]  # waits for threads, as the interpreter does
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _exit_code(pid: int) -> int | None:

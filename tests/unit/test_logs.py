@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.tracing import request_id_context, request_id_or_new
 
@@ -28,6 +30,8 @@ def set_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[Set]:
         configure_logging(Settings(), "gateway")
 
     yield make
+    for handler in set(root.handlers) - set(before[0]):
+        handler.close()
     root.handlers[:], level, levels = before
     root.setLevel(level)
     for name, was in levels.items():
@@ -129,3 +133,31 @@ def test_an_id_that_no_header_or_log_should_hold_is_replaced(sent: str | None) -
     assert made != sent
     assert len(made) == 36
     assert request_id_or_new("my-id:1/2") == "my-id:1/2"
+
+
+def test_a_log_file_gets_the_same_lines_is_rotated_and_private(
+    set_up: Set, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "logs" / "gateway.log"
+    set_up(LOG_FILE=str(file), LOG_FILE_SIZE="1000", LOG_FILES="2", LOG_FORMAT="json")
+    for number in range(50):
+        logging.getLogger("services").info("line %d", number)
+    files = sorted(path.name for path in file.parent.iterdir())
+    assert files == ["gateway.log", "gateway.log.1", "gateway.log.2"]
+    kept = [(file.parent / name).read_text() for name in reversed(files)]
+    assert capsys.readouterr().err.endswith("".join(kept))
+    assert all(len(text) <= 1000 for text in kept)
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (file.parent, *file.parent.iterdir()))
+
+
+def test_a_log_file_that_cannot_be_written_is_a_bad_setting(set_up: Set, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(Misconfigured, match=r"LOG_FILE=.*Not a directory"):
+        set_up(LOG_FILE=str(tmp_path / "file" / "gateway.log"))
+
+
+def test_commands_beside_a_server_leave_its_log_file_alone(set_up: Set, tmp_path: Path) -> None:
+    set_up(LOG_FILE=str(tmp_path / "server.log"))
+    configure_logging(Settings(), "keys", to_file=False)
+    logging.getLogger("services").info("a key")
+    assert (tmp_path / "server.log").read_text() == ""

@@ -40,7 +40,8 @@ annotations:
 {{- end }}
 {{- $fixed := dict "HOST" "0.0.0.0" "PORT" "8000" "METRICS_PORT" "9100" "SEARCH_URLS" (join "," $urls) }}
 {{- range $setting, $value := merge $fixed .Values.settings }}
-{{ $setting }}: {{ $value | toString | quote }}
+{{- /* Helm reads numbers as floats: toString would write 2.5e+08. */}}
+{{ $setting }}: {{ ternary $value ($value | toJson) (kindIs "string" $value) | quote }}
 {{- end }}
 {{- end }}
 

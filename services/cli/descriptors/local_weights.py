@@ -117,6 +117,45 @@ def inspect_weights(
     return _packaged_weights(config, on_reading)
 
 
+def has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
+    """Whether the weights of a DINOv2 or torch.hub extractor are on this machine and fit it."""
+    if config.hub is not None:
+        return _torchhub_weights(config.hub).here
+    try:
+        find_dinov2_weights(config, settings.dino_weights)
+    except Misconfigured:
+        return False
+    return True
+
+
+def suggest_extractor(settings: Settings) -> str | None:
+    """Suggest an extractor for new maps that finds more than the default one, in one line.
+
+    Returns:
+        A line, if EXTRACTOR and DINO_MODEL are unset, a GPU is available, and the weights of an
+        allowed torch.hub extractor or of DINOv2 (the largest first) are here; otherwise None.
+    """
+    if {"extractor", "dino_model"} & settings.model_fields_set or settings.device == "cpu":
+        return None
+    configs = list(list_extractor_configs(settings))
+    hub = [config for config in configs if config.hub is not None]
+    dinov2 = [config for config in configs if config.depth is not None]
+    dinov2.sort(key=lambda config: config.parameters or 0, reverse=True)
+    for config in (*hub, *dinov2):
+        if has_local_weights(config, settings):
+            break
+    else:
+        return None
+    import torch  # seconds, so only where there are weights
+
+    if not torch.cuda.is_available():
+        return None
+    return (
+        f"a GPU and the weights of {config.name} are here; it finds more than the default "
+        f"extractor: EXTRACTOR={config.name} uses it for new maps"
+    )
+
+
 def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
     """Cache key of the weights of a torch.hub entry."""
     return f"{hub.module} {code_fingerprint}"
@@ -153,12 +192,8 @@ def _packaged_weights(
 def _dinov2_weights(
     config: ExtractorConfig, weights_file: Path | None, on_reading: Callable[[Path], object]
 ) -> LocalWeights:
-    from shared.descriptors.backbones.dinov2 import Dinov2, check_dinov2_weights, dinov2_fingerprint
-    from shared.descriptors.backbones.dinov2_weights import (
-        find_local_weights,
-        hub_repository,
-        open_weights,
-    )
+    from shared.descriptors.backbones.dinov2 import Dinov2, dinov2_fingerprint
+    from shared.descriptors.backbones.dinov2_weights import hub_repository, open_weights
 
     layer, facet = config.layer, config.facet
     assert layer is not None
@@ -166,8 +201,7 @@ def _dinov2_weights(
     size = config.backbone.removeprefix("dinov2-")
     source = f"Hugging Face: {hub_repository(size)}" if weights_file is None else "DINO_WEIGHTS"
     try:
-        path = find_local_weights(size, weights_file)
-        check_dinov2_weights(size, layer, facet, open_weights(path, size))
+        path = find_dinov2_weights(config, weights_file)
     except Misconfigured as error:
         return LocalWeights(
             config.name, source, False, error.detail, None, None, Dinov2.licence, None
@@ -188,6 +222,19 @@ def _dinov2_weights(
         Dinov2.licence,
         known.fingerprint,
     )
+
+
+def find_dinov2_weights(config: ExtractorConfig, weights_file: Path | None) -> Path:
+    """Return the local weights file; raises Misconfigured where it is missing or does not fit."""
+    from shared.descriptors.backbones.dinov2 import check_dinov2_weights
+    from shared.descriptors.backbones.dinov2_weights import find_local_weights, open_weights
+
+    assert config.layer is not None
+    assert config.facet is not None
+    size = config.backbone.removeprefix("dinov2-")
+    path = find_local_weights(size, weights_file)
+    check_dinov2_weights(size, config.layer, config.facet, open_weights(path, size))
+    return path
 
 
 def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:

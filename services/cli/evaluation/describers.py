@@ -116,6 +116,7 @@ def checkpoint_describer(
         loaded.model.to(device),
         device,
         size,
+        interpolation=loaded.config.interpolation,
         batch_photos=settings.batch_photos if size else 1,
         max_pixels=settings.max_image_pixels,
     )

@@ -19,8 +19,6 @@ from services.cli.client import connect
 from services.cli.locate.folder import (
     FolderPhoto,
     check_time_zones,
-    clock_of,
-    known_positions,
     read_folder,
     read_gpx,
 )
@@ -48,6 +46,7 @@ from shared.geotagging.evidence import (
     PictureEvidence,
     ProbableCircle,
     SimilarPosition,
+    TimeNeighbours,
     interpolate_position,
 )
 from shared.geotagging.fusion import Proposal, propose_position
@@ -174,9 +173,9 @@ def locate(
             with connect(server, map_name, key) as client:
                 photo_count = client.stats().searchable_images
                 searches = _search_photos(client, unlocated)
-        neighbours = known_positions(photos, together)
+        neighbours = TimeNeighbours(photos, together)
         located = [
-            _locate_photo(photo, search, photo_count, neighbours, track, moves, radius, together)
+            _locate_photo(photo, search, photo_count, neighbours, track, moves, radius)
             for photo, search in zip(unlocated, searches, strict=True)
         ]
         accepted = [each for each in located if each.probability >= max(accept, 1e-9)]
@@ -228,24 +227,19 @@ def _locate_photo(
     photo: FolderPhoto,
     search: Similar | str | None,
     photo_count: int,
-    neighbours: dict[tuple[str, bool], list[KnownPosition]],
+    neighbours: TimeNeighbours,
     track: Sequence[KnownPosition],
     moves: MotionModel,
     radius_m: float,
-    together: bool,
 ) -> LocatedPhoto:
-    interpolated = on_track = None
-    if photo.time is not None:
-        clock = clock_of(photo, together)
-        known = neighbours.get(clock, []) if clock else []
-        interpolated = interpolate_position(known, photo.time, moves.max_speed_mps)
-        on_track = interpolate_position(track, photo.time, moves.max_speed_mps)
+    speed = moves.max_speed_mps
+    on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
     answer = search if isinstance(search, Similar) else None
     evidence = None if answer is None else picture_evidence(answer, photo_count)
     label = next((each for each in answer.estimate.levels if each.place), None) if answer else None
     return LocatedPhoto(
         photo,
-        propose_position(evidence, interpolated, on_track, radius_m),
+        propose_position(evidence, neighbours.position_of(photo, speed), on_track, radius_m),
         label.place if label else None,
         label.probability if label else None,
         search if isinstance(search, str) else None,

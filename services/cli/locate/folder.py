@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
@@ -16,26 +15,15 @@ from services.cli.ingest.geotags import list_photos
 from services.cli.locate.sidecars import embedded_xmp, find_sidecar, read_position
 from services.cli.output import printable_path
 from shared.errors import InvalidRequest, PlacewiseError
-from shared.geotagging.evidence import KnownPosition
+from shared.geotagging.evidence import DatedPhoto, KnownPosition
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
-
-TRAVELLERS = "all cameras"
 
 
 @dataclass(frozen=True, slots=True)
-class FolderPhoto:
-    """A photo of the folder."""
+class FolderPhoto(DatedPhoto):
+    """A photo of the folder; its coordinates are of the EXIF, of XMP in it, or of its sidecar."""
 
     path: Path
-    name: str
-    """relative to the folder"""
-    time: datetime | None
-    """UTC, or the camera's clock as if it were UTC"""
-    time_zone_is_known: bool
-    camera: str | None
-    latitude: float | None
-    longitude: float | None
-    """degrees, of the EXIF, of XMP in the photo, or of its sidecar"""
 
 
 def read_folder(
@@ -100,35 +88,6 @@ def check_time_zones(photos: Sequence[FolderPhoto], why: str) -> None:
         )
 
 
-def known_positions(
-    photos: Sequence[FolderPhoto], together: bool
-) -> dict[tuple[str, bool], list[KnownPosition]]:
-    """Return the photos with time and coordinates by `clock_of`, in the order of their times."""
-    known: dict[tuple[str, bool], list[KnownPosition]] = {}
-    for photo in photos:
-        clock = clock_of(photo, together)
-        if None in (clock, photo.time, photo.latitude, photo.longitude):
-            continue
-        assert clock is not None
-        assert photo.time is not None
-        assert photo.latitude is not None
-        assert photo.longitude is not None
-        position = KnownPosition(photo.time, photo.latitude, photo.longitude, photo.name)
-        insort(known.setdefault(clock, []), position, key=lambda each: each.time)
-    return known
-
-
-def clock_of(photo: FolderPhoto, together: bool) -> tuple[str, bool] | None:
-    """Return what identifies the photos whose times and ways can be compared; None if unknown.
-
-    Args:
-        photo: The photo.
-        together: Whether the people with the cameras travelled together.
-    """
-    camera = TRAVELLERS if together else photo.camera
-    return None if camera is None else (camera, photo.time_zone_is_known)
-
-
 def read_gpx(path: Path) -> list[KnownPosition]:
     """Read the track points of a GPX file that have a time, in the order of their times.
 
@@ -176,11 +135,11 @@ def _read_photo(folder: Path, path: Path, zone: tzinfo | None) -> FolderPhoto:
         if latitude is None and data is not None:
             latitude, longitude = read_position(data) or (None, None)
     return FolderPhoto(
-        path,
         printable_path(path.relative_to(folder)),
         time,
         header.time_zone_is_known or (time is not None and zone is not None),
         header.camera,
         latitude,
         longitude,
+        path,
     )

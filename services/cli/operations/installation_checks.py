@@ -22,6 +22,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from placewise.client import Client
+from services.cli.descriptors.local_weights import find_dinov2_weights, suggest_extractor
 from services.cli.operations.deployment_checks import (
     check_gateway,
     check_object_store,
@@ -176,22 +177,17 @@ def check_extractor(settings: Settings) -> str:
 
     extractor = load_extractor(config, settings)
     shipped = extractor.shipped_vocabulary()
-    return f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
+    summary = f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
         f"shipped vocabulary of {shipped[0].clusters} centres"
         if shipped
         else "no shipped vocabulary"
     )
+    suggestion = suggest_extractor(settings)
+    return f"{summary}; {suggestion}" if suggestion else summary
 
 
 def _check_dinov2(config: ExtractorConfig, weights: Path | None) -> str:
-    from shared.descriptors.backbones.dinov2 import check_dinov2_weights
-    from shared.descriptors.backbones.dinov2_weights import find_local_weights, open_weights
-
-    assert config.layer is not None
-    assert config.facet is not None
-    size = config.backbone.removeprefix("dinov2-")
-    path = find_local_weights(size, weights)
-    check_dinov2_weights(size, config.layer, config.facet, open_weights(path, size))
+    path = find_dinov2_weights(config, weights)
     return (
         f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
         "vocabulary: photos are described once one is fitted or imported"

@@ -177,7 +177,7 @@ def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _Catalo
     from shared.catalog.tables import open_catalog
 
     settings = read_settings()
-    configure_logging(settings, "keys")
+    configure_logging(settings, "keys", to_file=False)
     catalog = open_catalog(settings, "keys")
     try:
         wait_for_schema(catalog, 0)

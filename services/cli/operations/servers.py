@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import shlex
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
@@ -26,13 +27,35 @@ def serve() -> None:
     """Run the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C.
 
     If HOST is not a loopback address, every call requires an API key. The first start creates and
-    prints an admin key; `placewise keys` creates others.
+    prints an admin key; `placewise keys` creates others. With DEBUG, in a checkout of the
+    repository, the server restarts when its code changes.
     """
+    changed = threading.Event()
     with report_errors(as_json=False):
+        from services.code_reload import can_reload, restart_process, watch_code
         from services.standalone import serve_standalone
 
         settings = read_settings()
-        serve_standalone(settings, lambda running: _print(_startup_message(running, settings)))
+        is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
+
+        def announce(running: Standalone) -> None:
+            _print(_startup_message(running, settings))
+            if is_first_start and settings.database_url is None:
+                from services.cli.descriptors.local_weights import suggest_extractor
+
+                if suggestion := suggest_extractor(settings):
+                    _print(f"  note:     {suggestion}")
+            if settings.debug and can_reload():
+
+                def restart() -> None:
+                    changed.set()
+                    running.server.should_exit = True
+
+                watch_code(restart)
+
+        serve_standalone(settings, announce)
+    if changed.is_set():
+        restart_process()
 
 
 def _startup_message(running: Standalone, settings: Settings) -> str:

@@ -22,7 +22,7 @@ from services.trainer.arguments import (
 
 FIELDS = TrainingArguments.model_fields
 BOOLEANS = {name for name, field in FIELDS.items() if field.annotation is bool}
-SIZES = ("image_size", "test_image_size")
+SIZES = ("image_size", "val_image_size", "test_image_size")
 
 
 def with_training_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -125,7 +125,10 @@ async def start_vocabulary_import(
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await store_form_file(
-            request, gateway.store, new_vocabulary_key(), gateway.settings.max_vocabulary_bytes
+            request,
+            gateway.store,
+            lambda _filename: new_vocabulary_key(),
+            gateway.settings.max_vocabulary_bytes,
         )
     await idempotent.claim_form(gateway.store, received)
 

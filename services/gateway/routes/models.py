@@ -137,7 +137,7 @@ async def upload_model(
         received = await store_form_file(
             request,
             gateway.store,
-            new_checkpoint_key(),
+            lambda _filename: new_checkpoint_key(),
             gateway.settings.max_model_bytes,
             too_large=_checkpoint_too_large_error,
         )

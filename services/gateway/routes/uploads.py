@@ -32,7 +32,7 @@ from services.gateway.schemas import UploadResponse, accepted_headers, url_in_ma
 from services.gateway.uploads.multipart import multipart_schema, store_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
-from shared.imaging.file_formats import ACCEPTED_PHOTOS
+from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
 from shared.ingest.store_photo import BeforeCommit, StoreResult, store_photo
 from shared.ingest.validation import StoredUpload, check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
@@ -93,7 +93,7 @@ async def upload_photo(
         received = await store_form_file(
             request,
             gateway.store,
-            new_original_key(),
+            lambda filename: new_original_key(photo_suffix(filename)),
             gateway.settings.max_file_size,
             check_photo_signature,
         )

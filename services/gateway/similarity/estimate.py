@@ -104,8 +104,9 @@ def add_levels(
 def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
     if accepted is None or calibration is None or calibration.support_threshold is None:
         return (
-            "Whether the place is in the map is not known yet: this needs an evaluation with at "
-            "least 20 photos with coordinates or places (POST /api/v1/evaluations)."
+            "How certain this place is, and whether it is in the map, is not known yet: this needs "
+            "an evaluation with at least 20 photos with coordinates or places "
+            "(POST /api/v1/evaluations)."
         )
     compared = (
         f"The support of the first ten photos for the place is {support:.4f}; 5 % of the queries "

@@ -230,7 +230,7 @@ def run_similarity_search(
         ranking,
     )
     match_probabilities: dict[UUID, float] = {}
-    if places is not None:
+    if places is not None and model.is_fitted:
         estimate = add_levels(estimate, places, model, certainty)
         match_probabilities = dict(
             zip((hit.photo_id for hit in hits), places.match_probabilities, strict=True)

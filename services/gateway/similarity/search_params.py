@@ -48,6 +48,12 @@ class FilterParams(MapParams):
     tags: str | None = Field(
         None, max_length=5000, description="separated by commas; photos must have all"
     )
+    tags_like: str | None = Field(
+        None,
+        max_length=5000,
+        description="separated by commas; each must be a part of one of the photo's tags, "
+        "case-insensitive for A to Z",
+    )
     ids: str | None = Field(
         None, max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"
     )
@@ -71,6 +77,7 @@ class FilterParams(MapParams):
             place=self.place or None,
             place_under=level.rstrip("/") if level is not None else None,
             tags=tuple(parse_tags(self.tags.split(","))) if self.tags else (),
+            tags_like=tuple(parse_tags(self.tags_like.split(","))) if self.tags_like else (),
             ids=_parse_ids(self.ids) if self.ids is not None else None,
         )
 

@@ -28,6 +28,7 @@ from shared.imaging.file_formats import (
     ACCEPTED_ARCHIVES,
     ARCHIVE_SIGNATURE_BYTES,
     detect_archive_format,
+    photo_suffix,
 )
 from shared.ingest.photo_metadata import MAX_MANIFEST_BYTES
 from shared.ingest.validation import StreamValidator, check_photo_signature
@@ -198,7 +199,8 @@ class _BatchPartHandler:
         elif name == FILES_FIELD:
             if len(self.batch.files) == self._settings.max_batch_photos:
                 raise too_many_photos_error(self._settings.max_batch_photos)
-            self._file = BatchFile(_display_name(filename), new_original_key())
+            key = new_original_key(photo_suffix(filename))
+            self._file = BatchFile(_display_name(filename), key)
             self.batch.files.append(self._file)
         else:
             if self.batch.archive is not None:

@@ -167,7 +167,7 @@ STORE_WRITE_BYTES = 512 * 1024
 async def store_form_file(
     request: Request,
     store: ObjectStore,
-    key: str,
+    make_key: Callable[[str], str],
     max_bytes: int,
     check_begin: Callable[[bytes], object] = lambda begin: None,
     *,
@@ -180,7 +180,7 @@ async def store_form_file(
     Args:
         request: The request whose body is read.
         store: The object store.
-        key: Object key of the file.
+        make_key: Makes the object key of the file from its name.
         max_bytes: Maximum size of the file.
         check_begin: Called with the first bytes before the rest is read; may raise.
         too_large: Builds the exception for a file of more than `max_bytes`.
@@ -197,12 +197,14 @@ async def store_form_file(
     form = MultipartFormParser(
         request, parts, max_bytes + OVERHEAD_BYTES, lambda: too_large(max_bytes)
     )
+    key = ""
     writer: ObjectWriter | None = None
     try:
         async for piece in request.stream():
             form.feed(piece)
             if parts.pending_bytes >= STORE_WRITE_BYTES:
                 if writer is None:
+                    key = make_key(parts.filename)
                     writer = await run_in_threadpool(store.writer, key)
                 await run_in_threadpool(writer.write, parts.take_pending())
         form.finish()
@@ -211,6 +213,7 @@ async def store_form_file(
         small_file = rest if writer is None else None
         if small_file == b"":
             raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
+        key = key or make_key(parts.filename)
         await run_in_threadpool(_finish_object, store, key, writer, rest)
     except BaseException:
         if writer is not None:

@@ -33,7 +33,7 @@ async def receive_query_photo(
         received = await store_form_file(
             request,
             gateway.store,
-            query_key(job_id),
+            lambda _filename: query_key(job_id),
             gateway.settings.max_file_size,
             check_photo_signature,
         )

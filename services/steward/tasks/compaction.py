@@ -1,4 +1,8 @@
-"""Compaction: merges the small chunks of a slot into one and drops rows of deleted photos."""
+"""Compaction: merges the small chunks of a slot into one and drops rows of deleted photos.
+
+In tiers, so that a row is rarely merged more than twice: new chunks of an open slot are merged with
+each other, and the results with one another once the slot is full.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import random
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import case, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
@@ -24,6 +28,10 @@ from shared.storage.read_retries import ReadRetries
 
 log = logging.getLogger(__name__)
 
+# An open slot of small batches has many merged chunks: they are merged again from this multiple of
+# COMPACT_CHUNKS on, because a search worker holds each chunk as an open file.
+MAX_CHUNKS_FACTOR = 4
+
 DEAD_ROW_SAMPLE_SLOTS = 100  # slots whose dead rows one run counts: 100,000 rows, about 0.2 s
 DEAD_ROW_SHARE = 0.2  # of a slot's rows; with more, it is rewritten
 
@@ -36,7 +44,7 @@ def merge_small_chunks(
     Args:
         catalog: The catalog.
         store: The object store with the chunks.
-        compact_chunks: An open slot is merged from this number of chunks on.
+        compact_chunks: New chunks of an open slot are merged from this number on.
         retries: Backoff for slots with unreadable chunks, so that not every run reads them.
 
     Returns:
@@ -44,27 +52,38 @@ def merge_small_chunks(
     """
     retries = retries or ReadRetries()
     merged = 0
-    for generation_id, slot in _find_slots_to_merge(catalog, compact_chunks):
+    for generation_id, slot, new_only in _find_slots_to_merge(catalog, compact_chunks):
         name = f"slot {slot} of generation {generation_id}"
         if not retries.is_due(name):
             continue
         try:
-            merged += merge_slot(catalog, store, generation_id, slot)
+            merged += merge_slot(catalog, store, generation_id, slot, new_only=new_only)
             retries.succeeded(name)
         except (Unavailable, NotFound) as error:
             retries.failed(name, error)
     return merged
 
 
-def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: int) -> bool:
-    """Write the slot's live rows into one new chunk.
+def merge_slot(
+    catalog: Catalog,
+    store: ObjectStore,
+    generation_id: UUID,
+    slot: int,
+    *,
+    new_only: bool = False,
+) -> bool:
+    """Write the live rows of the slot, or of its chunks that were never merged, into one new chunk.
 
     Returns:
-        False if the slot's chunks changed meanwhile: the catalog is left unchanged.
+        False if one of these chunks was replaced meanwhile: the catalog is left unchanged.
     """
     with catalog.read() as session:
         generation = session.get_one(Generation, generation_id)
-        old = _slot_chunks(session, generation_id, slot)
+        old = [
+            chunk
+            for chunk in _slot_chunks(session, generation_id, slot)
+            if not (new_only and chunk.sealed)
+        ]
         live_rows = {chunk.id: list_live_rows(session, chunk.id) for chunk in old}
     rows = [read_chunk(store, chunk.object_key, chunk.sha256) for chunk in old]
     photo_ids = [photo_id for chunk in old for _, photo_id in live_rows[chunk.id]]
@@ -85,8 +104,8 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
         lock_map(session, generation.map_id)
         generation = lock_generation(session, generation_id)
         current = {chunk.id for chunk in _slot_chunks(session, generation_id, slot)}
-        if current != {chunk.id for chunk in old}:
-            # Another steward merged the slot, or it has a new chunk: the new file is an orphan.
+        if not current.issuperset(chunk.id for chunk in old):
+            # Another steward merged the slot: the new file is an orphan.
             return False
         old_ids = [chunk.id for chunk in old]
         # Rows of photos deleted meanwhile were copied, too: they are dead rows of the new chunk.
@@ -104,7 +123,7 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
                     rows=new_chunk.rows,
                     size_bytes=new_chunk.size_bytes,
                     sha256=new_chunk.sha256,
-                    sealed=slot < generation.open_slot,
+                    sealed=True,
                 )
             )
             session.flush()
@@ -138,9 +157,10 @@ def _slot_chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk
     )
 
 
-def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
+def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int, bool]]:
     """Return full slots of several chunks, open slots of many chunks, and slots with dead rows.
 
+    Each with its generation, and whether only its chunks that were never merged are to be merged.
     Dead rows are counted in a new random sample of DEAD_ROW_SAMPLE_SLOTS slots in each run:
     counting those of a large catalog would load the database.
     """
@@ -151,6 +171,7 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
                 Chunk.slot,
                 Generation.open_slot,
                 func.count(),
+                func.sum(case((Chunk.sealed, 0), else_=1)),
                 func.sum(Chunk.rows),
             )
             .join(Generation, Generation.id == Chunk.generation_id)
@@ -165,16 +186,20 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
         sampled = random.sample(slots, min(DEAD_ROW_SAMPLE_SLOTS, len(slots)))
         dead = {
             (generation_id, slot)
-            for generation_id, slot, _, _, rows in sampled
+            for generation_id, slot, _, _, _, rows in sampled
             if rows - _count_live_rows(session, generation_id, slot) > DEAD_ROW_SHARE * rows
         }
-    return [
-        (generation_id, slot)
-        for generation_id, slot, open_slot, chunks, _ in slots
-        if (slot < open_slot and chunks > 1)
-        or chunks >= compact_chunks
-        or (generation_id, slot) in dead
-    ]
+    found = []
+    for generation_id, slot, open_slot, chunks, new, _ in slots:
+        if (
+            (slot < open_slot and chunks > 1)
+            or chunks >= MAX_CHUNKS_FACTOR * compact_chunks
+            or (generation_id, slot) in dead
+        ):
+            found.append((generation_id, slot, False))
+        elif new >= compact_chunks:
+            found.append((generation_id, slot, True))
+    return found
 
 
 def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:

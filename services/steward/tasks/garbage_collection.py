@@ -14,6 +14,10 @@ from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
+from services.steward.tasks.model_changes import (
+    adopt_failed_reindex_jobs,
+    delete_done_reindex_jobs,
+)
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
@@ -283,7 +287,9 @@ def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: J
 
 
 def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
-    """Run every collection of this module once."""
+    """Run every collection of this module once, and complete the switch to new generations."""
+    adopt_failed_reindex_jobs(catalog)
+    delete_done_reindex_jobs(catalog)
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)
     collect_whitenings(catalog, store, settings.retired_grace_seconds)

@@ -4,18 +4,23 @@ A generation is complete when each live photo of the active generation has a des
 recorded failure in it. It is activated once every live search worker has loaded it. The last check
 and the activation are one transaction under the map's lock, which publishing takes, too, so no
 photo can be missed between them. Search workers that died are removed, or they would block it.
+
+Photos are queued without that lock, chunk by chunk of the active generation, and the chunks that
+are done are remembered: the last check reads only the chunks published since.
 """
 
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Sequence
 from uuid import UUID
 
-from sqlalchemy import delete, exists, func, insert, select, update
-from sqlalchemy.orm import Session, aliased
+from sqlalchemy import Select, delete, exists, func, insert, or_, select, update
+from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import Descriptor, estimate_described
-from shared.catalog.database.base import Condition, db_now, db_now_plus
+from shared.catalog.chunks import IDS_PER_QUERY, Chunk, Descriptor, estimate_described
+from shared.catalog.database.base import Condition, affected_rows, db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
@@ -92,26 +97,68 @@ def _loading_is_slow(session: Session, generation: Generation) -> bool:
 
 ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
 
-REINDEX_JOBS_PER_TRANSACTION = 2000
+REINDEX_JOBS_PER_TRANSACTION = 500
+DELETED_JOBS_PER_TRANSACTION = 1000
+SLICE_SECONDS = 0.5  # of one run for each model change, so that other tasks are not delayed
+
+QueuedChunks = dict[UUID, set[UUID]]
+"""Building generation -> chunks of the active one whose photos have all been queued."""
 
 # The defaults of `POST /vocabularies`; without `clusters` the extractor's own number is used.
 DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
 
 
-def advance_model_changes(catalog: Catalog, wakeups: Wakeups) -> None:
-    """Advance every model change that waits for descriptors or for search workers by one step."""
+def advance_model_changes(
+    catalog: Catalog, wakeups: Wakeups, queued_chunks: QueuedChunks | None = None
+) -> None:
+    """Advance every model change that waits for descriptors or for search workers by one step.
+
+    Args:
+        catalog: The catalog.
+        wakeups: Notified when photos were queued.
+        queued_chunks: What earlier calls have queued, updated by this one. It may be lost: then all
+            chunks are read again.
+    """
+    queued_chunks = {} if queued_chunks is None else queued_chunks
     with catalog.read() as session:
         waiting = session.scalars(
             select(Job).where(Job.kind.in_(MODEL_CHANGE_JOBS), Job.waiting_for.in_(ADVANCED_WAITS))
         ).all()
+    generation_ids = {job.generation_id for job in waiting}
+    for ended in queued_chunks.keys() - generation_ids:
+        del queued_chunks[ended]
     for job in waiting:
-        with catalog.write() as session:
+        if job.generation_id is not None:
+            done = queued_chunks.setdefault(job.generation_id, set())
+            _advance_model_change(catalog, wakeups, job, job.generation_id, done)
+
+
+def _advance_model_change(
+    catalog: Catalog, wakeups: Wakeups, job: Job, generation_id: UUID, queued_chunks: set[UUID]
+) -> None:
+    with catalog.read() as session:
+        generation = session.get_one(Generation, generation_id)
+    all_queued = True
+    if generation.state == GenerationState.BUILDING:
+        queued, all_queued = _queue_missing_photos(catalog, job, generation, queued_chunks)
+        if queued:
+            wakeups.send()
+    with catalog.read() as session:
+        seems_complete = all_queued and not _has_open_jobs(session, job, generation)
+    with catalog.write() as session:
+        if seems_complete:
             lock_map(session, job.map_id)
-            current = session.get_one(Job, job.id, with_for_update=True)
-            if current.waiting_for in ADVANCED_WAITS and current.generation_id:
-                queued = _advance_generation(session, current, current.generation_id)
-                if queued:
-                    wakeups.send()
+        job = session.get_one(Job, job.id, with_for_update=True)
+        if job.waiting_for not in ADVANCED_WAITS:
+            return  # cancelled, or finished by another steward
+        generation = lock_generation(session, generation_id)
+        if not seems_complete or not _is_complete(session, job, generation, queued_chunks):
+            _report_progress(session, job, generation)
+            return
+        switched = generation.state == GenerationState.BUILDING
+        _finish_model_change(session, job, generation)
+    if switched:
+        adopt_failed_reindex_jobs(catalog)
 
 
 def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
@@ -182,43 +229,64 @@ def _has_outgrown_its_vocabulary(session: Session, map_id: UUID, min_photos: int
     return session.scalar(select(func.count()).select_from(photos.subquery())) == required
 
 
-def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
-    """Queue missing photos, update the progress, or finish; return the number of queued jobs."""
-    generation = lock_generation(session, generation_id)
+def _open_jobs(job: Job, generation: Generation) -> Condition:
+    """Condition for the jobs that describe photos into the generation."""
     if generation.state == GenerationState.BUILDING:
-        queued = _queue_missing_photos(session, generation)
-        open_jobs = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation_id)
-    else:  # the map's first generation: photos are described into it by their own jobs
-        queued = 0
-        open_jobs = (
-            (Job.kind == JobKind.INDEX)
-            & (Job.map_id == job.map_id)
-            & (Job.created_at <= generation.created_at)
-        )
-    if queued or session.scalar(
-        select(exists().where(open_jobs, Job.state.in_(UNFINISHED_STATES)))
-    ):
-        before = int(job.params.get("done_before", 0))
-        described = estimate_described(session, generation_id)
-        # Also if it was complete before: photos have been added since.
-        job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
-        job.progress_done = max(0, min(before + described, job.progress_total - 1))
-        return queued
-    failed = _count_jobs(session, open_jobs & (Job.state == JobState.FAILED))
+        return (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation.id)
+    # The map's first generation: photos are described into it by their own jobs.
+    return (
+        (Job.kind == JobKind.INDEX)
+        & (Job.map_id == job.map_id)
+        & (Job.created_at <= generation.created_at)
+    )
+
+
+def _has_open_jobs(session: Session, job: Job, generation: Generation) -> bool:
+    unfinished = exists().where(_open_jobs(job, generation), Job.state.in_(UNFINISHED_STATES))
+    return bool(session.scalar(select(unfinished)))
+
+
+def _is_complete(
+    session: Session, job: Job, generation: Generation, queued_chunks: set[UUID]
+) -> bool:
+    """Return whether no photo is still to be described; the caller holds the map's lock."""
+    if _has_open_jobs(session, job, generation):
+        return False
+    if generation.state != GenerationState.BUILDING:
+        return True
+    new_chunks = _active_chunk_ids(session, generation.map_id) - queued_chunks
+    sources = [_photos_of_cancelled_jobs(generation.id), *map(_photos_of_chunk, new_chunks)]
+    return not any(
+        _find_missing(session, generation.id, session.scalars(photo_ids).all())
+        for photo_ids in sources
+    )
+
+
+def _report_progress(session: Session, job: Job, generation: Generation) -> None:
+    before = int(job.params.get("done_before", 0))
+    described = estimate_described(session, generation.id)
+    # Also if it was complete before: photos have been added since.
+    job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
+    job.progress_done = max(0, min(before + described, job.progress_total - 1))
+
+
+def _finish_model_change(session: Session, job: Job, generation: Generation) -> None:
+    """Activate the complete generation, unless search workers have yet to load it."""
+    failed = _count_jobs(session, _open_jobs(job, generation) & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
         if not search_workers_have_loaded(session, job, generation):
-            return 0
+            return
         _activate_generation(session, job, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
-    photos = estimate_described(session, generation_id)
+    photos = estimate_described(session, generation.id)
     whitening = None
     if generation.whitening_id is not None:
         whitening = session.get_one(StoredWhitening, generation.whitening_id).summary()
     succeed_job(
         job,
         {
-            "generation_id": str(generation_id),
+            "generation_id": str(generation.id),
             "vocabulary_id": str(generation.vocabulary_id) if generation.vocabulary_id else None,
             "clusters": generation.spec["clusters"],
             "dimension": generation.dimension,
@@ -227,50 +295,113 @@ def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
             "failed": failed,
         },
     )
-    log.info("activated generation %s with %d photos", generation_id, photos)
-    return 0
+    log.info("activated generation %s with %d photos", generation.id, photos)
 
 
-def _queue_missing_photos(session: Session, generation: Generation) -> int:
-    """Queue a reindex job for each photo without one, up to REINDEX_JOBS_PER_TRANSACTION."""
-    active = active_generation(session, generation.map_id)
-    assert active is not None, "a generation is built only while another is active"
-    described, reindexed = aliased(Descriptor), aliased(Job)
-    missing = (
-        select(Photo.id)
-        .join(
-            Descriptor,
-            (Descriptor.photo_id == Photo.id) & (Descriptor.generation_id == active.id),
+def _queue_missing_photos(
+    catalog: Catalog, job: Job, generation: Generation, queued_chunks: set[UUID]
+) -> tuple[int, bool]:
+    """Queue a reindex job for each photo without one, for up to SLICE_SECONDS.
+
+    Adds the chunks of the active generation whose photos are all queued to `queued_chunks`.
+
+    Returns:
+        The number of queued jobs, and whether every chunk was reached.
+    """
+    deadline = time.monotonic() + SLICE_SECONDS
+    queued = _queue_photos(catalog, job, generation, _photos_of_cancelled_jobs(generation.id))
+    with catalog.read() as session:
+        chunk_ids = _active_chunk_ids(session, generation.map_id)
+    queued_chunks &= chunk_ids
+    for chunk_id in sorted(chunk_ids - queued_chunks):
+        if time.monotonic() > deadline:
+            return queued, False
+        queued += _queue_photos(catalog, job, generation, _photos_of_chunk(chunk_id))
+        queued_chunks.add(chunk_id)
+    return queued, True
+
+
+def _queue_photos(
+    catalog: Catalog, job: Job, generation: Generation, photo_ids: Select[UUID]
+) -> int:
+    """Queue a reindex job for each missing one of the photos; return the number of jobs."""
+    with catalog.read() as session:
+        missing = _find_missing(session, generation.id, session.scalars(photo_ids).all())
+    queued = 0
+    for begin in range(0, len(missing), REINDEX_JOBS_PER_TRANSACTION):
+        batch = missing[begin : begin + REINDEX_JOBS_PER_TRANSACTION]
+        with catalog.write() as session:
+            # Of several stewards, one queues at a time; and none for a cancelled model change.
+            current = session.get_one(Job, job.id, with_for_update=True)
+            if current.waiting_for not in ADVANCED_WAITS:
+                break
+            still_missing = _find_missing(session, generation.id, batch)
+            if still_missing:
+                rows = [_reindex_job(generation, photo_id) for photo_id in still_missing]
+                session.execute(insert(Job), rows)
+            queued += len(still_missing)
+    return queued
+
+
+def _reindex_job(generation: Generation, photo_id: UUID) -> dict[str, object]:
+    return {
+        "id": new_id(),
+        "map_id": generation.map_id,
+        "kind": JobKind.REINDEX,
+        "priority": Priority.REINDEX,
+        "photo_id": photo_id,
+        "generation_id": generation.id,
+    }
+
+
+def _find_missing(session: Session, generation_id: UUID, photo_ids: Sequence[UUID]) -> list[UUID]:
+    """Return the live ones of the photos without a descriptor or a job in the generation.
+
+    Rows are looked up by photo and not by generation: PostgreSQL's planner underestimates how many
+    rows a generation has that is being built, and would read all of them for each photo.
+    """
+    missing: list[UUID] = []
+    for begin in range(0, len(photo_ids), IDS_PER_QUERY):
+        batch = photo_ids[begin : begin + IDS_PER_QUERY]
+        live = select(Photo.id).where(Photo.id.in_(batch), Photo.deleted_at.is_(None))
+        described = select(Descriptor.photo_id, Descriptor.generation_id).where(
+            Descriptor.photo_id.in_(batch)
         )
-        .where(
-            Photo.map_id == generation.map_id,
-            Photo.deleted_at.is_(None),
-            ~exists().where(
-                described.photo_id == Photo.id, described.generation_id == generation.id
-            ),
-            ~exists().where(
-                reindexed.photo_id == Photo.id,
-                reindexed.generation_id == generation.id,
-                reindexed.state != JobState.CANCELLED,  # by a user: the photo is still missing
-            ),
+        queued = select(Job.photo_id, Job.generation_id).where(
+            Job.photo_id.in_(batch), Job.state != JobState.CANCELLED
         )
-        .order_by(Photo.id)
-        .limit(REINDEX_JOBS_PER_TRANSACTION)
-    )
-    rows = [
-        {
-            "id": new_id(),
-            "map_id": generation.map_id,
-            "kind": JobKind.REINDEX,
-            "priority": Priority.REINDEX,
-            "photo_id": photo_id,
-            "generation_id": generation.id,
+        present = {
+            photo_id
+            for statement in (described, queued)
+            for photo_id, of_generation in session.execute(statement)
+            if of_generation == generation_id
         }
-        for photo_id in session.scalars(missing)
-    ]
-    if rows:
-        session.execute(insert(Job), rows)
-    return len(rows)
+        missing += [photo_id for photo_id in session.scalars(live) if photo_id not in present]
+    return missing
+
+
+def _photos_of_chunk(chunk_id: UUID) -> Select[UUID]:
+    return select(Descriptor.photo_id).where(Descriptor.chunk_id == chunk_id)
+
+
+def _photos_of_cancelled_jobs(generation_id: UUID) -> Select[UUID]:
+    """Select the photos whose reindex jobs were cancelled: they may be missing again."""
+    return (
+        select(Photo.id)
+        .join(Job, Job.photo_id == Photo.id)
+        .where(
+            Job.generation_id == generation_id,
+            Job.state == JobState.CANCELLED,
+            Job.kind == JobKind.REINDEX,
+        )
+    )
+
+
+def _active_chunk_ids(session: Session, map_id: UUID) -> set[UUID]:
+    active = active_generation(session, map_id)
+    assert active is not None, "a generation is built only while another is active"
+    live = select(Chunk.id).where(Chunk.generation_id == active.id, Chunk.superseded_at.is_(None))
+    return set(session.scalars(live))
 
 
 def _activate_generation(session: Session, job: Job, generation: Generation) -> None:
@@ -295,13 +426,61 @@ def _activate_generation(session: Session, job: Job, generation: Generation) -> 
             "extractor": generation.extractor,
         },
     )
-    reindex = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation.id)
-    # A failed reindex job becomes its photo's own job, so that the photo shows the error.
-    failed = select(Job.photo_id, Job.id).where(reindex, Job.state == JobState.FAILED)
-    for photo_id, job_id in session.execute(failed).all():
-        session.execute(update(Photo).where(Photo.id == photo_id).values(job_id=job_id))
-    session.execute(delete(Job).where(reindex, Job.state != JobState.FAILED))
     increment_map_version(session, generation.map_id)
+
+
+def adopt_failed_reindex_jobs(catalog: Catalog) -> None:
+    """Make the failed reindex jobs of active generations their photos' jobs, which show the error.
+
+    A photo whose job is newer than the reindex job keeps it: it was queued again since.
+    """
+    failed = (
+        select(Job.id)
+        .join(Generation, Generation.id == Job.generation_id)
+        .join(Photo, Photo.id == Job.photo_id)
+        .where(
+            Generation.state == GenerationState.ACTIVE,
+            Job.state == JobState.FAILED,
+            Job.kind == JobKind.REINDEX,
+            or_(Photo.job_id.is_(None), Photo.job_id < Job.id),
+        )
+        .limit(REINDEX_JOBS_PER_TRANSACTION)
+    )
+    while True:
+        with catalog.write() as session:
+            job_ids = session.scalars(failed).all()
+            if job_ids:
+                session.execute(
+                    update(Photo)
+                    .where(Photo.id == Job.photo_id, Job.id.in_(job_ids))
+                    .values(job_id=Job.id)
+                    .execution_options(synchronize_session=False)
+                )
+        if len(job_ids) < REINDEX_JOBS_PER_TRANSACTION:
+            return
+
+
+def delete_done_reindex_jobs(catalog: Catalog) -> None:
+    """Delete the successful and cancelled reindex jobs of activated generations.
+
+    Works for up to SLICE_SECONDS: a model change has as many jobs as its map has photos.
+    """
+    done = (
+        select(Job.id)
+        .join(Generation, Generation.id == Job.generation_id)
+        .where(
+            Generation.state.in_((GenerationState.ACTIVE, GenerationState.RETIRED)),
+            Job.state.in_((JobState.SUCCEEDED, JobState.CANCELLED)),
+            Job.kind == JobKind.REINDEX,
+        )
+        .limit(DELETED_JOBS_PER_TRANSACTION)
+    )
+    deadline = time.monotonic() + SLICE_SECONDS
+    while time.monotonic() < deadline:
+        with catalog.write() as session:
+            deleted = affected_rows(session.execute(delete(Job).where(Job.id.in_(done))))
+        if deleted < DELETED_JOBS_PER_TRANSACTION:
+            return
 
 
 def _last_change_failed(session: Session, map_id: UUID) -> bool:

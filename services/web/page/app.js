@@ -11,10 +11,11 @@ const VIEWS = {
   photo: { title: "Photo", show: async (...view) => (await import("./views/photo.js")).showPhoto(...view) },
   tracks: { title: "Tracks", show: async (...view) => (await import("./views/tracks.js")).showTracks(...view) },
   add: { title: "Add", show: async (...view) => (await import("./views/add.js")).showAdd(...view) },
+  locate: { title: "Locate a folder", show: async (...view) => (await import("./views/locate.js")).showLocate(...view) },
   model: { title: "Model", show: async (...view) => (await import("./views/model.js")).showModel(...view) },
   status: { title: "Status", show: async (...view) => (await import("./views/status.js")).showStatus(...view) },
 };
-const TAB_OF = { photo: "photos", tracks: "model" };
+const TAB_OF = { locate: "add", photo: "photos", tracks: "model" };
 const NEW_MAP = "\n"; // no map's name
 
 const main = document.getElementById("main");

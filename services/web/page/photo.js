@@ -1,7 +1,7 @@
 // Photos of the server as pictures. They are fetched, because an <img> can't send a key.
 
 import { ask, get } from "./api.js";
-import { h } from "./dom.js";
+import { h, noteError } from "./dom.js";
 import { nameOf } from "./format.js";
 import { hasEnded } from "./jobs.js";
 
@@ -44,8 +44,10 @@ async function show(image) {
       return;
     }
     // Until the preview is made, the original is shown, where the browser can.
-    if (!waited) showWhenMade(image, (await response.json()).job_id);
-    await draw(image, await ask(original));
+    const { job_id: jobId } = await response.json();
+    await draw(image, await ask(original)).finally(() => {
+      if (!waited) showWhenMade(image, jobId).catch(noteError);
+    });
   } catch {
     image.classList.add("missing");
     image.alt = `${image.alt} (can't be loaded)`;

@@ -5,11 +5,7 @@ import { degrees } from "./format.js";
 
 const ZOOM = 18;
 
-/** Coordinates with what can be done with them. */
-export function coordinates(latitude, longitude, ...more) {
-  return [h("span", { class: "degrees" }, degrees(latitude, longitude), ...more), coordinateTools(latitude, longitude)];
-}
-
+/** Copies the coordinates, or opens them on the map of another site. */
 export function coordinateTools(latitude, longitude) {
   const at = `${latitude.toFixed(6)}/${longitude.toFixed(6)}`;
   const url = `https://www.openstreetmap.org/?mlat=${latitude.toFixed(6)}&mlon=${longitude.toFixed(6)}#map=${ZOOM}/${at}`;

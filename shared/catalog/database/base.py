@@ -104,6 +104,16 @@ class json_array_has(FunctionElement[bool]):
     inherit_cache = True
 
 
+class json_array_has_part(FunctionElement[bool]):
+    """True where a string of a JSON array column contains a text, ASCII letters in either case.
+
+    The same strings as `photo_filter.is_part_of_tag`: `json_array_has_part(Photo.tags, "night")`.
+    """
+
+    type = Boolean()
+    inherit_cache = True
+
+
 class filename_trigrams(FunctionElement[Any]):
     """The case-folded trigrams of a text, for an index that serves substring searches.
 
@@ -159,6 +169,25 @@ def _json_array_has_sqlite(element: json_array_has, compiler: Any, **kw: Any) ->
     array, value = element.clauses
     array_sql, value_sql = compiler.process(array, **kw), compiler.process(value, **kw)
     return f"EXISTS (SELECT 1 FROM json_each({array_sql}) WHERE json_each.value = {value_sql})"  # noqa: S608  (compiled SQL, no text of users)
+
+
+@compiles(json_array_has_part, "postgresql")
+def _json_array_has_part_postgresql(element: json_array_has_part, compiler: Any, **kw: Any) -> str:
+    array, part = (compiler.process(clause, **kw) for clause in element.clauses)
+    # In the collation "C", lower() changes ASCII letters only.
+    return (
+        f"EXISTS (SELECT 1 FROM jsonb_array_elements_text({array}) AS item(text) WHERE "  # noqa: S608  (compiled SQL, no text of users)
+        f'strpos(lower(item.text COLLATE "C"), lower(CAST({part} AS text) COLLATE "C")) > 0)'
+    )
+
+
+@compiles(json_array_has_part, "sqlite")
+def _json_array_has_part_sqlite(element: json_array_has_part, compiler: Any, **kw: Any) -> str:
+    array, part = (compiler.process(clause, **kw) for clause in element.clauses)
+    return (
+        f"EXISTS (SELECT 1 FROM json_each({array}) WHERE "  # noqa: S608  (compiled SQL, no text of users)
+        f"instr(lower(json_each.value), lower({part})) > 0)"
+    )
 
 
 @compiles(filename_trigrams)

@@ -1,8 +1,8 @@
 """Backbone of models from `placewise train`: computes one global descriptor per photo.
 
-Photos are resized to the model's image size as in its evaluations: upright, bilinear, antialiased,
-ignoring the aspect ratio (`resizeHEIGHTxWIDTH` in `shared.imaging.preprocessing`), then normalised
-by ImageNet's mean and standard deviation.
+Photos are resized to the model's image size as in its evaluations: upright, antialiased, ignoring
+the aspect ratio (`squeeze_name` in `shared.imaging.preprocessing`), then normalised by ImageNet's
+mean and standard deviation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shared.descriptors.vpr_models.model import VprModel
 from shared.errors import Unprocessable
 from shared.extractor_config.configs import MAX_WIDTH
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
-from shared.imaging.preprocessing import Preprocessing, get_preprocessing
+from shared.imaging.preprocessing import Preprocessing, get_preprocessing, squeeze_name
 
 PROBE_SEED = 20_242
 MIN_REPEAT_COSINE = 0.999  # of a photo alone and in a batch; kernels differ slightly
@@ -82,7 +82,7 @@ class TrainedBackbone:
     @property
     def preprocessing(self) -> Preprocessing:
         """The resize to the model's image size."""
-        return get_preprocessing("resize{}x{}".format(*self.image_size))
+        return get_preprocessing(squeeze_name(self.image_size, self._model.config.interpolation))
 
     def as_spec(self) -> dict[str, Any]:
         """Return the fields that the model adds to the extractor spec: its input (JSON)."""

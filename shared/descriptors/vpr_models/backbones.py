@@ -371,6 +371,35 @@ _BUILDERS: dict[str, BackboneBuilder] = {
 }
 
 
+class OwnBackbone(StagedBackbone):
+    """A network of the user without stages: it is trained or frozen as a whole."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__(network, [])
+
+    def forward(self, photos: torch.Tensor) -> FeatureMaps:
+        maps = self._run(photos)
+        if not isinstance(maps, torch.Tensor) or maps.ndim != 4:
+            raise Misconfigured(
+                "backbone_unfit",
+                f"The backbone {type(self.stem).__name__} must return maps (B, C, h, w) of "
+                f"(B, 3, H, W) photos, not {tuple(getattr(maps, 'shape', [type(maps)]))}.",
+            )
+        return FeatureMaps(maps)
+
+
+def register_backbone(name: str, build: Callable[[bool], nn.Module]) -> None:
+    """Add a backbone of the user.
+
+    Args:
+        name: `package.module:function`.
+        build: Makes the network, with pretrained or random weights: (B, 3, H, W) float32 photos,
+            normalised as for ImageNet, to (B, C, h, w) maps.
+    """
+    STAGES[name] = 0
+    _BUILDERS[name] = lambda _name, pretrained, _weights: OwnBackbone(build(pretrained))
+
+
 def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbone:
     """Build the backbone of a config, cropped and frozen, in evaluation mode.
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Container, Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -42,6 +42,12 @@ NO_FREEZING = -1
 MIN_STAGE_TO_CROP = 2  # a stem alone has a receptive field of a few pixels
 MAX_SIDE_PIXELS = 4096
 
+
+def is_own_module(name: str) -> bool:
+    """Whether a name is `package.module:Name`, code of the user instead of a network's name."""
+    return ":" in name
+
+
 SidePixels = Annotated[int, Field(ge=16, le=MAX_SIDE_PIXELS)]
 
 
@@ -77,6 +83,11 @@ class VprModelConfig(BaseModel):
     are inferred by a first pass."""
     image_size: tuple[SidePixels, SidePixels] = (320, 320)
     """Height and width in pixels."""
+    interpolation: Annotated[
+        Literal["bilinear", "bicubic"], Field(exclude_if=lambda value: value == "bilinear")
+    ] = "bilinear"
+    """Resizing of photos to that size. Left out of the stored configuration if bilinear, as for
+    `backbone_norm`."""
 
     @classmethod
     def parse(cls, values: Mapping[str, Any]) -> VprModelConfig:
@@ -96,6 +107,8 @@ class VprModelConfig(BaseModel):
     @field_validator("backbone_arch")
     @classmethod
     def _canonical_backbone(cls, name: str) -> str:
+        if is_own_module(name):
+            return _registered(name, STAGES, "backbone_arch")
         canonical = name.strip().lower().replace("-", "_")
         canonical = ALIASES.get(canonical, canonical)
         if canonical not in STAGES:
@@ -108,6 +121,8 @@ class VprModelConfig(BaseModel):
     @field_validator("agg_arch")
     @classmethod
     def _canonical_aggregator(cls, name: str) -> str:
+        if is_own_module(name):
+            return _registered(name, AGGREGATORS, "agg_arch")
         for canonical in sorted(AGGREGATORS, key=len, reverse=True):
             if canonical.lower() in name.lower():
                 return canonical
@@ -135,6 +150,17 @@ class VprModelConfig(BaseModel):
                 f"stages; stages from {MIN_STAGE_TO_CROP} to {count} can be cropped."
             )
         return self
+
+
+def _registered(name: str, known: Container[str], field: str) -> str:
+    if name not in known:
+        raise Unprocessable(
+            "own_module_unknown",
+            f"The network uses {name} ({field}), code of the user who trained it. Only `placewise "
+            "train` imports such code, when its arguments name it. Elsewhere the network works as "
+            "a torch.hub entry (docs/how-to/weights-and-other-engines.md).",
+        )
+    return name
 
 
 def _bad_config_error(detail: str) -> Unprocessable:

@@ -109,7 +109,10 @@ def _validate_arguments(
     """Validate arguments against the signature of `aggregator_class` and add its defaults."""
     hints = get_type_hints(aggregator_class.__init__, include_extras=True)
     fields: dict[str, Any] = {
-        name: (hints[name], ... if parameter.default is parameter.empty else parameter.default)
+        name: (
+            hints.get(name, Any),
+            ... if parameter.default is parameter.empty else parameter.default,
+        )
         for name, parameter in inspect.signature(aggregator_class).parameters.items()
     }
     arguments = create_model(

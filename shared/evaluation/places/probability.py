@@ -2,7 +2,8 @@
 
 Each is a logistic regression on the features of the ranking (`level_features`). `fit` fits
 them to a map; without a fit, the coefficients are those of generated maps
-(`tools/make_place_prior.py`). `thresholds` decides which level is the answer.
+(`tools/make_place_prior.py`), which order the levels of any map, but are far too certain in a map
+of few photos. `thresholds` decides which level is the answer.
 """
 
 from __future__ import annotations
@@ -102,6 +103,11 @@ class PlaceModel(BaseModel):
     own_photos: int = 0
     labelled_queries: int = 0
 
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the probabilities were fitted to the map; those of the prior answer nothing."""
+        return self.source != "prior"
+
     @model_validator(mode="before")
     @classmethod
     def _drop_other_version(cls, stored: Any) -> Any:
@@ -136,6 +142,8 @@ class PlaceModel(BaseModel):
         self, probabilities: Sequence[float], not_in_map: float, certainty: float
     ) -> int | None:
         """Return the index of the finest level that is certain enough; None if none is."""
+        if not self.is_fitted:
+            return None
         stored = zip(CERTAINTIES, self.thresholds, strict=False)
         thresholds = next((t for known, t in stored if known >= certainty - 1e-9), Thresholds())
         return thresholds.answer(probabilities, not_in_map, certainty)
@@ -196,8 +204,8 @@ class PlaceModel(BaseModel):
 def _log_dropped_version(version: object) -> None:
     """Log once per process that models of another version are not used."""
     log.warning(
-        "stored place models of version %s are not used (this release: %d); the shipped prior "
-        "applies to their maps until the next evaluation",
+        "stored place models of version %s are not used (this release: %d); estimates in their "
+        "maps have no levels until the next evaluation",
         version,
         MODEL_VERSION,
     )

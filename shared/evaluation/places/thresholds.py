@@ -8,7 +8,9 @@ the answers above a threshold are surer ones, so that it is below c.
 An answer at any level but the coarsest also needs odds against "not in the map" that at most the
 share 1 - c of the impostors of each kind reaches, of those for which the level is wrong (Mondrian
 conformal prediction, Vovk et al. 2005). This holds with LIMIT_CONFIDENCE over the choice of the
-impostors, not on average (Vovk 2012). Too few samples for a threshold leave c itself.
+impostors, not on average (Vovk 2012), so that it takes n impostors with c^n <= 1 - LIMIT_CONFIDENCE
+(59 for c = 0.95): with fewer, as in a map of one place, the level is never the answer. Too few
+samples for a threshold leave c itself.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
 LIMIT_CONFIDENCE = 0.95  # that no more impostors exceed a limit than are allowed
 MIN_PROBABILITY = 1e-9  # of "not in the map"; bounds the odds
+UNREACHABLE_ODDS = 2 / MIN_PROBABILITY
 
 
 class Thresholds(BaseModel):
@@ -80,7 +83,7 @@ def choose_thresholds(
     """
     probability = _lowest_probability(judged, certainty)
     least = certainty if probability is None else probability
-    depth = max((len(s.probabilities) for s in impostors), default=0)
+    depth = max((len(s.probabilities) for s in [*judged, *impostors]), default=0)
     odds = tuple(
         _least_odds(impostors, position, least, 1 - certainty)
         for position in range(max(min(depth, 1), depth - 1))
@@ -96,14 +99,20 @@ def odds_in_map(probability: float, not_in_map: float) -> float:
 def _least_odds(
     impostors: Sequence[HeldOutEstimate], position: int, least: float, share: float
 ) -> float:
-    """Return the odds that at most a share of the impostors of each kind reaches at a level."""
+    """Return the odds that at most a share of the impostors of each kind reaches at a level.
+
+    UNREACHABLE_ODDS with too few impostors for which the level is wrong.
+    """
     kinds: dict[str | None, list[float]] = defaultdict(list)
     for impostor in impostors:
         if position < len(impostor.is_right) and impostor.is_right[position] is False:
             probability = impostor.probabilities[position]
             odds = odds_in_map(probability, impostor.not_in_map)
             kinds[impostor.left_out].append(odds if probability >= least else 0.0)
-    return max((_exceeded_by(odds, share) for odds in kinds.values()), default=0.0)
+    most = max(map(len, kinds.values()), default=0)
+    if (1 - share) ** most > 1 - LIMIT_CONFIDENCE:
+        return UNREACHABLE_ODDS
+    return max(_exceeded_by(odds, share) for odds in kinds.values())
 
 
 def _lowest_probability(estimates: Sequence[HeldOutEstimate], certainty: float) -> float | None:

@@ -172,7 +172,7 @@ def _places_section(places: dict[str, Any]) -> str:
     }
     source = f"The probabilities were fitted on {places['own_photos']} database photos"
     if places["source"] == "prior":
-        source = "The data set has too few photos of known places: the probabilities are the prior"
+        source = "The data set has too few photos of known places: nothing is answered"
     return (
         f"<h3>Levels of places</h3><table><tr>{heads}</tr>{rows}</table>"
         f'<p class="note">{source}. {places["samples"]} queries have an estimate and a known '

@@ -103,6 +103,22 @@ def test_a_tags_case_matters_and_parts_do_not_match(catalog: Catalog, map_id: UU
     assert found(catalog, map_id, tags=("night",)) == set()
 
 
+def test_a_part_of_a_tag_matches_with_tags_like(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        for tag in TAGS:
+            add_photo(session, map_id, filename=tag, tags=[f"Before{tag}After", "other"])
+        add_photo(session, map_id, filename="none", tags=["Üben", "50x"])
+    for tag in TAGS:
+        expected = {tag, "[1]"} if tag == "1" else {tag}
+        assert found(catalog, map_id, tags_like=(tag,)) == expected
+    assert found(catalog, map_id, tags_like=("bEFORE",)) == set(TAGS)
+    # Each part may be in another tag; wildcards are ordinary; other letters have their case.
+    assert found(catalog, map_id, tags_like=("NIGHT", "oth")) == {"night"}
+    assert found(catalog, map_id, tags_like=("5_",)) == set()
+    assert found(catalog, map_id, tags_like=("Üb",)) == {"none"}
+    assert found(catalog, map_id, tags_like=("üb",)) == set()
+
+
 def test_all_tags_are_required(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         add_photo(session, map_id, filename="both", tags=["wet", "night"])

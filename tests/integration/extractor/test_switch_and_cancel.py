@@ -30,6 +30,9 @@ from tests.integration.extractor.model_changes import (
 from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_model_changes.py and test_serve_models.py switch maps on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 
 @pytest.mark.parametrize("in_the_slice", [False, True])
 def test_a_fit_can_be_cancelled_in_each_stage(

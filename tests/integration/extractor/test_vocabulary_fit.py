@@ -12,6 +12,10 @@ import pytest
 from services.extractor import checkpointed_steps
 from services.extractor.model_changes import VocabularyFitJob
 from services.extractor.worker import ExtractorWorker
+from services.steward.tasks import model_changes
+from services.steward.tasks.garbage_collection import collect_garbage
+from services.steward.tasks.model_changes import advance_model_changes, delete_done_reindex_jobs
+from shared.catalog.chunks import list_live_chunks
 from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
@@ -19,6 +23,7 @@ from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
+from shared.integrity.verify import discard_chunk
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import cancel_job, requeue_job, retry_job
 from tests.integration.extractor.model_changes import (
@@ -33,6 +38,9 @@ from tests.integration.extractor.model_changes import (
 )
 from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.photos import photo_bytes
+
+# tests/e2e/test_model_changes.py fits vocabularies on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
 
 
 def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:
@@ -81,6 +89,7 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         assert same(rows[photo_id], expected)
         assert not same(before[photo_id], expected)
         assert fitted.job_of(photo_id).state == JobState.SUCCEEDED
+    delete_done_reindex_jobs(fitted.catalog)
     assert fitted.reindex_jobs(new.id) == []
 
 
@@ -294,6 +303,7 @@ def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing
     assert (job.progress_failed, job.progress_done) == (1, job.progress_total - 1)
     assert fitted.active().id == new
     assert set(fitted.rows()) == set(good)
+    delete_done_reindex_jobs(fitted.catalog)
     (failed,) = fitted.reindex_jobs(new)
     assert (failed.state, failed.photo_id) == (JobState.FAILED, bad)
     assert failed.error is not None
@@ -332,3 +342,43 @@ def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) ->
         cancel_job(session.get_one(Job, first.id))
     assert fitted.finish(job_id).state == JobState.SUCCEEDED
     assert set(fitted.rows(new)) == set(photo_ids(fitted))
+
+
+def test_photos_of_a_chunk_that_was_discarded_after_it_was_queued_are_described_again(
+    fitted: Workplace,
+) -> None:
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    fitted.drain()
+    with fitted.catalog.write() as session:
+        discard_chunk(session, list_live_chunks(session, new)[0].id)
+    assert len(fitted.rows(new)) < PHOTOS
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert set(fitted.rows(new)) == set(photo_ids(fitted))
+
+
+def test_a_steward_that_forgot_what_it_queued_queues_nothing_twice(fitted: Workplace) -> None:
+    _, new = fitted.build(seed=1)
+    fitted.advance()
+    advance_model_changes(fitted.catalog, fitted.wakeups)
+    assert len(fitted.reindex_jobs(new)) == PHOTOS
+
+
+def test_what_a_switch_leaves_is_completed_in_small_transactions(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model_changes, "REINDEX_JOBS_PER_TRANSACTION", 2)
+    monkeypatch.setattr(model_changes, "DELETED_JOBS_PER_TRANSACTION", 2)
+    job_id, new = fitted.build(seed=1)
+    bad = photo_ids(fitted)[:3]
+    for photo_id in bad:
+        with fitted.catalog.read() as session:
+            key = session.get_one(Photo, photo_id).object_key
+        fitted.store.put(key, b"the disk has rotted")
+    with monkeypatch.context() as killed:
+        killed.setattr(model_changes, "adopt_failed_reindex_jobs", lambda catalog: None)
+        assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert [fitted.job_of(photo_id).state for photo_id in bad] == [JobState.SUCCEEDED] * 3
+    collect_garbage(fitted.catalog, fitted.store, fitted.settings)
+    assert [fitted.job_of(photo_id).state for photo_id in bad] == [JobState.FAILED] * 3
+    assert {job.photo_id for job in fitted.reindex_jobs(new)} == set(bad)

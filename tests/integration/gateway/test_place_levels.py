@@ -6,6 +6,10 @@ from typing import Any
 
 import pytest
 
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import get_map
+from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.probability import PlaceModel
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
@@ -19,6 +23,22 @@ def ask(service: Service, number: int, map_name: str = "default", **params: Any)
     return service.json("GET", f"/jobs/{job_id}/result", params={"map": map_name})
 
 
+def fit(service: Service, map_name: str = "default") -> None:
+    """Store a place model as an evaluation of 20 photos would, with the prior's coefficients."""
+    calibration = Calibration(
+        radius_m=25.0,
+        support_threshold=None,
+        impostors=0,
+        labelled_queries=0,
+        confidence=None,
+        places=PlaceModel(source="own_photos", own_photos=20),
+    )
+    with service.catalog.write() as session:
+        generation = active_generation(session, get_map(session, map_name).id)
+        assert generation is not None
+        generation.calibration = calibration.model_dump(mode="json")
+
+
 @pytest.fixture
 def tower(service: Service) -> Service:
     body = {"name": "tower", "place_labels_are_paths": True}
@@ -26,7 +46,22 @@ def tower(service: Service) -> Service:
     for number, place in enumerate(PATHS):
         service.upload(photo_bytes(number), "tower", place=place)
     service.drain()
+    fit(service, "tower")
     return service
+
+
+def test_a_map_without_an_evaluation_states_no_certainty(service: Service) -> None:
+    """Of one photo, the prior would be certain whatever the query shows."""
+    for number in range(2):
+        service.upload(photo_bytes(number), place=f"room {number}")
+        service.drain()
+        answer = ask(service, 0, certainty=0.01)
+        estimate = answer["estimate"]
+        assert (estimate["levels"], estimate["answer_level"]) == ([], None)
+        assert (estimate["calibration_source"], estimate["certainty"]) == (None, None)
+        assert estimate["reason"].startswith("How certain this place is, and whether it is in")
+        assert estimate["place"] == "room 0"
+        assert answer["similar_images"][0]["match_probability"] is None
 
 
 def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
@@ -38,7 +73,7 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     assert levels == ["tower/7/lift", "tower/7", "tower"]
     probabilities = [level["probability"] for level in estimate["levels"]]
     assert probabilities == sorted(probabilities)
-    assert estimate["calibration_source"] == "prior"
+    assert estimate["calibration_source"] == "own_photos"
     assert (estimate["certainty"], estimate["answer_level"]) == (0.01, 0)
     assert 0 <= estimate["not_in_map_probability"] <= 1
     assert (estimate["radius_68_m"], estimate["radius_95_m"]) == (None, None)
@@ -70,6 +105,7 @@ def test_labels_are_no_paths_unless_the_map_says_so(service: Service) -> None:
     for number, place in enumerate(PATHS):
         service.upload(photo_bytes(number), place=place)
     service.drain()
+    fit(service)
     assert [e["place"] for e in ask(service, 0)["estimate"]["levels"]] == ["tower/7/lift"]
     for method, path in (("GET", "/search"), ("POST", "/similarity")):
         files = {"file": ("query.jpg", photo_bytes(0))} if method == "POST" else None
@@ -84,6 +120,7 @@ def test_circles_are_the_levels_of_coordinates(service: Service) -> None:
     service.upload(photo_bytes(0), latitude=45.0, longitude=7.0, place="here")
     service.upload(photo_bytes(1), latitude=46.0, longitude=7.0)
     service.drain()
+    fit(service)
     estimate = ask(service, 0)["estimate"]
     assert [level["radius_m"] for level in estimate["levels"]] == [25, 100, 500, 2000]
     assert {(level["latitude"], level["longitude"]) for level in estimate["levels"]} == {
@@ -96,6 +133,7 @@ def test_labels_of_one_level_are_the_only_level_of_a_map_of_paths(service: Servi
     for number in range(3):
         service.upload(photo_bytes(number), "flat", place=f"room {number}")
     service.drain()
+    fit(service, "flat")
     assert [e["place"] for e in ask(service, 1, "flat")["estimate"]["levels"]] == ["room 1"]
 
 
@@ -109,6 +147,7 @@ def test_a_label_that_disagrees_with_the_coordinates_decides_in_maps_of_paths_on
         place = ("tower/7", "tower/7", "tower/8")[number]
         service.upload(photo_bytes(number), "torn", latitude=latitude, longitude=7.0, place=place)
     service.drain()
+    fit(service, "torn")
     estimate = ask(service, 1, "torn")["estimate"]
     levels = estimate["levels"]
     if labels_are_paths:
@@ -120,6 +159,7 @@ def test_a_label_that_disagrees_with_the_coordinates_decides_in_maps_of_paths_on
 
 def test_a_photo_without_a_location_has_no_levels(service: Service) -> None:
     service.indexed(0)
+    fit(service)
     answer = ask(service, 0)
     assert answer["estimate"]["levels"] == []
     assert answer["estimate"]["calibration_source"] is None

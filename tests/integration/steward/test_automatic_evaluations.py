@@ -28,6 +28,9 @@ from tests.support.catalog_rows import (
     set_columns,
 )
 
+# tests/e2e/test_estimates.py has a map on SQLite evaluated by itself.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 LEAST = 20
 
 

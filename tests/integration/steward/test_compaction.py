@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -19,7 +20,7 @@ from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
-from shared.storage.chunks import read_chunk, write_chunk
+from shared.storage.chunks import WrittenChunk, read_chunk, write_chunk
 from shared.storage.read_retries import ReadRetries
 from tests.integration.steward.chunk_map import HOUR_SECONDS, MANY, ChunkMap
 from tests.integration.workplace import same
@@ -62,6 +63,34 @@ def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(chunk_map: Chunk
     assert sealed == [True, True, False, False]
     assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 1
     assert chunk_map.live() == [(0, 10), (1, 10), (2, 10)]
+    chunk_map.check_rows(photo_ids)
+
+
+def test_a_row_of_a_full_slot_was_merged_at_most_twice(
+    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: Counter[UUID] = Counter()
+
+    def count(*arguments: Any, **options: Any) -> WrittenChunk:
+        written.update(options["photo_ids"])
+        return write_chunk(*arguments, **options)
+
+    monkeypatch.setattr(compact_module, "write_chunk", count)
+    photo_ids = []
+    for _ in range(24):
+        photo_ids += sum_of(chunk_map.chunks(2, slot_rows=16))
+        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2)
+        assert len(chunk_map.live()) <= 3 + 4
+    assert set(written.values()) <= {1, 2}
+    chunk_map.check_rows(photo_ids)
+
+
+def test_an_open_slot_of_small_batches_has_a_bounded_number_of_chunks(chunk_map: ChunkMap) -> None:
+    photo_ids = []
+    for _ in range(40):
+        photo_ids += sum_of(chunk_map.chunks(1))
+        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2)
+        assert len(chunk_map.live()) < 4 * 2 + 2
     chunk_map.check_rows(photo_ids)
 
 
@@ -178,8 +207,8 @@ def test_a_chunk_that_arrives_while_merging_is_not_lost(
     first, second = chunk_map.chunks(2, 3)
     late: list[UUID] = []
     while_merging(lambda: late.extend(sum_of(chunk_map.chunks(2))))
-    assert not merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
-    assert chunk_map.live() == [(0, 2), (0, 3), (0, 2)]
+    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.live() == [(0, 5), (0, 2)]
     chunk_map.check_rows([*first, *second, *late])
 
 

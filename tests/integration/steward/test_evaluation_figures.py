@@ -22,6 +22,9 @@ from tests.support.catalog_rows import (
     read_job,
 )
 
+# tests/e2e/test_estimates.py evaluates a map on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
     town.publish(STREETS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from uuid import uuid4
 
 import pytest
 from prometheus_client import CollectorRegistry
@@ -222,11 +223,13 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -
 
 
 def test_files_that_people_put_beside_the_originals_are_not_removed(chunk_map: ChunkMap) -> None:
-    theirs = {"originals/.DS_Store", "originals/holiday.jpg", f"originals/{new_id()}.jpg"}
-    for key in theirs:
+    # The AnyLoc similarity service names its photos by a random UUID and their ending.
+    theirs = {"originals/.DS_Store", "originals/holiday.jpg", f"originals/{uuid4()}.jpg"}
+    orphan = new_original_key(".jpg")
+    for key in (*theirs, orphan):
         chunk_map.store.put(key, b"not ours")
-    chunk_map.age(theirs, 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    chunk_map.age({*theirs, orphan}, 2 * DAY_SECONDS)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
     assert chunk_map.objects() == theirs
 
 

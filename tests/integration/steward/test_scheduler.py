@@ -92,6 +92,23 @@ def test_a_duty_that_raises_does_not_stop_the_others(
     assert done == ["fail", "work", "fail", "work"]  # and it is tried again
 
 
+def test_a_long_task_with_a_thread_of_its_own_delays_no_other(
+    chunk_map: ChunkMap, settings: Settings
+) -> None:
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings)
+    stop, short_ran = threading.Event(), threading.Event()
+
+    def run_long() -> None:
+        assert short_ran.wait(timeout=60), "the short task waited for the long one"
+        stop.set()
+
+    steward.tasks = [
+        PeriodicTask("long", 0.0, run_long, own_thread=True),
+        PeriodicTask("short", 0.0, short_ran.set),
+    ]
+    steward.run(stop)
+
+
 def test_each_duty_is_done_by_the_loop(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,7 +144,12 @@ def test_each_duty_is_done_by_the_loop(
     chunk_map.store.put(incoming_key(forgotten.id), b"never completed")
     steward = Scheduler(chunk_map.catalog, chunk_map.store, wakeups, soon)
     stop = threading.Event()
-    steward.tasks.append(PeriodicTask("stop", 0.0, stop.set))
+
+    def stop_when_merged_and_collected() -> None:  # by the tasks that have a thread of their own
+        if chunk_map.live() == [(0, 2)] and not chunk_map.objects("originals/"):
+            stop.set()
+
+    steward.tasks.append(PeriodicTask("stop", 0.0, stop_when_merged_and_collected))
     steward.run(stop)
     assert chunk_map.live() == [(0, 2)]
     assert chunk_map.objects("originals/") == set()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,13 @@ from typer.testing import CliRunner
 from services.cli.main import build_app
 from services.trainer import run
 from services.trainer.arguments import build_arguments, load_yaml
+from services.trainer.grid import GridPlan, run_grid
 from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
+from services.trainer.run_folder import lock_folder
+from shared.descriptors.backbones.trained import TrainedBackbone
+from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.descriptors.vpr_models.config import STAGES
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from tests.support.training_runs import (
     CITY,
@@ -42,6 +49,24 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+OWN_CODE = """
+import torch
+from shared.descriptors.vpr_models.aggregators.base import Aggregator, normalise_rows
+
+def network(pretrained):
+    return torch.nn.Conv2d(3, 8, kernel_size=8, stride=8)
+
+class Strongest(Aggregator):
+    inferred = {"in_channels": "channels"}
+
+    def __init__(self, in_channels: int):
+        super().__init__(in_channels)
+
+    def forward(self, maps):
+        return normalise_rows(maps.amax((-2, -1)))
+"""
 
 
 class StopAfter(NullDisplay):
@@ -70,6 +95,8 @@ def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Pat
     folder, report = whole
     assert json.loads((folder / "metrics.json").read_text()) == report
     assert [epoch["step"] for epoch in report["epochs"]] == [3, 6]
+    recalls = {name.rpartition("/")[2] for name in report["epochs"][0]["figures"]}
+    assert recalls == {"R1", "R5", "R10", "R15", "R20"}
     assert report["training_set"]["places"] == 6
     assert report["training_set"]["cities"] == [CITY]
     (name,) = report["sets"]
@@ -220,6 +247,156 @@ def test_a_resumed_run_can_not_become_another(
         run.resume(copy, {"data_root": str(more)}, NullDisplay(), StopRequest())
     with pytest.raises(NotFound, match="there is no"):
         run.resume(tmp_path, {}, NullDisplay(), StopRequest())
+
+
+def refusal_of_resume(path: Path, **changes: Any) -> tuple[str, str]:
+    """Code and detail of the error with which `--resume` is refused."""
+    config = path / "config.yaml"
+    before = config.read_bytes() if config.is_file() else None
+    with pytest.raises(PlacewiseError) as caught:
+        run.resume(path, changes, NullDisplay(), StopRequest())
+    assert before is None or config.read_bytes() == before, "a refused resume changes nothing"
+    return caught.value.code, caught.value.detail
+
+
+@pytest.fixture
+def copy(whole: tuple[Path, Json], tmp_path: Path) -> Path:
+    """The finished run, to be damaged."""
+    return Path(shutil.copytree(whole[0], tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"seed": 2}, "seed (1 -> 2)"),
+        ({"compatible": True}, "optimizer (adam -> adamw)"),
+        ({"max_epochs": 1}, "was trained for 6 steps, but the run ends after 3"),
+        ({"max_steps": 5}, "ends after 5"),
+        ({"interpolation": "bicubic"}, "interpolation (bilinear -> bicubic)"),
+    ],
+)
+def test_a_run_is_not_resumed_with_what_contradicts_its_training(
+    copy: Path, changes: Json, reason: str
+) -> None:
+    code, detail = refusal_of_resume(copy, **changes)
+    assert code == "run_differs"
+    assert reason in detail
+
+
+def test_a_run_is_not_resumed_for_a_test_and_a_trial_step_leaves_it_as_it_was(copy: Path) -> None:
+    code, detail = refusal_of_resume(copy, experiment_phase="test")
+    assert code == "bad_argument"
+    assert "--model_path" in detail
+    before = {file: file.read_bytes() for file in copy.rglob("*") if file.is_file()}
+    answer = run.resume(copy, {"fast_dev_run": True, "max_epochs": 3}, NullDisplay(), StopRequest())
+    assert answer == {"fast_dev_run": True}
+    assert {file: file.read_bytes() for file in copy.rglob("*") if file.is_file()} == before
+
+
+def test_damaged_and_foreign_files_of_a_run_are_clear_errors(copy: Path, places: Path) -> None:
+    config, last = copy / "config.yaml", copy / "checkpoints" / "last.ckpt"
+    written = config.read_text()
+    config.write_text(written.replace("lr: 0.001", "lr: 0.5"))
+    assert refusal_of_resume(copy)[0] == "run_differs"
+    assert "lr (0.001 -> 0.5)" in refusal_of_resume(copy)[1]
+    config.write_text(written)
+
+    data = last.read_bytes()
+    last.write_bytes(data[: len(data) // 2])
+    assert refusal_of_resume(copy)[0] == "checkpoint_unreadable"
+    best = next(file for file in last.parent.iterdir() if file != last)
+    last.write_bytes(best.read_bytes())
+    code, detail = refusal_of_resume(copy)
+    assert code == "checkpoint_unreadable"
+    assert "full training state" in detail
+
+    stored = torch.load(io.BytesIO(data), weights_only=True)
+    name = next(iter(stored["state_dict"]))
+    stored["state_dict"][name] = torch.zeros(1)
+    torch.save(stored, last)
+    code, detail = refusal_of_resume(copy)
+    assert code == "run_differs"
+    assert "another network" in detail
+    last.unlink()
+    assert refusal_of_resume(copy)[0] == "run_not_found"
+    last.write_bytes(data)
+
+    (copy / "history.json").write_text('{"training_set": {}, "epochs": [], "best": []}')
+    assert refusal_of_resume(copy)[0] == "run_unreadable"
+    (copy / "history.json").unlink()
+    assert refusal_of_resume(copy)[0] == "run_unreadable"
+    config.write_text("lr: [")
+    assert refusal_of_resume(copy)[0] == "bad_config"
+
+
+def test_a_run_or_grid_that_another_process_trains_is_left_alone(copy: Path) -> None:
+    with lock_folder(copy):
+        code, detail = refusal_of_resume(copy, max_epochs=3)
+    assert code == "run_in_use"
+    assert str(copy) in detail
+    plan, nothing = GridPlan((), {}), lambda outcomes: None
+    with lock_folder(copy), pytest.raises(Conflict, match="Another process"):
+        run_grid(plan, copy, NullDisplay(), StopRequest(), nothing)
+
+
+def test_a_compiled_network_learns_the_same_and_leaves_an_ordinary_checkpoint(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[torch.nn.Module] = []
+    real = torch.compile
+
+    def compile_without_code(module: torch.nn.Module, **options: Any) -> Any:
+        compiled.append(module)
+        return real(module, **{**options, "backend": "eager"})  # the compiler takes a minute
+
+    monkeypatch.setattr(torch, "compile", compile_without_code)
+    report = train(run_arguments(places, tmp_path, compile=True))
+    assert compiled
+    assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(report["last"]))
+    assert load_checkpoint(Path(report["best"]["path"])).fingerprint
+
+
+def test_the_trained_model_keeps_the_size_and_the_interpolation_of_its_validation(
+    places: Path, tmp_path: Path
+) -> None:
+    said = run_arguments(
+        places, tmp_path, val_image_size=[48, 64], interpolation="bicubic",
+        randaugment_magnitude=5, max_steps=1, experiment_phase="all"
+    )  # fmt: skip
+    best = Path(train(said)["best"]["path"])
+    config = load_checkpoint(best).config
+    assert (config.image_size, config.interpolation) == ((48, 64), "bicubic")
+    served = TrainedBackbone.from_checkpoint("gsv:walks", best, torch.device("cpu"))
+    assert served.preprocessing.name == "resize48x64-bicubic"
+
+
+def test_own_code_is_trained_stopped_resumed_and_tested_by_its_name(
+    places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_walks.py").write_text(OWN_CODE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    backbone, aggregator = "own_walks:network", "own_walks:Strongest"
+    own: Json = {
+        "backbone_arch": backbone,
+        "layers_to_crop": [],
+        "agg_arch": aggregator,
+        "loss_name": "pytorch_metric_learning.losses:ContrastiveLoss",
+        "miner_name": "pytorch_metric_learning.miners:BatchHardMiner",
+        "experiment_phase": "all",
+    }
+    said = run_arguments(places, tmp_path, **own)
+    stop = StopRequest()
+    with pytest.raises(RunStopped):
+        run.run(build_arguments(said), StopAfter(stop, "epoch 1", 2), stop)
+    monkeypatch.delitem(AGGREGATORS, aggregator)  # as in another process
+    report = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
+    assert not [line for line in report["next"] if "models add" in line]
+    tested = train(
+        {**said, "experiment_phase": "test", "run_name": "t", "model_path": report["last"]}
+    )
+    assert tested["test"].keys() == report["test"].keys()
+    del AGGREGATORS[aggregator], STAGES[backbone]
 
 
 def test_frozen_layers_keep_their_weights_and_the_others_learn(

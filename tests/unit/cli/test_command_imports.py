@@ -16,6 +16,7 @@ CLIENT_COMMANDS = (
     "import-anyloc",
     "index",
     "keys",
+    "locate",
     "maps",
     "models",
     "pca",

@@ -24,7 +24,7 @@ def fits(**stats: Any) -> bool:
         return any(path.endswith("/vocabularies") for _, path, _ in server.requests)
 
 
-@pytest.mark.parametrize("vocabulary", ["foreign", "provisional", None])
+@pytest.mark.parametrize("vocabulary", ["foreign", "provisional", "pending", None])
 def test_enough_photos_replace_a_vocabulary_that_is_not_their_own(vocabulary: str | None) -> None:
     assert fits(vocabulary=vocabulary, total_images=MIN_PHOTOS_TO_FIT)
     assert not fits(vocabulary=vocabulary, total_images=MIN_PHOTOS_TO_FIT - 1)

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 import placewise
 from placewise import answers
 from services.gateway import schemas
-from services.gateway.routes import batches, evaluations, keys, maps, models, tracks
+from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
 from services.gateway.routes import stats as figures
 from services.gateway.routes import stats as history
 from services.gateway.tracks.schemas import TrackStateResponse
@@ -40,6 +40,8 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.OneTrack, tracks.TrackDetailResponse),
     (answers.TrackFrame, tracks.TrackFrameResponse),
     (answers.DeletedTrack, tracks.DeletedTrackResponse),
+    (answers.PhotoHeader, positions.PhotoHeaderResponse),
+    (answers.Proposal, positions.ProposalResponse),
     (answers.Progress, schemas.JobProgress),
     (answers.Job, schemas.JobResponse),
     (answers.Started, schemas.JobAcceptedResponse),

@@ -91,7 +91,7 @@ def receive(
         "headers": [(k.encode(), v.encode()) for k, v in sent.items()],
     }
     request = Request(scope, body.receive)
-    return asyncio.run(store_form_file(request, store, KEY, max_bytes, check_begin))
+    return asyncio.run(store_form_file(request, store, lambda _: KEY, max_bytes, check_begin))
 
 
 def refused(store: FolderStore, body: Body | bytes, **options: object) -> PlacewiseError:

@@ -46,13 +46,18 @@ def picture(
     return PictureEvidence(photos, circles, not_in_map, 1000)
 
 
-def proposed(*sources: PictureEvidence | list[KnownPosition] | None) -> Proposal:
-    """The proposal for a photo at noon from a picture, neighbours and a track."""
-    found = [
-        interpolate_position(source, NOON, WALK_MPS) if isinstance(source, list) else source
-        for source in (*sources, *[None] * (3 - len(sources)))
-    ]
-    proposal = propose_position(*found, RADIUS_M)  # type: ignore[arg-type]
+def proposed(
+    of_picture: PictureEvidence | None,
+    neighbours: list[KnownPosition] | None = None,
+    track: list[KnownPosition] | None = None,
+) -> Proposal:
+    """The proposal for a photo at noon."""
+    proposal = propose_position(
+        of_picture,
+        interpolate_position(neighbours or [], NOON, WALK_MPS),
+        interpolate_position(track or [], NOON, WALK_MPS),
+        RADIUS_M,
+    )
     assert proposal is not None
     return proposal
 

@@ -19,6 +19,7 @@ UNDECIDED_M = 0.001  # so near to a circle's edge, NumPy's and a database's sine
 
 PLACES = ["hall", "Hall", "it's", "日本"]
 TAGS = ["night", "Night", "wet", "50%", '"', "1"]
+PARTS_OF_TAGS = ["NIGH", "t", "%", '"', "0", "日"]
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 MOMENTS = [
     MOMENT + delta
@@ -105,6 +106,8 @@ def photo_filters(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> PhotoFi
             "captured_before": sometimes(some.sampled_from(MOMENTS)),
             "place": sometimes(some.sampled_from(PLACES)),
             "tags": sometimes(some.lists(some.sampled_from(TAGS), max_size=2).map(tuple)) or (),
+            "tags_like": sometimes(some.sampled_from(PARTS_OF_TAGS).map(lambda part: (part,)))
+            or (),
             "ids": sometimes(some.lists(some.sampled_from(ids)).map(tuple)),
         }
     )
@@ -120,6 +123,10 @@ def passes(photo: PhotoFilterValues, photo_filter: PhotoFilter) -> bool | None:
         or (photo.captured_at is not None and photo.captured_at <= photo_filter.captured_before),
         photo_filter.place is None or photo.place == photo_filter.place,
         all(tag in photo.tags for tag in photo_filter.tags),
+        all(
+            any(part.lower() in tag.lower() for tag in photo.tags)
+            for part in photo_filter.tags_like
+        ),
         photo_filter.ids is None or photo.photo_id in photo_filter.ids,
     ]
     if not all(certain):

@@ -19,6 +19,7 @@ from services.trainer.arguments import (
     build_arguments,
     load_yaml,
     save_yaml,
+    to_plain_dict,
 )
 from services.trainer.resolve import list_changed_meanings
 from shared.errors import InvalidRequest, NotFound
@@ -122,6 +123,26 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     assert "no_gpu" in shown
     assert "--accelerator cpu" in shown
     assert "data_root_missing" in shown, "every obstacle is listed at once"
+
+
+def test_compatible_arguments_have_the_effect_that_they_had_in_the_predecessor() -> None:
+    published = shlex.split(PUBLISHED_COMMAND)
+    arguments = read([*published, "--compatible", "--layers_to_freeze", "2"])
+    assert arguments.optimizer == "adamw"
+    assert arguments.layers_to_freeze == -1
+    assert arguments.test_image_size == "native"
+    (line,) = list_changed_meanings(arguments)
+    assert "--optimizer adamw" in line
+    assert build_arguments(to_plain_dict(arguments)) == arguments, "also when a run is resumed"
+    chosen = read([*published, "--compatible", "--optimizer", "sgd", "--test_image_size", "same"])
+    assert (chosen.optimizer, chosen.test_image_size) == ("sgd", "same")
+
+
+def test_validation_photos_have_the_size_of_training_unless_it_is_given() -> None:
+    assert read([]).evaluation_size == (320, 320)
+    assert read(["--val_image_size", "224", "448"]).evaluation_size == (224, 448)
+    with pytest.raises(InvalidRequest, match="32 pixels or more"):
+        read(["--val_image_size", "16"])
 
 
 @pytest.mark.parametrize(
@@ -260,7 +281,8 @@ def test_values_that_had_another_effect_in_the_predecessor_are_named() -> None:
     differing = build_arguments(
         {"optimizer": "adam", "weight_decay": 0.1, "experiment_phase": "all", "image_size": 224}
     )
-    adam, size = list_changed_meanings(differing)
+    adam, size, frozen = list_changed_meanings(differing)
     assert "--optimizer adamw" in adam
     assert "224 x 224" in size
     assert "--test_image_size native" in size
+    assert "--layers_to_freeze -1 or --compatible" in frozen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import signal
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,10 +16,11 @@ from PIL import Image
 
 from services.trainer.data import (
     Batch,
+    PhotoTransform,
     PlaceBatchSampler,
     PlaceDataset,
     PlaceSample,
-    apply_randaugment,
+    _init_worker,
     load_batches,
     to_tensor,
 )
@@ -124,7 +126,7 @@ def batches_of(
     bad_is_error: bool = False,
 ) -> Iterator[Batch]:
     plan = PlaceBatchSampler(places, 2, 2, False, True, 1, 7)
-    photos = PlaceDataset(plan, (32, 48), fail_on_undecodable=bad_is_error)
+    photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=bad_is_error)
     return load_batches(plan, photos, epoch, start, num_workers=num_workers, pin_memory=False)
 
 
@@ -142,6 +144,18 @@ def test_workers_read_what_one_process_reads(photos_on_disk: list[TrainingPlace]
     shared = list(batches_of(photos_on_disk, num_workers=1))
     for one, other in zip(alone, shared, strict=True):
         assert torch.equal(one.photos, other.photos)
+
+
+def test_workers_leave_ctrl_c_and_sigterm_to_the_run_that_saves_itself() -> None:
+    endings = {ending: signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)}
+    threads = torch.get_num_threads()
+    try:
+        _init_worker(0)
+        assert {signal.getsignal(ending) for ending in endings} == {signal.SIG_IGN}
+    finally:
+        torch.set_num_threads(threads)
+        for ending, handler in endings.items():
+            signal.signal(ending, handler)
 
 
 def test_batches_go_on_behind_those_that_were_given(photos_on_disk: list[TrainingPlace]) -> None:
@@ -182,9 +196,21 @@ def test_a_photo_that_does_not_decode_is_an_error_in_strict_mode(
 def test_augmentation_is_decided_by_its_seed() -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (32, 32, 3)).astype(np.uint8)
     image = Image.fromarray(pixels)
-    first, again, other = (np.asarray(apply_randaugment(image, seed)) for seed in (5, 5, 6))
+    usual, strong = PhotoTransform((32, 32)), PhotoTransform((32, 32), magnitude=30)
+    first, again, other = (np.asarray(usual.augment(image, seed)) for seed in (5, 5, 6))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
+    assert not np.array_equal(first, np.asarray(strong.augment(image, 5)))
+
+
+def test_photos_are_resized_bicubically_on_request_and_not_augmented_without_a_magnitude(
+    photos_on_disk: list[TrainingPlace],
+) -> None:
+    path = photos_on_disk[0].photos[0]
+    transform = PhotoTransform((50, 70), "bicubic", magnitude=None)
+    with Image.open(path) as image:
+        expected = image.convert("RGB").resize((70, 50), Image.Resampling.BICUBIC)
+    assert np.array_equal(np.asarray(transform.load(path, seed=1)), np.asarray(expected))
 
 
 def test_pixels_are_normalised_by_the_means_and_deviations_of_imagenet() -> None:

@@ -49,6 +49,13 @@ def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
     assert learning_rate(0, STEPS_PER_EPOCH, arguments) == pytest.approx(2e-4)
 
 
+def test_milestones_within_the_warm_up_count_unless_compatible() -> None:
+    for compatible, factor in ((False, 0.09), (True, 0.3)):
+        arguments = TrainingArguments(milestones=(0, 2), warmpup_steps=100, compatible=compatible)
+        rate = learning_rate(2 * STEPS_PER_EPOCH, STEPS_PER_EPOCH, arguments)
+        assert rate == pytest.approx(2e-4 * factor)
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("adam", torch.optim.Adam), ("adamw", torch.optim.AdamW), ("sgd", torch.optim.SGD)],

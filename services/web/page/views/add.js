@@ -63,7 +63,8 @@ function addZone(settings, take) {
       h("h1", {}, "Add photos"),
       h("p", { class: "lead" }, "Drop photos, a folder, or a zip. Coordinates and times are read from each photo."),
       h("div", { class: "row" }, button("Choose photos", () => files.click(), "primary"), button("Choose a folder", () => folder.click(), "not-touch"), files, folder),
-      h("p", { class: "soft small" }, `JPEG, PNG, WebP, BMP, TIFF or HEIC, up to ${bytes(settings.max_file_size)} each`)));
+      h("p", { class: "soft small" }, `JPEG, PNG, WebP, BMP, TIFF or HEIC, up to ${bytes(settings.max_file_size)} each`),
+      h("p", {}, "Photos without coordinates? ", h("a", { href: "#/locate" }, "Locate a folder"))));
   takesDrops(zone, take);
   return zone;
 }

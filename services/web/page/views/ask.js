@@ -83,7 +83,7 @@ function askEntry(map, onfile, signal) {
 }
 
 /** The answer to a photo, stored or not; `onjob` is told while it takes longer than a moment. */
-async function findSimilar(path, query, file, onjob, signal) {
+export async function findSimilar(path, query, file, onjob, signal) {
   const form = file ? new FormData() : null;
   form?.append("file", file, file.name);
   let response = await ask(path, {
@@ -120,7 +120,7 @@ async function showAnswer(answer, asked, signal) {
     return;
   }
   if (mine !== questions) return;
-  const photos = found.similar_images;
+  const photos = byProbability(found.similar_images);
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
   const open = (index) => compare(asked, photos, index, signal);
@@ -134,14 +134,16 @@ async function showAnswer(answer, asked, signal) {
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo is similar enough"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
-      photos.length > 0 && figures(found)));
+      photos.length > 0 && figures(photos, found.word_weights === "applied")));
   say(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
-  if (located) await drawAnswer(openMap, ground, found, open, signal);
+  if (located) await drawAnswer(openMap, ground, found.estimate, photos, open, signal);
 }
 
-async function drawAnswer(openMap, ground, found, open, signal) {
+/** The photos in the order of the number that they are shown with; those of equal probability as they are ranked. */
+const byProbability = (photos) => [...photos].sort((one, other) => other.match_probability - one.match_probability);
+
+async function drawAnswer(openMap, ground, estimate, photos, open, signal) {
   const map = await openMap(ground, "Where the matches were taken", { signal });
-  const { estimate, similar_images: photos } = found;
   drawRings(map, estimate);
   // From the last to the first, so that the best lies on top.
   photos.map((photo, index) => ({ photo, index })).reverse().forEach(({ photo, index }) => {
@@ -166,14 +168,13 @@ function matchCard(photo, index, onclick) {
 }
 
 /** The numbers behind the ranking. */
-function figures({ similar_images: photos, word_weights: weights }) {
-  const weighted = weights === "applied";
+function figures(photos, weighted) {
   const heads = ["", "Photo", "Same place", ...(weighted ? ["Weighted score"] : []), "Similarity"];
   const numbers = (photo) => [
     percent(photo.match_probability), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
-    h("p", { class: "soft" }, `The photos are ranked by ${weighted ? "the weighted score: the similarity of what this map trusts" : "similarity"} (the cosine of their descriptors). A match is strong from 80 %, fair from 30 %, and weak below.`),
+    h("p", { class: "soft" }, `Photos come in the order of the probability that they show the same place; it is computed from all similarities${weighted ? ", weighted by what this map trusts" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Similarity is the cosine of two descriptors.`),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Numbers of the matches" }, h("table", {},
       h("thead", {}, h("tr", {}, heads.map((name, column) => h("th", { scope: "col", class: column > 1 ? "number" : "" }, name || h("span", { class: "heard" }, "Rank"))))),
       h("tbody", {}, photos.map((photo, index) => h("tr", {},

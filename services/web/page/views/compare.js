@@ -20,8 +20,8 @@ export function compare(asked, photos, index, signal) {
     const photo = photos[index];
     fill(heading, `Match ${index + 1} of ${photos.length}`);
     const overlay = h("img", { class: "overlay", alt: "", hidden: true });
-    const strength = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
-    strength.addEventListener("input", () => (overlay.style.opacity = strength.value / 100));
+    const opacity = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
+    opacity.addEventListener("input", () => (overlay.style.opacity = opacity.value / 100));
     overlay.style.opacity = 0.7;
     const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Asking what makes them similar…"));
     fill(body,
@@ -44,7 +44,7 @@ export function compare(asked, photos, index, signal) {
       overlay.hidden = false;
       fill(why,
         h("p", { class: "legend" }, h("span", { class: "swatch for" }), "speaks for this match ", h("span", { class: "swatch against" }), "speaks against it"),
-        h("label", { class: "field inline" }, h("span", {}, "Overlay"), strength));
+        h("label", { class: "field inline" }, h("span", {}, "Overlay"), opacity));
     } catch (error) {
       if (mine !== shown || signal.aborted) return;
       fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "What makes them similar can’t be told now."));

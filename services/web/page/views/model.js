@@ -134,11 +134,11 @@ function generationsTable(generations, vocabularies) {
   const chip = ([words, tone]) => h("span", { class: `chip ${tone}` }, words);
   return h("section", { class: "card" }, h("h2", {}, "Model versions"),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Model versions" }, h("table", {},
-      h("thead", {}, h("tr", {}, ["State", "Vocabulary", "Dimension", "Photos", "Begun"].map((name) => h("th", { scope: "col", class: ["Dimension", "Photos"].includes(name) ? "number" : "" }, name)))),
+      h("thead", {}, h("tr", {}, ["State", "Vocabulary", "Dimension", "Photos", "Begun"].map((name) => h("th", { scope: "col", class: { Dimension: "number wide-only", Photos: "number" }[name] ?? "" }, name)))),
       h("tbody", {}, generations.map((one) => h("tr", {},
         h("td", {}, chip(states[one.state] ?? [one.state, ""])),
         h("td", {}, nameGeneration(one, vocabularies)),
-        h("td", { class: "number" }, count(one.dimension)), h("td", { class: "number" }, count(one.photos)), h("td", {}, time(one.created_at))))))));
+        h("td", { class: "number wide-only" }, count(one.dimension)), h("td", { class: "number" }, count(one.photos)), h("td", {}, time(one.created_at))))))));
 }
 
 function vocabulariesTable(vocabularies, generations, follow) {
@@ -146,10 +146,10 @@ function vocabulariesTable(vocabularies, generations, follow) {
   const active = generations.find((one) => one.state === "active");
   return h("section", { class: "card" }, h("h2", {}, "Vocabularies"),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Vocabularies" }, h("table", {},
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number" }, "Clusters"), h("th", { scope: "col" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number wide-only" }, "Clusters"), h("th", { scope: "col", class: "wide-only" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
       h("tbody", {}, vocabularies.map((one) => h("tr", {},
-        h("td", {}, nameVocabulary(one)), h("td", { class: "number" }, count(one.clusters)),
-        h("td", {}, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),
+        h("td", {}, nameVocabulary(one)), h("td", { class: "number wide-only" }, count(one.clusters)),
+        h("td", { class: "wide-only" }, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),
         h("td", { class: "row end" },
           button("Download", () => download(one)),
           active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), "Switching the vocabulary")))))))));

@@ -2,10 +2,10 @@
 
 import { ask, currentMap, get } from "../api.js";
 import { button, confirmed, field, fill, h, note, time } from "../dom.js";
-import { bytes, nameOf, when } from "../format.js";
+import { bytes, degrees, nameOf, when } from "../format.js";
 import { openMap } from "../map.js";
 import { preview } from "../photo.js";
-import { coordinates } from "../places.js";
+import { coordinateTools } from "../places.js";
 import { readTags } from "./photos.js";
 
 export async function showPhoto(view, { signal, id }) {
@@ -53,7 +53,7 @@ function facts(photo) {
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
     line("Searchable", photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet"),
-    photo.latitude !== null && line("Position", coordinates(photo.latitude, photo.longitude)),
+    photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
     line("Added", time(photo.upload_time)),

@@ -62,11 +62,11 @@ function drawJobs(card, jobs, look) {
     return;
   }
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
       h("td", {}, KINDS[job.kind] ?? job.kind),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
-      h("td", { class: "number" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
+      h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
       h("td", {}, time(job.created_at)),
       h("td", { class: "row end" },
         job.state === "failed" && (!job.error || maySucceed(job.error)) && button("Try again", () => post(`/jobs/${job.job_id}/retry`).then(look)),
@@ -80,14 +80,14 @@ function drawSearches(card, searches) {
   }
   const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number" }, "Took"), h("th", { scope: "col" }, "When"))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number wide-only" }, "Best"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
       const [words, tone] = verdict[one.in_map] ?? ["Open", ""];
       return h("tr", {},
         h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
         h("td", {}, h("span", { class: `chip ${tone}` }, words)),
-        h("td", { class: "number" }, one.best_score === null ? "–" : score(one.best_score)),
-        h("td", { class: "number" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, time(one.searched_at)));
+        h("td", { class: "number wide-only" }, one.best_score === null ? "–" : score(one.best_score)),
+        h("td", { class: "number wide-only" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, time(one.searched_at)));
     })))));
 }
 

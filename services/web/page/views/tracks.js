@@ -55,6 +55,7 @@ async function drawTrack(element, track, signal) {
   const { frames } = track;
   const located = frames.filter(({ state }) => state && state.latitude !== null);
   const ground = h("div", { class: "ground browse" });
+  const cut = h("p", { class: "soft small" });
   const followed = frames.filter((frame) => statusOf(frame) === "tracking").length;
   const rows = frames.slice(-FRAMES_SHOWN).reverse().map((frame) => h("tr", {},
     h("td", {}, new Date(frame.captured_at).toLocaleTimeString("en-GB")),
@@ -66,17 +67,18 @@ async function drawTrack(element, track, signal) {
   const shown = frames.length > FRAMES_SHOWN ? `; the last ${count(FRAMES_SHOWN)} are listed` : "";
   fill(element,
     h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, track.pending > 0 && `${plural(track.pending, "frame")} wait.`),
-    located.length > 0 && ground,
+    located.length > 0 && [ground, cut],
     h("section", { class: "card" }, h("h2", {}, "Frames"), table("Frames", heads("Time", "Photo", "Status", "Probability", "Place", "On the map"), rows)));
-  if (located.length) await drawPath(ground, frames, signal);
+  if (located.length) await drawPath(ground, cut, frames, signal);
 }
 
 /** The track over the map's photos: a circle of 68 % and a point for each frame, and lines between those that are not lost. */
-async function drawPath(ground, frames, signal) {
-  const [{ openMap }, { images }] = await Promise.all([
+async function drawPath(ground, cut, frames, signal) {
+  const [{ openMap }, { images, next_cursor: more, total_found: total, total_is_exact: exact }] = await Promise.all([
     import("../map.js"),
     get("/search", { query: { role: "database", limit: PHOTOS_SHOWN }, signal }),
   ]);
+  fill(cut, more && `Behind the track are ${count(images.length)} of ${exact ? "" : "more than "}${count(total)} photos of the map, the newest.`);
   const map = await openMap(ground, "The track over the photos of the map", { signal });
   for (const photo of images) {
     if (photo.latitude !== null) map.point(photo.latitude, photo.longitude, { kind: "behind", radius: 3 });

@@ -1,8 +1,8 @@
 // The place estimate in words, bars and rings.
 
 import { h } from "../dom.js";
-import { count, metres, percent } from "../format.js";
-import { coordinates } from "../places.js";
+import { count, degrees, metres, percent } from "../format.js";
+import { coordinateTools } from "../places.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
 
@@ -48,7 +48,8 @@ function judge({ levels, answer_level: answer, not_in_map_probability: outside, 
 function whereabouts({ place, latitude, longitude, radius_m: radius }) {
   return [
     place && h("p", { class: "place" }, place),
-    latitude !== null && h("p", { class: place ? "where" : "place where" }, coordinates(latitude, longitude, h("span", { class: "radius" }, ` ± ${metres(radius)}`))),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${metres(radius)}`)),
+    latitude !== null && coordinateTools(latitude, longitude),
   ];
 }
 
@@ -85,7 +86,6 @@ function ringsInWords(estimate) {
 /** What the probabilities were fitted on, and how they become better. */
 function source({ calibration_source: fitted }) {
   const words = {
-    prior: ["These probabilities come from generated maps. ", h("a", { href: "#/model" }, "Measure the map"), " to fit them to its photos."],
     own_photos: ["These probabilities were fitted on the map’s own photos. ", h("a", { href: "#/add" }, "Add test photos"), " of another day to correct them."],
     labelled_queries: ["These probabilities were fitted on test photos."],
   }[fitted];

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import pyexiv2
 import pytest
 from PIL import Image
 
@@ -100,3 +101,17 @@ def test_coordinates_in_the_xmp_of_a_photo_are_read() -> None:
     plain = io.BytesIO()
     Image.new("RGB", (8, 8)).save(plain, "PNG")
     assert embedded_xmp(plain) is None
+
+
+@pytest.mark.parametrize("existing", [None, DARKTABLE])
+def test_exiv2_reads_the_sidecar_as_darktable_and_digikam_do(
+    existing: bytes | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.jpg.xmp"
+    path.write_bytes(add_position(existing, *PLACES[1], 12.4))
+    with pyexiv2.Image(str(path)) as sidecar:
+        values = sidecar.read_xmp()
+    assert values["Xmp.exif.GPSLatitude"] == "33,51.407064S"
+    assert values["Xmp.exif.GPSLongitude"] == "151,12.917802E"
+    assert values["Xmp.exif.GPSHPositioningError"] == "12/1"
+    assert values.get("Xmp.xmp.Rating") == ("4" if existing else None)

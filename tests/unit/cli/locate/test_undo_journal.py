@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -14,36 +14,57 @@ from filelock import FileLock
 from services.cli.locate.undo_journal import FOLDER, JOURNAL, open_journal, undo
 from shared.errors import Conflict, NotFound
 
-WRITER = """
-import os, signal, sys
-from pathlib import Path
-from services.cli.locate import undo_journal as tested
+MOMENTS = 40
+"""More than there are moments at which a call is killed below"""
 
-root, killed_at = Path(sys.argv[1]), int(sys.argv[2])
-calls = 0
 
-def counted(function):
-    def call(*arguments, **options):
-        global calls
-        calls += 1
-        if calls == killed_at:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*arguments, **options)
-    return call
+def run_until(killed_at: int, work: Callable[[], object]) -> bool:
+    """Run in a process of its own that is killed before its n-th call that touches a file.
 
-os.fsync, os.link = counted(os.fsync), counted(os.link)
-Path.replace, Path.write_bytes = counted(Path.replace), counted(Path.write_bytes)
-with tested.open_journal(root) as journal:
-    for name in ("old.xmp", "new.xmp"):
-        path = root / name
-        journal.install(path, journal.stage(path, b"written"))
-"""
+    Returns False if it ended before.
+    """
+    child = os.fork()
+    if child == 0:
+        _kill_at(killed_at, work)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+def _kill_at(killed_at: int, work: Callable[[], object]) -> None:
+    calls = 0
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == killed_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **options)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in (
+            *((os, name) for name in ("fsync", "link")),
+            *((Path, name) for name in ("mkdir", "open", "replace", "unlink")),
+        ):
+            patch.setattr(owner, name, counted(getattr(owner, name)))
+        work()
 
 
 def contents(root: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()
     }
+
+
+def without_journal(root: Path) -> dict[str, bytes]:
+    return {name: data for name, data in contents(root).items() if not name.startswith(FOLDER)}
+
+
+def write_two(root: Path) -> None:
+    for name in ("old.xmp", "new.xmp"):
+        write(root, name, b"written")
 
 
 def write(root: Path, name: str, content: bytes) -> None:
@@ -91,20 +112,31 @@ def test_a_file_that_was_changed_since_is_left_as_it_is(folder: Path) -> None:
     assert not (folder / FOLDER).exists()
 
 
-@pytest.mark.parametrize("killed_at", range(1, 25, 2))
-def test_a_kill_at_any_moment_leaves_what_undo_repairs(folder: Path, killed_at: int) -> None:
+def test_a_kill_at_any_moment_leaves_what_undo_repairs(folder: Path) -> None:
     before = contents(folder)
-    command = [sys.executable, "-c", WRITER, str(folder), str(killed_at)]
-    code = subprocess.run(command, check=False, timeout=100).returncode
-    assert code in (-signal.SIGKILL, 0)
-    for name, old in (("old.xmp", before["old.xmp"]), ("new.xmp", None)):
-        path = folder / name
-        present = path.read_bytes() if path.exists() else None
-        assert present in (old, b"written"), "never half of it"
-    if (folder / FOLDER / JOURNAL).exists():
-        undo(folder)
-    left = {name: data for name, data in contents(folder).items() if not name.startswith(FOLDER)}
-    assert left == before
+    killed = 0
+    for moment in range(1, MOMENTS):
+        killed += run_until(moment, lambda: write_two(folder))
+        for name, old in (("old.xmp", before["old.xmp"]), ("new.xmp", None)):
+            path = folder / name
+            present = path.read_bytes() if path.exists() else None
+            assert present in (old, b"written"), "never half of it"
+        if (folder / FOLDER / JOURNAL).exists():
+            undo(folder)
+        assert without_journal(folder) == before, f"killed before call {moment}"
+    assert 15 < killed < MOMENTS - 1, "after the last moment, all was written"
+
+
+def test_an_undo_that_was_killed_is_finished_by_the_next(folder: Path) -> None:
+    before = contents(folder)
+    killed = 0
+    for moment in range(1, MOMENTS):
+        write_two(folder)
+        killed += run_until(moment, lambda: undo(folder))
+        if (folder / FOLDER / JOURNAL).exists():
+            undo(folder)
+        assert without_journal(folder) == before, f"killed before call {moment}"
+    assert 5 < killed < MOMENTS - 1
 
 
 def test_an_incomplete_last_line_of_the_journal_stands_for_no_change(folder: Path) -> None:

@@ -129,7 +129,7 @@ def test_thousands_of_labels_have_their_levels() -> None:
 # --- probabilities ---------------------------------------------------------------------------
 
 
-def test_without_an_evaluation_the_prior_says_how_sure_a_clear_and_an_unclear_ranking_are() -> None:
+def test_the_prior_orders_a_clear_and_an_unclear_ranking_and_answers_neither() -> None:
     clear = ranking(
         *((0.9 - n / 100, label("a/1/x")) for n in range(10)),
         *((0.1, label("b/1/x")) for _ in range(40)),
@@ -140,7 +140,10 @@ def test_without_an_evaluation_the_prior_says_how_sure_a_clear_and_an_unclear_ra
     assert unsure is not None
     assert sure.probabilities[0] > 0.8 > 0.6 > unsure.probabilities[0]
     assert sure.not_in_map < unsure.not_in_map
-    assert unsure.answer is None
+    assert (sure.answer, unsure.answer) == (None, None)
+    fitted = PlaceModel(source="own_photos").estimate(clear, clear[1:], PATHS, 0.5, 25.0)
+    assert fitted is not None
+    assert fitted.answer == 0
 
 
 def test_a_level_is_never_less_probable_than_a_finer_one() -> None:
@@ -168,13 +171,14 @@ def test_the_error_radius_lies_between_the_levels_that_enclose_its_share() -> No
 
 def test_an_answer_is_the_finest_level_over_the_threshold_with_enough_odds() -> None:
     at_95 = Thresholds(probability=0.9, odds=(5.0,))
-    model = PlaceModel(thresholds=(at_95,) * len(CERTAINTIES))
+    model = PlaceModel(source="own_photos", thresholds=(at_95,) * len(CERTAINTIES))
     assert model.answer([0.91, 0.96], 0.1, 0.95) == 0
     assert model.answer([0.91, 0.96], 0.3, 0.95) == 1  # probably not in the map
     assert model.answer([0.5, 0.91], 0.1, 0.95) == 1
     assert model.answer([0.5, 0.89], 0.1, 0.95) is None
     assert model.answer([0.91, 0.96], 0.1, 1.0) is None  # beyond the stored certainties
-    assert PlaceModel().answer([0.94, 0.96], 0.1, 0.95) == 1  # no threshold: the certainty is one
+    without_thresholds = PlaceModel(source="own_photos")
+    assert without_thresholds.answer([0.94, 0.96], 0.1, 0.95) == 1  # the certainty is one
 
 
 def test_the_threshold_is_the_lowest_with_the_certainty_as_share_of_right_answers() -> None:
@@ -204,8 +208,20 @@ def test_at_most_one_impostor_in_twenty_gets_an_answer_at_the_finest_level() -> 
         shares.append(np.mean([thresholds.answer([0.97], value, 0.95) == 0 for value in new]))
     assert np.mean(np.array(shares) > 0.05) <= 0.08
     assert np.mean(shares) > 0.01
-    few = choose_thresholds(right, impostors[:5], 0.95)
-    assert [few.answer([0.97], s.not_in_map, 0.95) for s in impostors[:5]] == [None] * 5
+    few = choose_thresholds(right, impostors[:20], 0.95)
+    assert [few.answer([0.97], s.not_in_map, 0.95) for s in impostors[:20]] == [None] * 20
+
+
+def test_a_level_with_too_few_impostors_is_no_answer() -> None:
+    """In a map of one room, nothing tells a query of another room."""
+    right = [held_out([0.97, 0.98], [True, True]) for _ in range(200)]
+    wrong = [held_out([0.1, 0.98], [False, True], 0.5, "level 0") for _ in range(59)]
+    assert choose_thresholds(right, wrong, 0.95).answer([0.97, 0.98], 0.0, 0.95) == 0
+    assert choose_thresholds(right, wrong[:58], 0.95).answer([0.97, 0.98], 0.0, 0.95) == 1
+    one_room = [held_out([0.97], [True]) for _ in range(200)]
+    thresholds = choose_thresholds(one_room, [], 0.95)
+    assert thresholds.answer([1.0], 0.0, 0.95) is None
+    assert Thresholds.model_validate_json(thresholds.model_dump_json()) == thresholds
 
 
 def test_the_odds_exclude_impostors_of_each_kind_at_every_level_but_the_coarsest() -> None:

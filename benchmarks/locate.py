@@ -1,0 +1,262 @@
+"""`placewise locate` on generated walks: photos proposed, and how many of them are right.
+
+    placewise datasets synth CITY --places 300 --rides 500 --no-ladder --no-train
+    python -m benchmarks.locate CITY [--seeds 10] [--share 0.15]
+
+The rides of the city are slowed down to walks; where a ride jumps to another street, half an hour
+passes. A photo is taken at a random share of the frames, and a random half of the photos loses its
+coordinates. The clock of the camera is CLOCK_ERROR_SECONDS ahead of the GPX track, which has a
+point every few frames. Part of each ride is outside the map. A proposal is right if the photo was
+taken within 100 m of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.cli.environment import read_settings
+from services.cli.evaluation.describers import extractor_describer
+from services.cli.output import Table, print_table, progress_bar
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set
+from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.ranking import describe_evaluation_set
+from shared.evaluation.sequences import COARSE_RADII_M, split_sequences
+from shared.geodesy import distance_m
+from shared.geotagging.evidence import (
+    KnownPosition,
+    PictureEvidence,
+    ProbableCircle,
+    SimilarPosition,
+    interpolate_position,
+)
+from shared.geotagging.fusion import propose_position
+
+START = datetime(2026, 5, 1, tzinfo=UTC)
+SECONDS_A_FRAME = 6.0  # of 6 to 10 m
+JUMP_M = 50.0
+JUMP_SECONDS = 1800.0
+POINT_FRAMES = 5
+POINT_NOISE_M = 5.0
+CLOCK_ERROR_SECONDS = 10.0
+RADIUS_M = 100.0
+SCHEME = LevelScheme(labels_are_paths=False, radii_m=(25.0, *COARSE_RADII_M))
+OWN_PHOTOS_SAMPLED = 1000
+CERTAINTY = 0.95
+DEGREES_PER_M = 360 / 40_030_000
+SOURCES = ("picture", "picture, neighbours", "picture, neighbours, GPX", "neighbours", "GPX")
+
+
+@dataclass(frozen=True)
+class LocatedMap:
+    """The photos of a map, with the place model that is fitted on them."""
+
+    photos: Sequence[DatasetPhoto]
+    rows: NDArray[np.float32]
+    """(n, D), of unit length"""
+    locations: Sequence[PhotoLocation]
+    model: PlaceModel
+
+    @classmethod
+    def fit(cls, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32]) -> LocatedMap:
+        """Fit the place model."""
+
+        def rank(photo: int) -> IndexRanking:
+            scores = (rows @ rows[photo]).astype(np.float64)
+            order = np.argsort(-scores, kind="stable")
+            order = order[order != photo]
+            return order, scores[order]
+
+        locations = [PhotoLocation(each.latitude, each.longitude, each.place) for each in photos]
+        sampler = OwnPhotoSampler(
+            locations, [each.captured_at for each in photos], SCHEME, SCHEME.radii_m[0], rank
+        )
+        sampled = np.random.default_rng(0).permutation(len(photos))[:OWN_PHOTOS_SAMPLED].tolist()
+        spread = sampler.spread(sampled)
+        fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), SCHEME, spread)
+        return cls(photos, rows, locations, fitted.model)
+
+    def neighbours(self, photo: int) -> list[RankedPhoto]:
+        """Return the ranking of a photo of the map, without it."""
+        scores = self.rows @ self.rows[photo]
+        scores[photo] = -np.inf
+        order = np.argsort(-scores, kind="stable")[: min(EVIDENCE_DEPTH, len(scores) - 1)]
+        return [RankedPhoto(float(scores[each]), self.locations[each]) for each in order]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A proposal for a photo."""
+
+    probability: float
+    is_right: bool
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("city", type=Path)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--share", type=float, default=0.15, help="frames that are photos")
+    arguments = parser.parse_args()
+    map_, rides = describe_rides(arguments.city)
+    for name, frames, scores in rides:
+        pictures = [picture_of(map_, row) for row in scores]
+        judged: dict[str, list[Judged]] = {}
+        for seed in range(arguments.seeds):
+            for source, proposals in locate_walk(frames, pictures, seed, arguments.share).items():
+                judged.setdefault(source, []).extend(proposals)
+        print_table(figures_table(name, judged))
+
+
+def describe_rides(
+    city: Path,
+) -> tuple[LocatedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
+    """Describe a city as a new map would be, and return its rides with their (frames, n) scores."""
+    name = next(each for each in evaluation_set_names(city) if each.endswith("_rides"))
+    evaluation_set = open_evaluation_set(city, name)
+    settings = read_settings()
+    with progress_bar() as progress:
+        describer = extractor_describer(
+            settings.new_map_extractor, None, evaluation_set, settings, progress, fit=True
+        )
+        with describe_evaluation_set(describer.describe, evaluation_set) as matrices:
+            database, queries = (np.array(rows) for rows in matrices)
+    map_ = LocatedMap.fit(evaluation_set.database, database)
+    rides = []
+    for members in split_sequences(evaluation_set.queries):
+        frames = [evaluation_set.queries[member] for member in members]
+        rides.append((str(frames[0].sequence), frames, queries[members] @ database.T))
+    return map_, rides
+
+
+def picture_of(map_: LocatedMap, scores: NDArray[np.float32]) -> PictureEvidence:
+    """Return what the search of the map says about a frame, as `placewise locate` reads it."""
+    order = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
+    ranking = [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
+    neighbours = map_.neighbours(order[0])
+    estimate = map_.model.estimate(ranking, neighbours, SCHEME, CERTAINTY, SCHEME.radii_m[0])
+    assert estimate is not None
+    return PictureEvidence(
+        [
+            SimilarPosition(
+                *degrees(map_.photos[each]), float(scores[each]), map_.photos[each].name
+            )
+            for each in order
+        ],
+        [
+            ProbableCircle(
+                float(level.latitude or 0), float(level.longitude or 0), level.radius_m or 0, share
+            )
+            for level, share in zip(estimate.levels, estimate.probabilities, strict=True)
+        ],
+        estimate.not_in_map,
+        len(map_.photos),
+    )
+
+
+def locate_walk(
+    frames: Sequence[DatasetPhoto], pictures: Sequence[PictureEvidence], seed: int, share: float
+) -> dict[str, list[Judged]]:
+    """Draw photos of a walk, and judge what is proposed for those without coordinates."""
+    rng = np.random.default_rng(seed)
+    times = walk_times(frames)
+    ahead = timedelta(seconds=CLOCK_ERROR_SECONDS)
+    known = [
+        KnownPosition(time, *degrees(frame)) for time, frame in zip(times, frames, strict=True)
+    ]
+    track = [
+        KnownPosition(
+            point.time - ahead,
+            point.latitude + float(rng.normal(0, POINT_NOISE_M)) * DEGREES_PER_M,
+            point.longitude + float(rng.normal(0, POINT_NOISE_M)) * DEGREES_PER_M,
+        )
+        for point in known[::POINT_FRAMES]
+    ]
+    taken = np.flatnonzero(rng.random(len(frames)) < share)
+    stripped = rng.random(len(taken)) < 0.5
+    located = [known[number] for number in taken[~stripped].tolist()]
+    speed = MOTION_MODELS["walk"].max_speed_mps
+    judged: dict[str, list[Judged]] = {source: [] for source in SOURCES}
+    for number in taken[stripped].tolist():
+        neighbours = interpolate_position(located, times[number], speed)
+        on_track = interpolate_position(track, times[number], speed)
+        for source in SOURCES:
+            proposal = propose_position(
+                pictures[number] if "picture" in source else None,
+                neighbours if "neighbours" in source else None,
+                on_track if "GPX" in source else None,
+                RADIUS_M,
+            )
+            if proposal is None:
+                judged[source].append(Judged(0.0, is_right=False))
+                continue
+            away = distance_m(
+                proposal.latitude,
+                proposal.longitude,
+                known[number].latitude,
+                known[number].longitude,
+            )
+            judged[source].append(Judged(proposal.probability, away <= RADIUS_M))
+    return judged
+
+
+def walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
+    """Return the times of the frames, with half an hour before each jump."""
+    seconds = [0.0]
+    for before, after in pairwise(frames):
+        jumped = distance_m(*degrees(before), *degrees(after)) > JUMP_M
+        seconds.append(seconds[-1] + (JUMP_SECONDS if jumped else SECONDS_A_FRAME))
+    return [START + timedelta(seconds=each) for each in seconds]
+
+
+def figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
+    """Return a table of shares in %."""
+    table = Table(
+        "sources", "photos", "proposed at 0.95", "right", "most at 95 % right", "ECE", title=name
+    )
+    for source, proposals in judged.items():
+        accepted = [each.is_right for each in proposals if each.probability >= CERTAINTY]
+        error = expected_calibration_error(
+            [each.probability for each in proposals], [each.is_right for each in proposals]
+        )
+        table.add_row(
+            source,
+            str(len(proposals)),
+            f"{100 * len(accepted) / len(proposals):.1f}",
+            f"{100 * np.mean(accepted):.1f}" if accepted else "-",
+            f"{100 * most_proposed(proposals):.1f}",
+            f"{error:.3f}",
+        )
+    return table
+
+
+def most_proposed(proposals: Sequence[Judged]) -> float:
+    """Return the largest share of photos that any threshold proposes with 95 % of them right."""
+    ordered = sorted(proposals, key=lambda each: -each.probability)
+    right = np.cumsum([each.is_right for each in ordered])
+    precise = right >= CERTAINTY * np.arange(1, len(ordered) + 1)
+    return float(np.flatnonzero(precise).max(initial=-1) + 1) / len(ordered)
+
+
+def degrees(photo: DatasetPhoto) -> tuple[float, float]:
+    """Return latitude and longitude; photos of generated cities have both."""
+    assert photo.latitude is not None
+    assert photo.longitude is not None
+    return photo.latitude, photo.longitude
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""Routes that propose positions for photos without coordinates; they store nothing."""
+
+from __future__ import annotations
+
+import io
+from typing import Annotated, Literal, Self
+
+from fastapi import APIRouter, Body
+from pydantic import AwareDatetime, ConfigDict, Field, model_validator
+
+from services.gateway.authentication import READ
+from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, MapQuery
+from services.gateway.schemas import RequestModel, ResponseModel
+from shared.catalog.chunks import count_searchable
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import get_map
+from shared.geotagging.evidence import (
+    DatedPhoto,
+    KnownPosition,
+    PictureEvidence,
+    ProbableCircle,
+    SimilarPosition,
+    TimeNeighbours,
+    interpolate_position,
+)
+from shared.geotagging.fusion import propose_position
+from shared.imaging.photo_header import read_photo_header
+from shared.tracks.motion import motion_model
+
+router = APIRouter(tags=["photos"])
+
+MAX_NAME = 1000
+MAX_UNLOCATED = 100
+"""Photos without coordinates in one call; each takes some milliseconds"""
+MAX_SIMILAR = 100
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(max_length=MAX_NAME)]
+
+
+class PhotoHeaderResponse(ResponseModel):
+    """What a photo's header says about when, where and by which camera it was taken."""
+
+    captured_at: AwareDatetime | None = Field(
+        description="UTC; if `time_zone_is_known` is false, the camera's clock as if it were UTC"
+    )
+    time_zone_is_known: bool
+    camera: str | None = Field(description="make, model and serial number")
+    latitude: float | None
+    longitude: float | None
+
+
+class _Finite(RequestModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class SimilarBody(_Finite):
+    """A photo of the map that looks similar."""
+
+    name: Name
+    latitude: Latitude
+    longitude: Longitude
+    score: float = Field(ge=-10, le=10)
+
+
+class CircleBody(_Finite):
+    """A level of the estimate."""
+
+    latitude: Latitude
+    longitude: Longitude
+    radius_m: float = Field(gt=0, le=1e6)
+    probability: Probability
+
+
+class SearchBody(_Finite):
+    """What a similarity search answered for the photo."""
+
+    similar: list[SimilarBody] = Field(max_length=MAX_SIMILAR, description="best first")
+    circles: list[CircleBody] = Field(max_length=10, description="finest first")
+    not_in_map: Probability
+
+
+class DatedPhotoBody(_Finite):
+    """A photo of a folder, with or without coordinates."""
+
+    name: Name
+    captured_at: AwareDatetime | None = None
+    time_zone_is_known: bool = False
+    camera: Name | None = None
+    latitude: Latitude | None = None
+    longitude: Longitude | None = None
+    search: SearchBody | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.latitude is None) != (self.longitude is None):
+            raise ValueError("send both `latitude` and `longitude`, or neither")
+        return self
+
+
+class TrackPointBody(_Finite):
+    time: AwareDatetime
+    latitude: Latitude
+    longitude: Longitude
+
+
+class PositionsBody(_Finite):
+    """The photos of a folder."""
+
+    photos: list[DatedPhotoBody] = Field(
+        max_length=10_000,
+        description=f"at most {MAX_UNLOCATED} of them without coordinates; the others show where "
+        "their camera was",
+    )
+    track: list[TrackPointBody] = Field(
+        default=[], max_length=10_000, description="points of a GPX track"
+    )
+    radius_m: float = Field(100.0, ge=10, le=2000, description="radius of the proposals")
+    motion: Literal["walk", "bicycle", "car", "train"] = "walk"
+    together: bool = Field(
+        False, description="photos of all cameras are neighbours in time, not only of the same one"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if sum(photo.latitude is None for photo in self.photos) > MAX_UNLOCATED:
+            raise ValueError(f"send at most {MAX_UNLOCATED} photos without coordinates")
+        return self
+
+
+class ProposalResponse(ResponseModel):
+    """Where a photo was probably taken."""
+
+    name: str
+    latitude: float | None = Field(description="null if nothing is known about its place")
+    longitude: float | None
+    radius_m: float
+    probability: float = Field(description="that it was taken within `radius_m`")
+    radius_68_m: float | None
+    reason: str
+
+
+class ProposalsResponse(ResponseModel):
+    proposals: list[ProposalResponse] = Field(
+        description="of the photos without coordinates, in their order"
+    )
+
+
+@router.post("/photo-headers", operation_id="read_photo_header", dependencies=[READ, NO_PARAMETERS])
+def read_header(
+    gateway: GatewayDep,
+    begin: Annotated[
+        bytes, Body(media_type="application/octet-stream", description="first bytes of the photo")
+    ],
+) -> PhotoHeaderResponse:
+    """Read time, camera and coordinates from the first bytes of a photo; 256 KiB are enough."""
+    header = read_photo_header(io.BytesIO(begin), gateway.settings.max_image_pixels)
+    return PhotoHeaderResponse.model_validate(header)
+
+
+@router.post("/positions", operation_id="propose_positions", dependencies=[READ])
+def propose_positions(
+    gateway: GatewayDep, query: MapQuery, body: PositionsBody
+) -> ProposalsResponse:
+    """Propose where photos were taken that have no coordinates.
+
+    The answers of similarity searches are combined with photos that have coordinates and were taken
+    shortly before or after, and with a GPX track. Nothing is stored.
+    """
+    with gateway.catalog.read() as session:
+        generation = active_generation(session, get_map(session, query.map).id)
+        photo_count = count_searchable(session, generation.id) if generation else 0
+    photos = [
+        DatedPhoto(
+            each.name,
+            each.captured_at,
+            each.time_zone_is_known,
+            each.camera,
+            each.latitude,
+            each.longitude,
+        )
+        for each in body.photos
+    ]
+    neighbours = TimeNeighbours(photos, body.together)
+    track = sorted(
+        (KnownPosition(each.time, each.latitude, each.longitude) for each in body.track),
+        key=lambda point: point.time,
+    )
+    speed = motion_model(body.motion).max_speed_mps
+    proposals = []
+    for photo, sent in zip(photos, body.photos, strict=True):
+        if photo.latitude is not None:
+            continue
+        on_track = None
+        if photo.time is not None and photo.time_zone_is_known:
+            on_track = interpolate_position(track, photo.time, speed)
+        proposal = propose_position(
+            _picture_evidence(sent.search, photo_count),
+            neighbours.position_of(photo, speed),
+            on_track,
+            body.radius_m,
+        )
+        proposals.append(
+            ProposalResponse(
+                name=photo.name,
+                latitude=proposal.latitude if proposal else None,
+                longitude=proposal.longitude if proposal else None,
+                radius_m=body.radius_m,
+                probability=proposal.probability if proposal else 0.0,
+                radius_68_m=proposal.radius_68_m if proposal else None,
+                reason=proposal.reason if proposal else "nothing is known about its place",
+            )
+        )
+    return ProposalsResponse(proposals=proposals)
+
+
+def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvidence | None:
+    if search is None:
+        return None
+    return PictureEvidence(
+        [
+            SimilarPosition(each.latitude, each.longitude, each.score, each.name)
+            for each in search.similar
+        ],
+        [
+            ProbableCircle(each.latitude, each.longitude, each.radius_m, each.probability)
+            for each in search.circles
+        ],
+        search.not_in_map,
+        photo_count,
+    )

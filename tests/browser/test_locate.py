@@ -1,0 +1,78 @@
+"""Locate a folder: proposals by the map and by time, accepted by probability, and downloaded."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from xml.etree import ElementTree
+
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+from playwright.sync_api import expect
+
+from shared.ingest.photo_metadata import read_csv_manifest
+from tests.browser.conftest import Town, Visitor
+
+NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
+
+
+def take_photo(
+    picture: Path, path: Path, seconds: float, position: tuple[float, float] | None
+) -> None:
+    """Copy a picture as one of a camera, so many seconds after noon."""
+    exif = Image.Exif()
+    exif[Base.Model] = "Camera"
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = (
+        f"{NOON + timedelta(seconds=seconds):%Y:%m:%d %H:%M:%S}"
+    )
+    if position:
+        gps = exif.get_ifd(IFD.GPSInfo)
+        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
+        gps[GPS.GPSLatitude] = (position[0], 0.0, 0.0)
+        gps[GPS.GPSLongitude] = (position[1], 0.0, 0.0)
+    with Image.open(picture) as image:
+        image.save(path, "JPEG", exif=exif)
+
+
+def test_a_folder_is_located_accepted_by_probability_and_downloaded(
+    visitor: Visitor, town: Town, tmp_path: Path
+) -> None:
+    stored = town.get("/search", role="database", limit=1)["images"][0]
+    picture = tmp_path / "stored.jpg"
+    picture.write_bytes(town.server.client.get(stored["image_url"]).content)
+    position = (stored["latitude"], stored["longitude"])
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    take_photo(picture, folder / "known.jpg", 0, position)
+    take_photo(picture, folder / "soon.jpg", 5, None)
+    take_photo(town.queries[0], folder / "much later.jpg", 7200, None)
+    (folder / "broken.jpg").write_bytes((folder / "soon.jpg").read_bytes()[:100])
+
+    page = visitor.visit("add")
+    page.get_by_role("link", name="Locate a folder").click()
+    page.locator("input[data-use=locate]").set_input_files(sorted(folder.iterdir()))
+    expect(page.locator("tbody tr")).to_have_count(3)
+    soon = page.locator("tr", has_text="soon.jpg")
+    expect(soon).to_contain_text("accepted")
+    expect(soon).to_contain_text("taken 5 s after known.jpg")
+    expect(page.locator("tr", has_text="broken.jpg")).to_contain_text("damaged")
+    expect(page.locator("path.point.behind")).to_have_count(1)
+    expect(page.locator("path.point.tracking").first).to_be_attached()
+
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download CSV").click()
+    entries = read_csv_manifest(download.value.path().read_bytes(), "table")
+    table = {entry.name: entry.fields for entry in entries}
+    assert abs(float(table["soon.jpg"]["latitude"]) - position[0]) < 5e-4
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download GPX").click()
+    names = [
+        each.text for each in ElementTree.parse(download.value.path()).iter() if "name" in each.tag
+    ]
+    assert set(names) == table.keys()
+
+    page.get_by_label("Accept from").fill("100")
+    page.get_by_label("Accept from").blur()
+    expect(page.get_by_role("button", name="Download CSV")).to_have_count(0)
+    expect(page.get_by_text("3 photos without coordinates, 0 accepted").first).to_be_visible()
+    visitor.untroubled()

@@ -1,0 +1,81 @@
+"""`placewise locate` as a user runs it: a folder, a map that knows the places, sidecars, undo."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from services.cli.locate.sidecars import read_position
+from tests.support.photos import encoded, photo_bytes, photo_image
+from tests.support.server import ServerProcess, environment, run_command
+
+NOON = datetime(2026, 5, 1, 12)  # noqa: DTZ001 the clock of a camera
+DEGREES_APART = 0.001
+LONGITUDE = 7.0
+
+
+def taken(number: int, seconds: float, latitude: float | None = None) -> bytes:
+    """The photo `number` so many seconds after noon."""
+    exif = Image.Exif()
+    exif[Base.Model] = "Camera"
+    clock = NOON + timedelta(seconds=seconds)
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
+    if latitude is not None:
+        gps = exif.get_ifd(IFD.GPSInfo)
+        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
+        gps[GPS.GPSLatitude], gps[GPS.GPSLongitude] = (latitude, 0.0, 0.0), (LONGITUDE, 0.0, 0.0)
+    return encoded(photo_image(number), "JPEG", quality=90, exif=exif)
+
+
+def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    for number in range(1, 21):
+        server.indexed(
+            photo_bytes(number),
+            f"{number}.jpg",
+            latitude=number * DEGREES_APART,
+            longitude=LONGITUDE,
+        )
+    trip = tmp_path / "trip"
+    trip.mkdir()
+    (trip / "known.jpg").write_bytes(taken(3, 0, 3 * DEGREES_APART))
+    (trip / "of the map.jpg").write_bytes(taken(3, 5))
+    (trip / "later.jpg").write_bytes(taken(900, 10))
+    (trip / "broken.jpg").write_bytes(taken(4, 0)[:300])
+    before = {path.name: path.read_bytes() for path in trip.iterdir()}
+
+    def locate(*options: str) -> subprocess.CompletedProcess[str]:
+        return run_command("locate", "trip", *options, env=environment(server.home), cwd=tmp_path)
+
+    run = locate("--accept", "0.9", "--json")
+    assert run.returncode == 1, "a photo could not be read"
+    answer = json.loads(run.stdout)
+    assert (answer["photos"], answer["with_coordinates"]) == (4, 1)
+    proposals = {each["filename"]: each for each in answer["proposals"]}
+    assert "damaged" in proposals["broken.jpg"]["error"]
+    assert proposals["broken.jpg"]["position"] is None
+    by_both = proposals["of the map.jpg"]
+    assert by_both["accepted"]
+    assert by_both["position"]["latitude"] == pytest.approx(3 * DEGREES_APART, abs=2e-4)
+    assert by_both["position"]["reason"] == "looks like 3.jpg; taken 5 s after known.jpg"
+    by_time = proposals["later.jpg"]["position"]
+    assert by_time["latitude"] == pytest.approx(3 * DEGREES_APART, abs=4e-4)
+    assert by_time["probability"] < by_both["position"]["probability"]
+
+    (trip / "broken.jpg").unlink()
+    del before["broken.jpg"]
+    written = locate("--accept", "0.9", "--write", "sidecar")
+    assert written.returncode == 0, written.stderr
+    assert "of the map.jpg" in written.stdout
+    position = read_position((trip / "of the map.jpg.xmp").read_bytes())
+    assert position == pytest.approx((by_both["position"]["latitude"], LONGITUDE), abs=1e-4)
+    undone = locate("--undo")
+    assert undone.returncode == 0, undone.stderr
+    assert {path.name: path.read_bytes() for path in trip.iterdir()} == before

@@ -1,0 +1,89 @@
+"""Positions over HTTP: a photo's header, and proposals for the photos of a folder."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from tests.integration.in_process_api import Service
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+
+NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
+only_sqlite = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+
+
+def dated(name: str, seconds: float, latitude: float | None = None) -> dict[str, Any]:
+    return {
+        "name": name,
+        "captured_at": (NOON + timedelta(seconds=seconds)).isoformat(),
+        "time_zone_is_known": True,
+        "camera": "Camera",
+        "latitude": latitude,
+        "longitude": None if latitude is None else 7.0,
+    }
+
+
+def propose(service: Service, *photos: dict[str, Any], **options: Any) -> list[dict[str, Any]]:
+    answer = service("POST", "/positions", json={"photos": photos, **options})
+    assert answer.status_code == 200, answer.text
+    proposals: list[dict[str, Any]] = answer.json()["proposals"]
+    return proposals
+
+
+@only_sqlite
+def test_the_begin_of_a_photo_says_when_and_by_which_camera_it_was_taken(service: Service) -> None:
+    exif = Image.Exif()
+    exif[Base.Model] = "Camera"
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:00:00"
+    begin = photo_bytes(1, exif=exif)[:1500]
+    octets = {"Content-Type": "application/octet-stream"}
+    answer = service("POST", "/photo-headers", content=begin, headers=octets)
+    assert answer.json() == {
+        "captured_at": "2026-05-01T12:00:00Z",
+        "time_zone_is_known": False,
+        "camera": "Camera",
+        "latitude": None,
+        "longitude": None,
+    }
+    refused = service("POST", "/photo-headers", content=b"no photo", headers=octets)
+    assert problem(refused, 422, "undecodable_photo")
+
+
+@only_sqlite
+def test_searches_neighbours_and_a_track_are_combined(service: Service) -> None:
+    for number in range(3):
+        service.upload(photo_bytes(number), latitude=45 + number / 1000, longitude=7.0)
+    search = {
+        "similar": [{"name": "2.jpg", "latitude": 45.002, "longitude": 7.0, "score": 0.9}],
+        "circles": [{"latitude": 45.002, "longitude": 7.0, "radius_m": 100, "probability": 0.6}],
+        "not_in_map": 0.02,
+    }
+    unknown = {**dated("unknown.jpg", 20), "camera": None, "search": search}
+    between = {**dated("between.jpg", 10), "search": search}
+    alone, both = propose(service, dated("a.jpg", 0, 45.0019), unknown, between)
+    assert (alone["name"], alone["reason"]) == ("unknown.jpg", "looks like 2.jpg")
+    assert alone["latitude"] == pytest.approx(45.002, abs=1e-4)
+    assert both["probability"] > 0.9 > alone["probability"]
+    assert both["reason"] == "looks like 2.jpg; taken 10 s after a.jpg"
+    track = [
+        {"time": (NOON + timedelta(seconds=s)).isoformat(), "latitude": 45.001, "longitude": 7.0}
+        for s in (30, 0)
+    ]
+    (by_track,) = propose(service, dated("b.jpg", 5), track=track)
+    assert by_track["latitude"] == pytest.approx(45.001, abs=1e-5)
+    (nothing,) = propose(service, {"name": "c.jpg"}, track=track)
+    assert (nothing["latitude"], nothing["probability"]) == (None, 0)
+
+
+@only_sqlite
+def test_bodies_that_cannot_be_computed_are_refused(service: Service) -> None:
+    half = {**dated("a.jpg", 0), "latitude": 45.0}
+    many = [{"name": str(number)} for number in range(101)]
+    for photos in ([half], many, [{"name": "a", "latitude": 95, "longitude": 0}]):
+        answer = service("POST", "/positions", json={"photos": photos})
+        assert problem(answer, 422, "invalid_field")

@@ -1,0 +1,340 @@
+"""`placewise locate` without a server: times, cameras, GPX tracks, and what is written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+from typer.testing import CliRunner, Result
+
+from placewise.answers import Similar
+from services.cli.locate import command, exif_writers
+from services.cli.locate.folder import FolderPhoto, read_folder, read_gpx
+from services.cli.locate.sidecars import add_position, read_position
+from services.cli.main import build_app
+from shared.errors import InvalidRequest
+from shared.imaging.photo_header import read_photo_header
+from shared.ingest.photo_metadata import read_csv_manifest
+from tests.support.api_responses import PHOTO, SIMILAR
+from tests.support.photos import encoded, photo_image
+
+NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
+LATITUDE, LONGITUDE = 45.0691, 7.6853
+DEGREES_PER_M = 1 / 111_195
+
+
+def photo(
+    seconds: float | None,
+    north_m: float | None = None,
+    *,
+    camera: str = "X100",
+    offset: str | None = "+02:00",
+) -> bytes:
+    """A JPEG that was taken so many seconds after noon UTC; the camera's clock is two ahead."""
+    exif = Image.Exif()
+    exif[Base.Make], exif[Base.Model] = "Maker", camera
+    if seconds is not None:
+        clock = NOON + timedelta(hours=2, seconds=seconds)
+        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
+        if offset:
+            exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = offset
+    if north_m is not None:
+        gps = exif.get_ifd(IFD.GPSInfo)
+        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
+        gps[GPS.GPSLatitude] = (LATITUDE + north_m * DEGREES_PER_M, 0.0, 0.0)
+        gps[GPS.GPSLongitude] = (LONGITUDE, 0.0, 0.0)
+    return encoded(photo_image(1), "JPEG", exif=exif)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three photos of one camera, 20 s and 20 m apart; the second has no coordinates."""
+    root = tmp_path / "trip"
+    (root / "day 1").mkdir(parents=True)
+    (root / "1.jpg").write_bytes(photo(0, 0))
+    (root / "day 1" / "2.jpg").write_bytes(photo(20))
+    (root / "3.jpg").write_bytes(photo(40, 40))
+    (root / "4.jpg").write_bytes(photo(25, camera="another"))
+    return root
+
+
+def run(*arguments: str | Path, picture: bool = False) -> Result:
+    options = [] if picture else ["--no-picture"]
+    return CliRunner().invoke(build_app(["locate"]), ["locate", *map(str, arguments), *options])
+
+
+def proposals(*arguments: str | Path, picture: bool = False) -> dict[str, dict[str, Any]]:
+    result = run(*arguments, "--json", picture=picture)
+    assert result.exit_code == 0, result.output
+    return {each["filename"]: each for each in json.loads(result.stdout)["proposals"]}
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    files = [path for path in root.rglob("*") if path.is_file()]
+    return {str(path.relative_to(root)): path.read_bytes() for path in files}
+
+
+def write_gpx(path: Path, points: Sequence[tuple[float, float]]) -> Path:
+    """A track of (seconds, metres to the north)."""
+    rows = "".join(
+        f'<trkpt lat="{LATITUDE + north * DEGREES_PER_M}" lon="{LONGITUDE}">'
+        f"<time>{NOON + timedelta(seconds=seconds):%Y-%m-%dT%H:%M:%SZ}</time></trkpt>"
+        for seconds, north in points
+    )
+    namespace = "http://www.topografix.com/GPX/1/1"
+    path.write_text(f'<gpx xmlns="{namespace}"><trk><trkseg>{rows}</trkseg></trk></gpx>')
+    return path
+
+
+def test_a_photo_is_placed_between_its_neighbours_of_the_same_camera(folder: Path) -> None:
+    found = proposals(folder)
+    assert found.keys() == {"day 1/2.jpg", "4.jpg"}
+    position = found["day 1/2.jpg"]["position"]
+    assert position["latitude"] == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
+    assert position["longitude"] == pytest.approx(LONGITUDE, abs=1e-5)
+    assert position["reason"] == "taken 20 s after 1.jpg"
+    assert found["day 1/2.jpg"]["accepted"]
+    assert found["4.jpg"]["position"] is None, "another camera was perhaps elsewhere"
+
+
+def test_cameras_that_travelled_together_are_neighbours_of_each_other(folder: Path) -> None:
+    assert proposals(folder, "--together")["4.jpg"]["accepted"]
+    (folder / "5.jpg").write_bytes(photo(30, offset=None))
+    refusal = run(folder, "--together")
+    assert refusal.exit_code == 1
+    assert "unknown_time_zone" in refusal.stderr
+    assert "5.jpg" in refusal.stderr
+    found = proposals(folder, "--together", "--time-zone", "Europe/Paris")
+    assert found["5.jpg"]["captured_at"] == "2026-05-01T12:00:30+00:00"
+
+
+def test_times_of_one_camera_are_compared_without_a_zone_but_not_with_a_track(
+    tmp_path: Path,
+) -> None:
+    root = tmp_path / "trip"
+    root.mkdir()
+    for name, seconds, north in (("1.jpg", 0.0, 0.0), ("2.jpg", 5.0, None)):
+        (root / name).write_bytes(photo(seconds, north, offset=None))
+    assert proposals(root)["2.jpg"]["accepted"]
+    track = write_gpx(tmp_path / "track.gpx", [(0, 0), (60, 60)])
+    refusal = run(root, "--gpx", track)
+    assert (refusal.exit_code, "unknown_time_zone" in refusal.stderr) == (1, True)
+    assert "--time-zone" in refusal.stderr
+    found = proposals(root, "--gpx", track, "--time-zone", "+02:00")
+    assert "GPX track" in found["2.jpg"]["position"]["reason"]
+    assert "bad_time_zone" in run(root, "--time-zone", "Mars").stderr
+
+
+def test_a_clock_that_was_ahead_is_put_right(folder: Path, tmp_path: Path) -> None:
+    track = write_gpx(tmp_path / "track.gpx", [(-3600 + s, s) for s in range(0, 100, 10)])
+    assert proposals(folder, "--gpx", track)["4.jpg"]["position"] is None
+    found = proposals(folder, "--gpx", track, "--clock-offset", "3600")["4.jpg"]
+    expected = pytest.approx(LATITUDE + 25 * DEGREES_PER_M, abs=2e-5)
+    assert found["position"]["latitude"] == expected
+
+
+def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "track.gpx"
+    for text in ("no XML", "<gpx/>", '<gpx><trkpt lat="1"><time>2026-05-01</time></trkpt></gpx>'):
+        path.write_text(text)
+        with pytest.raises(InvalidRequest) as refusal:
+            read_gpx(path)
+        assert refusal.value.code == "bad_gpx"
+
+
+def test_a_sidecar_with_coordinates_counts_as_coordinates_of_the_photo(folder: Path) -> None:
+    (folder / "4.jpg.xmp").write_bytes(add_position(None, LATITUDE, LONGITUDE, 5.0))
+    photos = {each.name: each for each in read_folder(folder, None, 0.0)}
+    assert photos["4.jpg"].latitude == pytest.approx(LATITUDE, abs=1e-6)
+    assert proposals(folder).keys() == {"day 1/2.jpg"}
+
+
+def test_nothing_is_written_unless_it_is_requested(folder: Path) -> None:
+    before = contents(folder)
+    result = run(folder)
+    assert result.exit_code == 0
+    assert "Nothing is written" in result.stderr
+    assert contents(folder) == before
+
+
+def test_sidecars_are_written_for_accepted_proposals_and_undone(folder: Path) -> None:
+    before = contents(folder)
+    written = run(folder, "--write", "sidecar")
+    assert written.exit_code == 0, written.output
+    assert "1 files written: day 1/2.jpg.xmp" in written.stderr
+    position = read_position((folder / "day 1" / "2.jpg.xmp").read_bytes())
+    assert position == pytest.approx((LATITUDE + 20 * DEGREES_PER_M, LONGITUDE), abs=1e-5)
+    assert proposals(folder).keys() == {"4.jpg"}, "it has coordinates now"
+    undone = run(folder, "--undo")
+    assert (undone.exit_code, "1 removed" in undone.stderr) == (0, True)
+    assert contents(folder) == before
+    assert "nothing_to_undo" in run(folder, "--undo").stderr
+
+
+def test_a_proposal_that_is_not_probable_enough_is_not_written(folder: Path) -> None:
+    assert run(folder, "--accept", "0.9999", "--write", "sidecar").exit_code == 0
+    assert not list(folder.rglob("*.xmp"))
+
+
+@pytest.mark.parametrize("latitude", [LATITUDE, -LATITUDE])
+def test_exif_is_written_into_the_photo_and_undone(
+    folder: Path, latitude: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pyexiv2
+    for path, north in ((folder / "1.jpg", 0.0), (folder / "3.jpg", 40.0)):
+        path.with_suffix(".jpg.xmp").write_bytes(
+            add_position(None, latitude + north * DEGREES_PER_M, -LONGITUDE, 5.0)
+        )
+        path.write_bytes(photo(north))
+    before = contents(folder)
+    pixels = Image.open(folder / "day 1" / "2.jpg").tobytes()
+    written = run(folder, "--write", "exif")
+    assert written.exit_code == 0, written.output
+    with (folder / "day 1" / "2.jpg").open("rb") as file:
+        header = read_photo_header(file, 10**9)
+    assert (header.latitude, header.longitude) == pytest.approx(
+        (latitude + 20 * DEGREES_PER_M, -LONGITUDE), abs=1e-5
+    )
+    assert header.captured_at == NOON + timedelta(seconds=20)
+    assert Image.open(folder / "day 1" / "2.jpg").tobytes() == pixels
+    assert run(folder, "--undo").exit_code == 0
+    assert contents(folder) == before
+
+
+def test_a_photo_whose_exif_cannot_be_written_is_skipped_with_the_reason(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*position: object) -> None:
+        """Writes nothing."""
+
+    monkeypatch.setattr("services.cli.locate.writers.find_exif_writer", lambda: fail)
+    result = run(folder, "--write", "exif")
+    assert result.exit_code == 1
+    assert "can't be read back" in result.stderr
+    assert "0 files written" in result.stderr
+
+
+def test_a_missing_exif_writer_is_named_with_the_ways_to_get_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setattr(exif_writers, "find_spec", lambda name: None)
+    result = run(folder, "--write", "exif")
+    assert result.exit_code == 1
+    for words in ("no_exif_writer", "exiftool", "uv pip install '.[exif]'", "--write sidecar"):
+        assert words in " ".join(result.stderr.split())
+
+
+def test_exiftool_writes_where_it_is_installed(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "exiftool"
+    program.write_text(
+        f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path}/arguments\necho no >&2; exit 1'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr("shutil.which", lambda name: str(program))
+    result = run(folder, "--write", "exif")
+    assert (result.exit_code, "exiftool can't write the EXIF: no" in result.stderr) == (1, True)
+    arguments = (tmp_path / "arguments").read_text().splitlines()
+    assert "-GPSLatitudeRef=N" in arguments
+    assert f"-GPSLongitude={LONGITUDE:.5f}00" in arguments
+    assert arguments[-1].endswith("2.jpg")
+
+
+def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path) -> None:
+    assert run(folder, "--write", "csv").exit_code == 0
+    table = folder / "placewise-locations.csv"
+    entries = read_csv_manifest(table.read_bytes(), "table")
+    assert [entry.name for entry in entries] == ["day 1/2.jpg"]
+    assert entries[0].fields.keys() == {"latitude", "longitude"}
+    assert table.read_text().startswith("filename,latitude,longitude,place\n")
+    assert run(folder, "--write", "gpx").exit_code == 0
+    root = ElementTree.parse(folder / "placewise-locations.gpx").getroot()
+    point = root[0]
+    assert [child.text for child in point][:2] == ["2026-05-01T12:00:20Z", "day 1/2.jpg"]
+    assert float(point.attrib["lat"]) == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
+    assert run(folder, "--undo").exit_code == 0
+    assert not list(folder.glob("placewise-locations*"))
+
+
+def answer(**changes: Any) -> Similar:
+    similar = {**PHOTO, "latitude": LATITUDE, "longitude": LONGITUDE, "similarity_score": 0.9}
+    levels = [
+        {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": radius, "probability": 0.97}
+        for radius in (25.0, 100.0)
+    ]
+    estimate = {"reason": "", "levels": levels, "not_in_map_probability": 0.01}
+    return Similar(**{**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes})
+
+
+class ScriptedClient:
+    """Answers each search with the next answer, and remembers the filters."""
+
+    def __init__(self, *answers: Similar) -> None:
+        self.answers = list(answers)
+        self.boxes: list[str | None] = []
+
+    def similar(self, path: Path, top_k: int, box: str | None = None) -> Similar:
+        self.boxes.append(box)
+        return self.answers.pop(0)
+
+
+def search(*answers: Similar) -> tuple[Any, list[str | None]]:
+    client = ScriptedClient(*answers)
+    photos = [FolderPhoto("a.jpg", None, False, None, None, None, Path("a.jpg"))]
+    found = command._search_photos(client, photos)  # type: ignore[arg-type]
+    return found[0], client.boxes
+
+
+def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others() -> None:
+    unlocated = {**PHOTO, "latitude": None, "longitude": None, "place": None}
+    first = answer(similar_images=[{**unlocated, "similarity_score": 1.0}], estimate={"reason": ""})
+    found, boxes = search(first, answer())
+    assert boxes == [None, command.WITH_COORDINATES]
+    evidence = command.picture_evidence(found, 1000)
+    assert [circle.radius_m for circle in evidence.circles] == [25.0, 100.0]
+    assert evidence.similar[0].name == "street.jpg"
+    assert search(answer())[1] == [None]
+
+
+def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
+    unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
+    by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
+
+    class Connection:
+        def __enter__(self) -> Any:
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            """Nothing to close."""
+
+        def stats(self) -> Any:
+            return type("Stats", (), {"searchable_images": 10})
+
+        def similar(self, path: Path, **options: object) -> Similar:
+            return by_label
+
+    monkeypatch.setattr(command, "connect", lambda *options: Connection())
+    found = proposals(folder, picture=True)["4.jpg"]
+    assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
+    result = run(folder, "--write", "gpx", picture=True)
+    assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
+    assert run(folder, "--write", "csv", picture=True).exit_code == 0
+    assert "4.jpg,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
+
+
+def test_the_table_is_tab_separated_without_a_terminal(folder: Path) -> None:
+    rows = [line.split("\t") for line in run(folder).stdout.splitlines()]
+    assert rows[0] == ["photo", "latitude", "longitude", "within", "prob.", "reason"]
+    assert rows[1][0] == "4.jpg"
+    assert rows[1][5] == "nothing is known about its place"
+    assert rows[2][3:] == ["100 m", rows[2][4], "taken 20 s after 1.jpg"]
