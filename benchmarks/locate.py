@@ -44,6 +44,7 @@ from shared.geotagging.evidence import (
     interpolate_position,
 )
 from shared.geotagging.fusion import propose_position
+from shared.tracks.motion import MOTION_MODELS
 
 START = datetime(2026, 5, 1, tzinfo=UTC)
 SECONDS_A_FRAME = 6.0  # of 6 to 10 m
