@@ -92,7 +92,11 @@ def test_a_ride_is_followed_frame_by_frame(street: Service, catalog: Catalog) ->
     assert (first["status"], first["state"], first["version"]) == ("pending", None, 1)
     assert read(street, track_id)["pending"] == 1
     for number in (1, 2, 3):  # a single one of five photos does not stand out enough
-        odometry = {"distance_m": METRES_APART, "distance_accuracy_m": 2, "turn_degrees": 10}
+        odometry: dict[str, Any] = {
+            "distance_m": METRES_APART,
+            "distance_accuracy_m": 2,
+            "turn_degrees": 10,
+        }
         send(street, track_id, number, **odometry, turn_accuracy_degrees=2)
     street.drain()
     track = read(street, track_id)
