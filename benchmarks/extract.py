@@ -188,11 +188,14 @@ def measure(
     extractor: str,
     photos: int,
     device: str,
-    batch: int,
+    batches: Sequence[int],
     precision: Literal["auto", "float32", "bfloat16"],
     rounds: int,
 ) -> Report:
     """Run `rounds` of `photos` with both implementations.
+
+    With several maximum batch sizes, the published one, which takes one photo at a time, is
+    measured beside the largest.
 
     Only `anyloc-` extractors with hard VLAD are published and compared; others are only measured.
     """
@@ -203,13 +206,24 @@ def measure(
         measured = BenchmarkedExtractor.of(extractor, device, Path(folder))
         chosen = choose_precision(precision, measured.config, measured.device)
         report = Report(f"{measured.title}, {chosen}")
-        with _open_pipeline(measured, chosen, batch, made[:FIT_PHOTOS]) as pipeline:
-            _run_rounds(report, progress, measured, pipeline, files, rounds)
+        for number, batch in enumerate(batches):
+            with _open_pipeline(measured, chosen, batch, made[:FIT_PHOTOS]) as pipeline:
+                suffix = f", batches of {batch}" if len(batches) > 1 else ""
+                _run_rounds(
+                    report,
+                    progress,
+                    measured,
+                    pipeline,
+                    files,
+                    rounds,
+                    suffix=suffix,
+                    compare=number == len(batches) - 1,
+                )
     report.details = {
         "random_weights": measured.random,
         "precision": chosen,
         "photos": photos,
-        "batch": batch,
+        "batch": batches[0] if len(batches) == 1 else list(batches),
         "rounds": rounds,
         "torch": torch.__version__,
     }
@@ -223,12 +237,15 @@ def _run_rounds(
     pipeline: ExtractionPipeline,
     files: Sequence[bytes],
     rounds: int,
+    *,
+    suffix: str,
+    compare: bool,
 ) -> None:
     bar = progress.add_task("rounds", total=rounds)
     pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
     ours, published = RoundTimings(), RoundTimings()
     reference, expected = None, None
-    if measured.config.depth is not None and measured.config.aggregator == "vlad":
+    if compare and measured.config.depth is not None and measured.config.aggregator == "vlad":
         assert pipeline.centres is not None
         reference = ReferenceAnyLoc(measured, pipeline.centres.array)
         reference.describe(files[:1])
@@ -242,9 +259,9 @@ def _run_rounds(
             expected = published.run(partial(reference.describe, files))
         progress.advance(bar)
     rate = len(files) / statistics.median(ours.seconds)
-    report.add("this pipeline", rate, "photos/s")
+    report.add(f"this pipeline{suffix}", rate, "photos/s")
     if measured.device.type == "cpu":
-        report.add("CPU time of a photo", ours.cpu_milliseconds(len(files)), "ms")
+        report.add(f"CPU time of a photo{suffix}", ours.cpu_milliseconds(len(files)), "ms")
     if expected is not None:
         report.add("as published", len(files) / statistics.median(published.seconds), "photos/s")
         if measured.device.type == "cpu":
@@ -259,8 +276,8 @@ def _run_rounds(
     ceiling = _matmul_flops_per_second(measured.device, pipeline.made.precision)
     report.add("forward pass of a photo", flop / 1e9, "GFLOP")
     report.add("matrix products on this device", ceiling / 1e9, "GFLOP/s")
-    report.add("share of it that this pipeline reaches", rate * flop / ceiling)
-    report.add("peak memory", peak_bytes / 1e6, "MB")
+    report.add(f"share of it that this pipeline reaches{suffix}", rate * flop / ceiling)
+    report.add(f"peak memory{suffix}", peak_bytes / 1e6, "MB")
 
 
 class ExtractionPipeline:

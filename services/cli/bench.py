@@ -87,7 +87,7 @@ def extract(
     photos: Annotated[int, typer.Option(min=1)] = 32,
     device: DeviceOption = "auto",
     precision: Annotated[str, typer.Option(help="Precision: auto, float32 or bfloat16.")] = "auto",
-    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
+    batch: Annotated[str, typer.Option(help="Maximum batch sizes, comma-separated.")] = "16",
     rounds: Annotated[int, typer.Option(min=1, help="Passes over all photos per method.")] = 3,
     as_json: JsonOption = False,
 ) -> None:
@@ -104,7 +104,7 @@ def extract(
         photos=photos,
         device=device,
         precision=precision,
-        batch=batch,
+        batches=_parse_integers(batch),
         rounds=rounds,
     )
 

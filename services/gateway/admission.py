@@ -23,6 +23,7 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import Depends, Request
+from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Caller, get_caller
 from services.gateway.dependencies import GatewayDep, get_map_name
@@ -220,7 +221,7 @@ class AdmissionControl:
             return measure_queue_depth(session, limit)
 
 
-def get_admission_control(request: Request) -> AdmissionControl:
+async def get_admission_control(request: Request) -> AdmissionControl:
     """Dependency that returns the admission control of the application."""
     admission: AdmissionControl = request.app.state.admission
     return admission
@@ -237,10 +238,12 @@ def _admit_query(admission: AdmissionDep) -> None:
     admission.admit_query()
 
 
-def _check_photo_quota(request: Request, gateway: GatewayDep) -> None:
+async def _check_photo_quota(request: Request, gateway: GatewayDep) -> None:
     key_limit = get_photo_limit(get_caller(request), gateway.settings)
     if key_limit is not None:
-        request.app.state.photo_quota.check(*key_limit)
+        quota: PhotoQuota = request.app.state.photo_quota
+        key_id, limit = key_limit
+        await run_in_threadpool(quota.check, key_id, limit)
 
 
 def reserve_photo_quota(request: Request, settings: Settings) -> AbstractContextManager[None]:

@@ -294,7 +294,7 @@ def get_caller(request: Request) -> Caller:
     return caller
 
 
-def _require_scope(
+async def _require_scope(
     request: Request,
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],

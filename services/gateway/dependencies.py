@@ -246,7 +246,7 @@ class GatewayContext:
         object.__setattr__(self, "track_frames", track_frames)
 
 
-def get_gateway_context(request: Request) -> GatewayContext:
+async def get_gateway_context(request: Request) -> GatewayContext:
     gateway: GatewayContext = request.app.state.gateway
     return gateway
 
@@ -316,11 +316,13 @@ def get_map_name(request: Request) -> str:
     return request.query_params.get("map", DEFAULT_MAP)
 
 
-def _accept_no_parameters(_params: Annotated[MapParams, Query(include_in_schema=False)]) -> None:
+async def _accept_no_parameters(
+    _params: Annotated[MapParams, Query(include_in_schema=False)],
+) -> None:
     pass
 
 
-def _require_all_maps(request: Request) -> None:
+async def _require_all_maps(request: Request) -> None:
     get_caller(request).check_all_maps()
 
 

@@ -112,6 +112,9 @@ class IdempotentRequest:
         Deletes the received file from `store` if the request is refused or was already executed.
         """
 
+        if self._key is None:
+            return
+
         def claim() -> None:
             content = [received.filename, received.sha256, received.fields]
             with delete_if_refused(store, received.key):
@@ -205,11 +208,19 @@ class IdempotentRequest:
             store_response(session, self._token, stored)
             self._response_stored = True
 
-    def release_key(self) -> None:
+    async def claim_body(self, body: bytes) -> None:
+        """Claim the key for a request with a JSON body or none."""
+        if self._key is not None:
+            await run_in_threadpool(self.claim_key, hashlib.sha256(body).hexdigest())
+
+    async def release_key(self) -> None:
         """Release the key if no response was stored under it."""
         if self._token is not None and not self._response_stored:
-            with self._gateway.catalog.write() as session:
-                release_idempotency_key(session, self._token)
+            await run_in_threadpool(self._release, self._token)
+
+    def _release(self, token: UUID) -> None:
+        with self._gateway.catalog.write() as session:
+            release_idempotency_key(session, token)
 
 
 @contextlib.contextmanager
@@ -236,15 +247,14 @@ async def _idempotent_form_request(
         await run_in_threadpool(idempotent.store_refusal, error)
         raise
     finally:
-        await run_in_threadpool(idempotent.release_key)
+        await idempotent.release_key()
 
 
 async def _idempotent_request(
     request: Request, idempotent: Annotated[IdempotentRequest, Depends(_idempotent_form_request)]
 ) -> IdempotentRequest:
     """Dependency for requests with a JSON body or none; claims the key."""
-    body = await request.body()
-    await run_in_threadpool(idempotent.claim_key, hashlib.sha256(body).hexdigest())
+    await idempotent.claim_body(await request.body())
     return idempotent
 
 

@@ -170,7 +170,7 @@ class WorkerHeartbeat:
         versions = status.loaded, status.missing
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
-        with self._catalog.write() as session:
+        with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
             upsert_search_worker(
                 session, self.id, self._name, self._url, self._worker.shard, *versions
             )

@@ -43,7 +43,7 @@ from services.steward.tasks.model_changes import (
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.schema import sqlite_file
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
@@ -112,6 +112,8 @@ class PeriodicTask:
     """Whether it can take so long that the others must not wait for it."""
     next_run: float = field(default=0.0)
     """By `time.monotonic`."""
+    commits_seen: int = field(default=-1)
+    """`CommitSignal.count` before its last run."""
 
 
 class Scheduler:
@@ -130,6 +132,7 @@ class Scheduler:
         metrics: StewardMetrics | None = None,
     ) -> None:
         self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
+        self._catalog = catalog
         self._outage = OutageLog("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         merge_retries = ReadRetries()
@@ -244,19 +247,24 @@ class Scheduler:
             thread.start()
         shared = [task for task in self.tasks if not task.own_thread]
         while not stop.is_set():
+            commits = self._catalog.commits.count
             for task in shared:
                 if time.monotonic() >= task.next_run and not stop.is_set():
                     self._run_task(task)
                     self._heartbeat.beat()
+                    task.commits_seen = commits
             stop.wait(SCHEDULER_TICK_SECONDS)
+            if self._catalog.is_sqlite and all(task.commits_seen == commits for task in shared):
+                self._catalog.wait_for_commit(stop, commits, IDLE_SECONDS)
         self._run_task(self._journal)
         for thread in threads:
             thread.join()
 
     def _run_alone(self, task: PeriodicTask, stop: threading.Event) -> None:
+        poll = ChangePoll(self._catalog)
         while not stop.is_set():
             self._run_task(task)
-            stop.wait(task.interval_seconds)
+            poll.wait(stop, task.interval_seconds)
 
     def _run_task(self, task: PeriodicTask) -> None:
         started, outcome = time.monotonic(), "done"

@@ -92,7 +92,7 @@ def process_heartbeat(
     def send_heartbeats() -> None:
         while True:
             try:
-                with catalog.write() as session:
+                with catalog.write(is_heartbeat=True) as session:
                     _upsert_process(session, process_id, role, name, read_state())
                 outage.record_success()
             except SQLAlchemyError as error:

@@ -38,8 +38,8 @@ from sqlalchemy.orm import Session
 from shared.catalog.batch_items import has_batch_items
 from shared.catalog.database.base import db_now
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import Job, JobKind, JobState
+from shared.catalog.database.session import IDLE_SECONDS, Catalog
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs
@@ -118,11 +118,21 @@ class JobRunner:
     ) -> None:
         """Repeat `work`, which returns whether there were jobs, until `stop` is set.
 
-        Without jobs, `wait` waits for new ones, at most the given seconds.
+        Without jobs, `wait` waits for new ones, at most the given seconds: long in an embedded
+        server without any job, because nothing but a commit of this process can bring one.
         """
         while not stop.is_set():
             if self.run_once(work, stop) is False:
-                wait(IDLE_POLL_SECONDS)
+                is_idle = self.catalog.is_sqlite and self.run_once(self._has_none_unfinished, stop)
+                wait(IDLE_SECONDS if is_idle else IDLE_POLL_SECONDS)
+
+    def _has_none_unfinished(self) -> bool:
+        """Return whether no job can become claimable by the passing of time."""
+        unfinished = select(Job.id).where(
+            Job.state.in_(UNFINISHED_STATES), Job.kind.in_(self.kinds), Job.waiting_for.is_(None)
+        )
+        with self.catalog.read() as session:
+            return session.scalar(unfinished.limit(1)) is None
 
     def run_once(self, work: Callable[[], Result], stop: threading.Event) -> Result | None:
         """Run `work`; pause and return None if the catalog was unavailable.

@@ -41,7 +41,7 @@ MapNamePath = Annotated[
 ]
 
 
-def _check_map(request: Request, name: MapNamePath) -> None:
+async def _check_map(request: Request, name: MapNamePath) -> None:
     get_caller(request).check_map(name)
 
 

@@ -44,7 +44,7 @@ from shared.catalog.batch_items import (
     sync_item_states,
     update_batch_progress,
 )
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.jobs import WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
@@ -62,7 +62,7 @@ from shared.ingest.validation import (
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import JobInterrupted, JobRunner
+from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner
 from shared.jobs.transitions import make_waiting_jobs_claimable, release_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.keys import new_original_key
@@ -264,7 +264,12 @@ class BatchWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run batches until `stop` is set."""
-        self._runner.run(lambda: self.run_next(stop), stop, stop.wait)
+        poll = ChangePoll(self._catalog)
+        self._runner.run(
+            lambda: self.run_next(stop),
+            stop,
+            lambda seconds: poll.wait(stop, IDLE_POLL_SECONDS, seconds),
+        )
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run a slice of the next batch; False when there is none."""

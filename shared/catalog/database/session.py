@@ -9,6 +9,7 @@ import contextlib
 import copy
 import logging
 import random
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -96,6 +97,25 @@ RETRY_BASE_SECONDS = 0.05  # doubled after each attempt
 T = TypeVar("T")
 
 
+class CommitSignal:
+    """Counts the commits of this process that changed rows, and wakes threads that wait for one."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self.count = 0
+
+    def notify(self) -> None:
+        """Count a commit."""
+        with self._changed:
+            self.count += 1
+            self._changed.notify_all()
+
+    def wait(self, count: int, seconds: float) -> None:
+        """Wait until the count differs from `count`, at most `seconds`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.count != count, seconds)
+
+
 class Catalog:
     """Opens sessions on one database.
 
@@ -128,6 +148,7 @@ class Catalog:
         self._sessions = sessionmaker(expire_on_commit=False)
         # SQLite has one writer: a lock is fair and does not poll, unlike SQLite's busy handler.
         self._sqlite_writer = threading.Lock()
+        self.commits = CommitSignal()
 
     def with_timeouts(self, limits: TransactionTimeouts) -> Catalog:
         """Return a catalog on the same connection pool with other timeouts."""
@@ -147,12 +168,24 @@ class Catalog:
             yield session
 
     @contextlib.contextmanager
-    def write(self) -> Iterator[Session]:
-        """Open a session that commits at the end of the block. PostgreSQL: READ COMMITTED."""
-        writer_lock = self._sqlite_writer if self.is_sqlite else contextlib.nullcontext()
-        with writer_lock, self._session(placewise_write=True) as session:
+    def write(self, *, is_heartbeat: bool = False) -> Iterator[Session]:
+        """Open a session that commits at the end of the block. PostgreSQL: READ COMMITTED.
+
+        A heartbeat ends no wait of a `ChangePoll`: nobody has anything to do because of it.
+        """
+        if not self.is_sqlite:
+            with self._session(placewise_write=True) as session:
+                yield session
+                session.commit()
+            return
+        with self._sqlite_writer, self._session(placewise_write=True) as session:
+            before = _changed_rows(session)
             yield session
+            session.flush()
+            changed = _changed_rows(session) != before
             session.commit()
+        if changed and not is_heartbeat:
+            self.commits.notify()
 
     def run(self, unit: Callable[[Session], T]) -> T:
         """Run `unit` in a write transaction, commit, and return its result.
@@ -176,6 +209,12 @@ class Catalog:
         with self.write() as session:
             return unit(session)
 
+    def wait_for_commit(self, stop: threading.Event, count: int, seconds: float) -> None:
+        """Wait until `commits.count` differs from `count`, or `stop` is set; at most `seconds`."""
+        deadline = time.monotonic() + seconds
+        while self.commits.count == count and not stop.is_set() and time.monotonic() < deadline:
+            self.commits.wait(count, STOP_CHECK_SECONDS)
+
     def close(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
@@ -184,6 +223,40 @@ class Catalog:
         return self._sessions(
             bind=self.engine.execution_options(placewise_limits=self.limits, **options)
         )
+
+
+def _changed_rows(session: Session) -> int:
+    """Rows that the session's SQLite connection has changed since it was opened."""
+    connection: sqlite3.Connection = session.connection().connection.driver_connection  # type: ignore[assignment]
+    return connection.total_changes
+
+
+# The longest pause of a loop without changes: what depends on time alone, such as an expired lease,
+# is seen then.
+IDLE_SECONDS = 10.0
+STOP_CHECK_SECONDS = 0.5
+
+
+class ChangePoll:
+    """Paces a loop that looks for work in the catalog.
+
+    SQLite is written by one process only: without a commit since the last look, the loop pauses up
+    to IDLE_SECONDS. PostgreSQL, which others write to, is polled at the loop's interval.
+    """
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+        self._seen = -1
+
+    def wait(
+        self, stop: threading.Event, interval_seconds: float, longest_seconds: float = IDLE_SECONDS
+    ) -> None:
+        """Pause after a look until the next one, at least for the interval unless `stop` is set."""
+        stop.wait(interval_seconds)
+        if self._catalog.is_sqlite:
+            idle_seconds = longest_seconds - interval_seconds
+            self._catalog.wait_for_commit(stop, self._seen, idle_seconds)
+        self._seen = self._catalog.commits.count
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:

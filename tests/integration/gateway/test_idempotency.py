@@ -296,7 +296,7 @@ def test_a_gateway_that_crashed_blocks_its_key_no_longer_than_its_lease(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a killed process leaves: a claimed key, and nothing after it."""
-    monkeypatch.setattr(once.IdempotentRequest, "release_key", lambda self: None)
+    monkeypatch.setattr(once.IdempotentRequest, "_release", lambda self, token: None)
     with monkeypatch.context() as dying:
         dying.setattr(
             once.IdempotentRequest,

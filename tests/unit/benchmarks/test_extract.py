@@ -40,7 +40,7 @@ def test_reference_makes_the_same_descriptors_by_the_whole_network(
         extractor="anyloc-vits14:layer=1",
         photos=2,
         device="cpu",
-        batch=2,
+        batches=[2],
         precision="auto",
         rounds=1,
     )
@@ -63,7 +63,7 @@ def test_other_extractors_are_measured_without_a_reference(
         extractor="test-tiny-vlad",
         photos=2,
         device="cpu",
-        batch=2,
+        batches=[2],
         precision="float32",
         rounds=1,
     )

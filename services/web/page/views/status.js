@@ -80,13 +80,13 @@ function drawSearches(card, searches) {
   }
   const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number wide-only" }, "Best"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
       const [words, tone] = verdict[one.in_map] ?? ["Open", ""];
       return h("tr", {},
         h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
         h("td", {}, h("span", { class: `chip ${tone}` }, words)),
-        h("td", { class: "number" }, one.best_score === null ? "–" : score(one.best_score)),
+        h("td", { class: "number wide-only" }, one.best_score === null ? "–" : score(one.best_score)),
         h("td", { class: "number wide-only" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, time(one.searched_at)));
     })))));
 }
