@@ -28,9 +28,13 @@ from services.cli.output import Table, print_table, progress_bar
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.ranking import describe_evaluation_set
-from shared.evaluation.sequences import SequenceMap, own_neighbours, prepare_map, split_sequences
+from shared.evaluation.sequences import split_sequences
 from shared.geodesy import distance_m
 from shared.geotagging.evidence import (
     KnownPosition,
@@ -51,8 +55,52 @@ POINT_NOISE_M = 5.0
 CLOCK_ERROR_SECONDS = 10.0
 RADIUS_M = 100.0
 CERTAINTY = 0.95
+OWN_PHOTOS_SAMPLED = 1000
+SCHEME = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0, 500.0, 2000.0))
 DEGREES_PER_M = 360 / 40_030_000
 SOURCES = ("picture", "picture, neighbours", "picture, neighbours, GPX", "neighbours", "GPX")
+
+
+@dataclass(frozen=True)
+class DescribedMap:
+    """The photos of a map, with descriptors and the place model that is fitted to them."""
+
+    photos: Sequence[DatasetPhoto]
+    locations: Sequence[PhotoLocation]
+    rows: NDArray[np.float32]
+    """(n, D), of unit length"""
+    model: PlaceModel
+
+    @classmethod
+    def of(cls, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32]) -> DescribedMap:
+        """Fit the place model on up to OWN_PHOTOS_SAMPLED of the photos, as an evaluation does."""
+
+        def rank(photo: int) -> IndexRanking:
+            scores = (rows @ rows[photo]).astype(np.float64)
+            order = np.argsort(-scores, kind="stable")
+            order = order[order != photo]
+            return order, scores[order]
+
+        locations = [PhotoLocation(each.latitude, each.longitude, each.place) for each in photos]
+        times = [photo.captured_at for photo in photos]
+        sampler = OwnPhotoSampler(locations, times, SCHEME, SCHEME.radii_m[0], rank)
+        known = np.flatnonzero([location.is_known for location in locations])
+        sampled = np.random.default_rng(0).permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
+        spread = sampler.spread(sampled)
+        fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), SCHEME, spread)
+        return cls(photos, locations, rows, fitted.model)
+
+    def rank(self, scores: NDArray[np.float32]) -> list[int]:
+        """Return the first EVIDENCE_DEPTH photos for their (n,) scores."""
+        best: list[int] = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
+        return best
+
+    def neighbours(self, photo: int) -> list[RankedPhoto]:
+        """Return the ranking of a photo of the map, without it."""
+        scores = self.rows @ self.rows[photo]
+        scores[photo] = -np.inf
+        order = [each for each in self.rank(scores) if each != photo]
+        return [RankedPhoto(float(scores[each]), self.locations[each]) for each in order]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +129,7 @@ def main() -> None:
 
 def describe_rides(
     city: Path,
-) -> tuple[SequenceMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
+) -> tuple[DescribedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
     """Describe a city as a new map would be, and return its rides with their (frames, n) scores."""
     name = next(each for each in evaluation_set_names(city) if each.endswith("_rides"))
     evaluation_set = open_evaluation_set(city, name)
@@ -92,7 +140,7 @@ def describe_rides(
         )
         with describe_evaluation_set(describer.describe, evaluation_set) as matrices:
             database, queries = (np.array(rows) for rows in matrices)
-    map_ = prepare_map(evaluation_set, database, MOTION_MODELS["walk"])
+    map_ = DescribedMap.of(evaluation_set.database, database)
     rides = []
     for members in split_sequences(evaluation_set.queries):
         frames = [evaluation_set.queries[member] for member in members]
@@ -100,14 +148,12 @@ def describe_rides(
     return map_, rides
 
 
-def picture_of(map_: SequenceMap, scores: NDArray[np.float32]) -> PictureEvidence:
+def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEvidence:
     """Return what the search of the map says about a frame, as `placewise locate` reads it."""
-    assert map_.model is not None
-    order = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
+    order = map_.rank(scores)
     ranking = [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
-    radius_m = map_.scheme.radii_m[0]
-    neighbours = own_neighbours(map_, order[0])
-    estimate = map_.model.estimate(ranking, neighbours, map_.scheme, CERTAINTY, radius_m)
+    neighbours = map_.neighbours(order[0])
+    estimate = map_.model.estimate(ranking, neighbours, SCHEME, CERTAINTY, SCHEME.radii_m[0])
     assert estimate is not None
     return PictureEvidence(
         [

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 from uuid import UUID
 
@@ -37,7 +37,8 @@ from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
-from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.background import subtract_background
+from shared.search_api.protocol import RowReference, SearchRequest, SearchResponse, SearchStatus
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CACHED_ROWS = 64  # 25 MB at 98,304 dimensions
+BACKGROUND_CACHE_BYTES = 50_000_000  # successive frames of a track share their background
 
 
 class QueryRowReader:
@@ -60,6 +62,9 @@ class QueryRowReader:
         self._store = store
         self._lock = threading.Lock()
         self._cache: LRUCache[tuple[str, int], Row] = LRUCache(CACHED_ROWS)
+        self._background: LRUCache[RowReference, Row] = LRUCache(
+            BACKGROUND_CACHE_BYTES, getsizeof=lambda row: row.nbytes
+        )
 
     def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
         """Return the (dimension,) row that a request refers to.
@@ -77,6 +82,25 @@ class QueryRowReader:
             raise reference_expired_error(f"row {request.row} of {request.object_key}")
         row: Row = chunk.rows[request.row]
         return row
+
+    def read_background(self, references: Sequence[RowReference]) -> list[Row]:
+        """Return the rows of a background that still exist."""
+        rows = []
+        for reference in references:
+            with self._lock:
+                row = self._background.get(reference)
+            if row is None:
+                try:
+                    row = read_row(self._store, reference.object_key, reference.row)
+                except (NotFound, IndexError):
+                    continue  # expired
+                except ValueError as error:
+                    log.warning("%s is left out of the background: %s", reference, error)
+                    continue
+                with self._lock:
+                    self._background[reference] = row
+            rows.append(row)
+        return rows
 
     def _read_cached(self, object_key: str, row: int) -> Row:
         cache_key = (object_key, row)
@@ -218,6 +242,9 @@ class SearchWorker:
         """Return the most similar rows of this shard; see `SearchRequest`."""
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._query_rows.read_query(snapshot, request)
+        if request.background:
+            background = self._query_rows.read_background(request.background)
+            query = subtract_background(query, background)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
         options = SearchOptions(
             k=request.k,

@@ -11,6 +11,7 @@ inserted there and the later ones recomputed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 from uuid import UUID
@@ -153,6 +154,32 @@ def last_belief(session: Session, track_id: UUID, before: datetime) -> bytes | N
         .order_by(TrackFrame.captured_at.desc())
         .limit(1)
     )
+
+
+def _applied_before(frame: TrackFrame) -> Condition:
+    return sa.and_(
+        TrackFrame.track_id == frame.track_id,
+        TrackFrame.captured_at < frame.captured_at,
+        TrackFrame.state.is_not(None),
+    )
+
+
+def count_applied_before(session: Session, frame: TrackFrame) -> int:
+    """Count the applied frames of the same track before a frame; failed ones do not count."""
+    return count_rows(session, sa.select(TrackFrame.id).where(_applied_before(frame)))
+
+
+def applied_jobs_from(session: Session, frame: TrackFrame, first: int) -> Sequence[UUID]:
+    """Return the jobs of the applied frames before a frame, from number `first` on, counted from 0.
+
+    They are in the order of their times.
+    """
+    return session.scalars(
+        sa.select(TrackFrame.job_id)
+        .where(_applied_before(frame))
+        .order_by(TrackFrame.captured_at)
+        .offset(first)
+    ).all()
 
 
 def drop_old_beliefs(session: Session, track_id: UUID) -> None:

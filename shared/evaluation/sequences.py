@@ -1,7 +1,8 @@
 """Evaluation of tracks on data sets with sequences: single frames, SeqSLAM and the filter.
 
 A frame is right if the photo that it is matched to is a positive of the set's rule. Frames without
-positives were taken outside the map; there every answer is wrong. All methods use the same scores.
+positives were taken outside the map; there every answer is wrong. All methods use the same
+descriptors; the filter searches with the earlier frames as the background, as the API does.
 """
 
 from __future__ import annotations
@@ -18,28 +19,26 @@ from numpy.typing import NDArray
 from shared.datasets.dataset import DatasetPhoto, EvaluationSet
 from shared.datasets.ground_truth import parse_rule
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.places.fit import fit_place_model
-from shared.evaluation.places.levels import LevelScheme, photos_inside
-from shared.evaluation.places.probability import PlaceModel
-from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.seqslam import seqslam_matches
+from shared.search_api.background import background_frames, subtract_background
 from shared.tracks.belief import Belief, TrackStatus
-from shared.tracks.evidence import FrameEvidence, frame_evidence
+from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
 from shared.tracks.motion import MotionModel
 from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
 
 Rows = NDArray[np.float32]
 
-HITS = 200
-"""of a frame, as in the API"""
 COARSE_RADII_M = (100.0, 500.0, 2000.0)
-OWN_PHOTOS_SAMPLED = 1000
 JUMP_M = 100.0
 """between two frames, from which on the camera was carried away"""
 NOTICE_FRAMES = 20
 """frames after which a track outside the map must be lost"""
+KIDNAPS = 6
+"""of a sequence"""
+FOUND_FRAMES = 40
+"""frames after which a track that was carried away must be right again"""
 MAX_PRECISION_ERROR = 0.01
 SEQSLAM_CELL_M = 12.0
 
@@ -70,22 +69,16 @@ class SequenceMap:
     rows: Rows
     """(n, D), of unit length"""
     graph: ArrayPhotoGraph
-    locations: Sequence[PhotoLocation]
     scheme: LevelScheme
-    model: PlaceModel | None
-    """None without coordinates and labels"""
 
 
-def prepare_map(
-    evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel, seed: int = 0
-) -> SequenceMap:
-    """Build the photo graph, and fit the place model on the map's own photos.
+def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) -> SequenceMap:
+    """Build the photo graph.
 
     Args:
         evaluation_set: The set; its rule is the tolerance.
         rows: (n, D) descriptors of its database photos, of unit length.
         motion: For the distance between photos without coordinates.
-        seed: Of the sample of own photos.
     """
     photos = evaluation_set.database
     rule = parse_rule(evaluation_set.rule.removesuffix(" m"))
@@ -106,36 +99,7 @@ def prepare_map(
         )
         for number, photo in enumerate(photos)
     )
-    locations = [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos]
-    model = None
-    if any(location.is_known for location in locations):
-        model = _fit_model(photos, locations, rows, scheme, finest, seed)
-    return SequenceMap(photos, rows, ArrayPhotoGraph(table), locations, scheme, model)
-
-
-def _fit_model(
-    photos: Sequence[DatasetPhoto],
-    locations: Sequence[PhotoLocation],
-    rows: Rows,
-    scheme: LevelScheme,
-    radius_m: float,
-    seed: int,
-) -> PlaceModel:
-    def rank(photo: int) -> IndexRanking:
-        scores = (rows @ rows[photo]).astype(np.float64)
-        order = np.argsort(-scores, kind="stable")
-        order = order[order != photo]
-        return order, scores[order]
-
-    sampler = OwnPhotoSampler(
-        locations, [photo.captured_at for photo in photos], scheme, radius_m, rank
-    )
-    known = np.flatnonzero([location.is_known for location in locations])
-    rng = np.random.default_rng(seed)
-    sampled = rng.permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
-    spread = sampler.spread(sampled)
-    fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), scheme, spread)
-    return fitted.model
+    return SequenceMap(photos, rows, ArrayPhotoGraph(table), scheme)
 
 
 def split_sequences(queries: Sequence[DatasetPhoto]) -> list[list[int]]:
@@ -170,9 +134,7 @@ def evaluate_sequence(
     """
     queries = [evaluation_set.queries[index] for index in members]
     scores = rows @ map_.rows.T
-    evidence = [
-        frame_of(map_, time_, row) for time_, row in zip(_times(queries), scores, strict=True)
-    ]
+    evidence = frames_of(map_, _times(queries), rows)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     states = []
@@ -203,41 +165,74 @@ def evaluate_sequence(
     return results, seconds
 
 
-def frame_of(map_: SequenceMap, time_: datetime, scores: Rows) -> FrameEvidence:
-    """Return the evidence of a frame from its scores, with the map's place model if it has one.
+def evaluate_kidnapped(
+    map_: SequenceMap,
+    evaluation_set: EvaluationSet,
+    members: Sequence[int],
+    rows: Rows,
+    motion: MotionModel,
+    every: int,
+    seed: int = 0,
+) -> list[int | None]:
+    """Carry the camera of a sequence to another place of it after every so many frames.
+
+    The frames outside the map are left out; the sequence goes on from its beginning at its end.
 
     Args:
         map_: The map.
-        time_: When the frame was taken.
-        scores: (n,) similarities to the map's photos.
+        evaluation_set: The set.
+        members: Query indices in the order of frames.
+        rows: (len(members), D) descriptors of these queries, of unit length.
+        motion: The motion model.
+        every: Number of frames between two kidnappings.
+        seed: Of the places.
+
+    Returns:
+        For each of KIDNAPS, the frames until the place is tracked and right; None if it is not
+        before the next one.
     """
-    count = min(HITS, len(scores))
-    order = np.argpartition(-scores, count - 1)[:count]
-    order = order[np.argsort(-scores[order], kind="stable")]
-    ids, found = [str(photo) for photo in order], scores[order].astype(np.float64).tolist()
-    not_in_map, best_place = None, None
-    if map_.model is not None:
-        ranking = [
-            RankedPhoto(score, map_.locations[p]) for p, score in zip(order, found, strict=True)
+    inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
+    if len(inside) < 2:
+        return []
+    starts = np.random.default_rng(seed).integers(len(inside), size=KIDNAPS + 1).tolist()
+    frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
+    times = _times([evaluation_set.queries[index] for index in members])
+    interval = (times[-1] - times[0]) / (len(times) - 1)
+    evidence = frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
+    track_filter = TrackFilter(map_.graph, motion, map_.scheme)
+    belief: Belief | None = None
+    found: list[int | None] = [None] * (KIDNAPS + 1)
+    for number, frame in enumerate(evidence):
+        belief = track_filter.advance(belief, frame)
+        segment, since = divmod(number, every)
+        if found[segment] is None and belief.status == "tracking":
+            photo = _photo(track_filter.state(belief).photo)
+            if photo in evaluation_set.positives[members[frames[number]]]:
+                found[segment] = since
+    return found[1:]  # the first is no kidnapping
+
+
+def frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
+    """Return the evidence of the frames of a sequence.
+
+    Args:
+        map_: The map.
+        times: (n,) when the frames were taken.
+        rows: (n, D) their descriptors, of unit length.
+    """
+    centred = np.stack(
+        [
+            subtract_background(row, rows[background_frames(number)])
+            for number, row in enumerate(rows)
         ]
-        estimate = map_.model.estimate(
-            ranking, own_neighbours(map_, int(order[0])), map_.scheme, 0.95, map_.scheme.radii_m[0]
-        )
-        if estimate is not None:
-            not_in_map = estimate.not_in_map
-            inside = photos_inside(estimate.levels[0], ranking).tolist()
-            best_place = inside, estimate.probabilities[0]
-    return frame_evidence(
-        time_, ids, found, len(scores), not_in_map=not_in_map, best_place=best_place
     )
-
-
-def own_neighbours(map_: SequenceMap, photo: int) -> list[RankedPhoto]:
-    """Return the ranking of a photo of the map, without it."""
-    scores = map_.rows @ map_.rows[photo]
-    scores[photo] = -np.inf
-    order = np.argsort(-scores, kind="stable")[: min(EVIDENCE_DEPTH, len(scores) - 1)]
-    return [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
+    count = min(HITS, len(map_.rows))
+    frames = []
+    for time_, scores in zip(times, centred @ map_.rows.T, strict=True):
+        order = np.argsort(-scores, kind="stable")[:count]
+        found = scores[order].astype(np.float64).tolist()
+        frames.append(frame_evidence(time_, [str(photo) for photo in order], found, len(scores)))
+    return frames
 
 
 def _times(queries: Sequence[DatasetPhoto]) -> list[datetime]:
@@ -315,6 +310,15 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
         "frames_to_localise": localised,
         "frames_to_notice_lost": noticed,
         "claimed_outside": _share(claimed),
+    }
+
+
+def kidnapping_figures(found: Sequence[int | None]) -> dict[str, Any]:
+    """Compute the figures of kidnappings from the frames until each was found."""
+    return {
+        "kidnapped": len(found),
+        "found_within_40_frames": _share([n is not None and n <= FOUND_FRAMES for n in found]),
+        "frames_until_found": list(found),
     }
 
 

@@ -45,6 +45,13 @@ class _Message(BaseModel):
         return self.model_dump_json(exclude_defaults=True)
 
 
+class RowReference(_Message):
+    """Reference to a descriptor: row `row` of the object `object_key`."""
+
+    object_key: str
+    row: int = Field(ge=0)
+
+
 class SearchRequest(_Message):
     """Request for the `k` rows of a generation that are most similar to one stored row.
 
@@ -58,6 +65,10 @@ class SearchRequest(_Message):
     `word_weights`, one for each word of the generation's vocabulary, multiply the words of the
     query, and rows are ranked by the similarity to that weighted query; `min_score` still applies
     to the plain cosine. The weights are sent by value, so that all shards rank by the same ones.
+
+    The mean of the rows of `background` is subtracted from the query first
+    (`shared.search_api.background`); scores are the cosines to what is left. Rows that no longer
+    exist are left out of the mean.
     """
 
     # Unknown fields of a request are refused: ignoring a filter would give a wrong result.
@@ -78,6 +89,7 @@ class SearchRequest(_Message):
     most_seconds: float | None = Field(None, gt=0)
     """Time limit in seconds."""
     word_weights: tuple[float, ...] = ()
+    background: tuple[RowReference, ...] = ()
 
 
 class SearchHit(_Message):

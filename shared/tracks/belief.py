@@ -12,8 +12,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_BYTES = 1_000_000
+START_GAIN = 0.5
+"""`gain` before the first frame, cautious"""
+START_GAIN_WEIGHT = 20.0
 FloatArray = NDArray[np.float64]
 
 TrackStatus = Literal["converging", "tracking", "lost"]
@@ -35,6 +38,10 @@ class Belief:
     """outside the map"""
     seen: dict[str, float]
     """what the last frame's hits had beyond their prior, to tell how much the next frame adds"""
+    gain: float = START_GAIN
+    """mean log-likelihood of the frames at the predicted places, relative to that of any place"""
+    gain_weight: float = START_GAIN_WEIGHT
+    """number of independent, tracked frames that `gain` is the mean of"""
     status: TrackStatus = "converging"
     frames: int = 0
     """number of frames so far"""
@@ -49,6 +56,8 @@ class Belief:
             "elsewhere": self.elsewhere,
             "outside": self.outside,
             "seen": self.seen,
+            "gain": self.gain,
+            "gain_weight": self.gain_weight,
             "status": self.status,
             "frames": self.frames,
         }
@@ -66,8 +75,11 @@ class Belief:
         try:
             content: dict[str, Any] = json.loads(zlib.decompress(data))
             version = content.pop("version")
-            if version != FORMAT_VERSION:
-                raise ValueError(f"Belief format {version} is not known, only {FORMAT_VERSION}.")
+            if version > FORMAT_VERSION:  # older ones lack fields that have a default
+                raise ValueError(
+                    f"The belief has format {version}; this release reads formats up to "
+                    f"{FORMAT_VERSION}. Use the release that began the track."
+                )
             belief = cls(
                 **content
                 | {

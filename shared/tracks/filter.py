@@ -11,17 +11,23 @@ probability that the camera was carried away, e and c those of leaving and enter
     p'(j)     = (1 - r - e) * sum_i p(i) K(i, j) + (r * (1 - outside) + c * outside) / n
     outside'  = (1 - c) * outside + e * (1 - outside)
 
-Update. The frame's evidence has posterior probabilities q of a single frame, and its prior is
-known, so their ratio is the likelihood up to a factor (Bayes' rule):
+Update. The frame's evidence has posterior probabilities q of a single frame that is in the map, and
+its prior is uniform, so n * q(j) is the likelihood up to a factor (Bayes' rule):
 
-    p(j)      ~ p'(j) * (n * q(j) / (1 - q_out)) ** w
-    outside   ~ outside' * ((q_out / (1 - q_out)) / (s / (1 - s))) ** (w / 2)
+    p(j)      ~ p'(j) * (n * q(j)) ** w
+    outside   ~ outside' * exp(w * OUTSIDE_GAIN * max(0, g - CHANCE_GAIN))
 
-with s = OUT_OF_MAP_SHARE; photos that are no hits share what the hits leave. Two frames of the same
-view are not independent, so w is the share of the evidence that is new: the squared Hellinger
-distance w = 1 - sum_j sqrt(d(j) d_before(j)) of what exceeds the prior, d(j) ~ max(q(j) - (1 - s) /
-n, 0), from the frame before. A camera that stands still adds nothing. SeqSLAM (Milford and Wyeth
-2012) sums scores along lines of constant speed instead; it is the baseline of the evaluation.
+Photos that are no hits share what the hits leave. Outside the map, frames fit the predicted places
+by chance only, yet better than any place: similar streets look similar in successive frames. So
+"outside" is measured by the track itself: g is the mean of what the tracked frames gained by the
+prediction, log(sum_j p'(j) (n q(j)) ** w / sum_j p'(j)) / w. Where the evidence is weak, g is near
+what frames gain by chance, and little speaks for "outside".
+
+Two frames of the same view are not independent, so w = min(1, NEWS_WEIGHT * news), and news is the
+share of the evidence that is new: the squared Hellinger distance 1 - sum_j sqrt(d(j) d_before(j))
+of what exceeds the prior, d(j) ~ max(q(j) - 1 / n, 0), from the frame before. A camera that stands
+still adds nothing. SeqSLAM (Milford and Wyeth 2012) sums scores along lines of constant speed
+instead; it is the baseline of the evaluation.
 """
 
 from __future__ import annotations
@@ -52,11 +58,16 @@ CARRIED_AWAY = 0.002
 """Probability per frame that the camera goes on at any place of the map"""
 LEAVING = 0.002
 """Probability per frame that the camera leaves the map"""
-ENTERING = 0.02
+ENTERING = 0.005
 """Probability per frame that a camera outside enters the map, at any place"""
-OUTSIDE_WEIGHT = 0.5
-"""Weight of a frame's evidence for "outside the map". Another season makes all frames of a ride
-look foreign alike, so that their evidence is not independent."""
+OUTSIDE_GAIN = 0.7
+"""Share of the track's gain above CHANCE_GAIN that a frame outside the map must fall below"""
+CHANCE_GAIN = 0.45
+"""A track that gains no more than this by its frames cannot be told from one outside the map"""
+MAX_GAIN_WEIGHT = 200.0
+"""Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
+NEWS_WEIGHT = 1.5
+"""A frame with two thirds of new evidence counts in full"""
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
@@ -174,14 +185,14 @@ class TrackFilter:
         targets = self._targets(sources, sources.take(moving), evidence, reach)
         kernel = self._kernel(sources, targets, seconds, evidence.odometry)
         seen = _excess(evidence, count)
-        news = _news(before.seen, seen)
+        weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
 
         # Photos that were deleted since have given their probability to the others.
         own = before.probabilities[rows]
         elsewhere = before.elsewhere + float(before.probabilities.sum() - own.sum())
         density = elsewhere / max(count - len(own), 1)
-        carried = max(CARRIED_AWAY * news, 1 - MAX_REACH_M / max(reach_m, MAX_REACH_M))
-        leaving, entering = LEAVING * news, ENTERING * news
+        carried = max(CARRIED_AWAY * weight, 1 - MAX_REACH_M / max(reach_m, MAX_REACH_M))
+        leaving, entering = LEAVING * weight, ENTERING * weight
         stay = max(0.0, 1 - carried - leaving)
         inside = 1 - before.outside
         entered = (carried * inside + entering * before.outside) / count
@@ -192,7 +203,15 @@ class TrackFilter:
         predicted_elsewhere = stay * density * max(unseen, 0) + entered * remaining
         predicted_outside = (1 - entering) * before.outside + leaving * inside
 
-        weights, weight_elsewhere, weight_outside = _likelihoods(targets, evidence, count, news)
+        likelihoods, likelihood_elsewhere = _likelihoods(targets, evidence, count)
+        in_map = float(predicted.sum()) + predicted_elsewhere
+        weights, weight_elsewhere = likelihoods**weight, likelihood_elsewhere**weight
+        fit = float(predicted @ weights) + predicted_elsewhere * weight_elsewhere
+        outside_gain = OUTSIDE_GAIN * max(0.0, before.gain - CHANCE_GAIN)
+        weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
+        if evidence.fix is not None:
+            weights = weights * _fix_weights(targets, evidence.fix, count)
+            weight_elsewhere *= FIX_OUTLIERS
         posterior = predicted * weights
         posterior_elsewhere = predicted_elsewhere * weight_elsewhere
         posterior_outside = predicted_outside * weight_outside
@@ -206,11 +225,15 @@ class TrackFilter:
             elsewhere=posterior_elsewhere + float(posterior.sum() - posterior[kept].sum()),
             outside=posterior_outside / total,
             seen=seen,
+            gain=before.gain,
+            gain_weight=before.gain_weight,
             status=before.status,
             frames=before.frames + 1,
         )
         state = track_state(after, targets.take(kept), self._scheme, self._motion.typical_speed_mps)
         after = replace(after, status=next_status(before.status, state.probability, after.outside))
+        if evidence.hits and in_map > 0:
+            after = _learn_gain(after, float(np.log(fit / in_map)), weight, state.probability)
         return _Step(
             rows,
             kernel[:, kept],
@@ -298,7 +321,7 @@ def _near_fix(graph: PhotoGraph, fix: PositionFix) -> PhotoTable:
 
 def _excess(evidence: FrameEvidence, count: int) -> dict[str, float]:
     """Return by how much the probabilities of the hits exceed their prior."""
-    prior = (1 - OUT_OF_MAP_SHARE) / count
+    prior = 1 / count
     return {h.photo: h.probability - prior for h in evidence.hits if h.probability > prior}
 
 
@@ -311,21 +334,28 @@ def _news(seen: dict[str, float], now: dict[str, float]) -> float:
 
 
 def _likelihoods(
-    targets: PhotoTable, evidence: FrameEvidence, count: int, news: float
-) -> tuple[FloatArray, float, float]:
-    """Return the likelihoods of the targets, of any other photo, and of "outside the map"."""
-    inside = max(1 - evidence.not_in_map, 1e-9)
-    probability = {hit.photo: hit.probability / inside for hit in evidence.hits}
+    targets: PhotoTable, evidence: FrameEvidence, count: int
+) -> tuple[FloatArray, float]:
+    """Return the likelihoods of the targets and of any other photo; 1 on average over the map."""
+    probability = {hit.photo: hit.probability for hit in evidence.hits}
     other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
     values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
-    weights = np.maximum(values * count, 1e-9) ** news
-    elsewhere = max(other * count, 1e-9) ** news
-    odds = max(evidence.not_in_map, 1e-9) / inside * (1 - OUT_OF_MAP_SHARE) / OUT_OF_MAP_SHARE
-    outside = odds ** (OUTSIDE_WEIGHT * news)
-    if evidence.fix is not None:
-        near = _fix_weights(targets, evidence.fix, count)
-        weights, elsewhere = weights * near, elsewhere * FIX_OUTLIERS
-    return weights, elsewhere, outside
+    return np.maximum(values * count, 1e-9), max(other * count, 1e-9)
+
+
+def _learn_gain(belief: Belief, log_fit: float, weight: float, tracked: float) -> Belief:
+    """Add a frame to the mean gain of the track; the oldest frames beyond the maximum fade.
+
+    Args:
+        belief: The belief after the frame.
+        log_fit: Log-likelihood of the frame's evidence at the predicted places.
+        weight: Share of the evidence that counts.
+        tracked: Probability of the place; frames of unknown places say nothing about the gain.
+    """
+    before = min(belief.gain_weight, MAX_GAIN_WEIGHT)
+    total = before + tracked * weight
+    mean = (belief.gain * before + tracked * log_fit) / total
+    return replace(belief, gain=max(0.0, mean), gain_weight=total)
 
 
 def _fix_weights(targets: PhotoTable, fix: PositionFix, count: int) -> FloatArray:

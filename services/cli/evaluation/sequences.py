@@ -18,7 +18,9 @@ from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, op
 from shared.errors import InvalidRequest, NotFound
 from shared.evaluation.ranking import describe_evaluation_set
 from shared.evaluation.sequences import (
+    evaluate_kidnapped,
     evaluate_sequence,
+    kidnapping_figures,
     prepare_map,
     sequence_figures,
     split_sequences,
@@ -54,9 +56,12 @@ def evaluate_sequences(
     rule: str | None,
     target: EvaluationTarget,
     motion: MotionModel,
+    kidnap_every: int | None,
     as_json: bool,
 ) -> None:
     """Evaluate tracks on the sets below `data` that have sequences.
+
+    With `kidnap_every`, the camera is also carried away after every so many frames.
 
     Raises:
         NotFound: `no_evaluation_set`, `no_sequences`.
@@ -72,7 +77,9 @@ def evaluate_sequences(
         for name in names or evaluation_set_names(data):
             evaluation_set = open_evaluation_set(data, name, protocol=protocol, rule=rule)
             if split_sequences(evaluation_set.queries):
-                figures[name] = _evaluate_set(evaluation_set, target, motion, progress)
+                figures[name] = _evaluate_set(
+                    evaluation_set, target, motion, kidnap_every, progress
+                )
     if not figures:
         raise NotFound(
             "no_sequences",
@@ -87,7 +94,11 @@ def evaluate_sequences(
 
 
 def _evaluate_set(
-    evaluation_set: EvaluationSet, target: EvaluationTarget, motion: MotionModel, progress: Progress
+    evaluation_set: EvaluationSet,
+    target: EvaluationTarget,
+    motion: MotionModel,
+    kidnap_every: int | None,
+    progress: Progress,
 ) -> Json:
     describer = make_describer(evaluation_set, target, read_settings(), progress)
     on_progress = progress_bars(progress, evaluation_set.name)
@@ -97,11 +108,16 @@ def _evaluate_set(
         database, queries = (_normalise(rows) for rows in matrices)
     map_ = prepare_map(evaluation_set, database, motion)
     sequences, milliseconds = [], []
+    found: list[int | None] = []
     members_of = split_sequences(evaluation_set.queries)
     for number, members in enumerate(members_of):
         frames, seconds = evaluate_sequence(map_, evaluation_set, members, queries[members], motion)
         sequences.append(frames)
         milliseconds.append(1000 * seconds)
+        if kidnap_every is not None:
+            found += evaluate_kidnapped(
+                map_, evaluation_set, members, queries[members], motion, kidnap_every
+            )
         on_progress("tracking", number + 1, len(members_of))
     by_sequence = {
         str(evaluation_set.queries[members[0]].sequence): sequence_figures([frames])
@@ -112,6 +128,7 @@ def _evaluate_set(
         "database": len(database),
         "filter_ms_a_frame": statistics.fmean(milliseconds),
         **sequence_figures(sequences),
+        **({} if kidnap_every is None else kidnapping_figures(found)),
         "sequences": by_sequence,
     }
 
@@ -147,6 +164,14 @@ def _print_figures(name: str, figures: Json) -> None:
         soft_wrap=True,
         markup=False,
     )
+    if "kidnapped" in figures:
+        console.print(
+            f"Carried away {figures['kidnapped']} times: "
+            f"{_percent(figures['found_within_40_frames'])} are found again within 40 frames; "
+            f"frames: {_frame_counts(figures['frames_until_found'])}.",
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 def _percent(share: float | None) -> str:

@@ -44,7 +44,7 @@ from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
-from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse
+from shared.search_api.protocol import RowReference, SearchHit, SearchRequest, SearchResponse
 from shared.word_weights.record import WordWeights, parse_word_weights
 
 log = logging.getLogger(__name__)
@@ -96,6 +96,8 @@ class SimilarityQuery:
     row: int
     photo_id: UUID | None
     filename: str
+    background: tuple[RowReference, ...] = ()
+    """Descriptors whose mean is subtracted from the query"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,6 +287,15 @@ def run_similarity_search(
     )
 
 
+def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
+    """Return the first `k` live photos of the map, most similar first, without an estimate."""
+    weights = select_ranking_weights(query.generation, True, gateway.settings)
+    hits, _, _ = _search_live_photos(
+        gateway, query, SearchParams(), NO_FILTER, k, weights=weights.values
+    )
+    return hits
+
+
 def _rank_neighbours(
     gateway: GatewayContext,
     query: SimilarityQuery,
@@ -359,6 +370,7 @@ def _search_live_photos(
                 min_score=min_score,
                 exclude=(query.photo_id,) if query.photo_id else (),
                 word_weights=weights,
+                background=query.background,
                 mode=search_params.mode,
                 most_rows=search_params.most_rows,
                 most_seconds=search_params.most_seconds,

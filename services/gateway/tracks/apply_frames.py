@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import update
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.similarity.estimate import locate_hits
-from services.gateway.similarity.execute import query_from_job, run_similarity_search
-from services.gateway.similarity.search_params import SearchParams
+from services.gateway.similarity.execute import query_from_job, rank_live_photos
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
 from shared.catalog.jobs import UNFINISHED_STATES
@@ -29,21 +27,24 @@ from shared.catalog.maps import Map
 from shared.catalog.tracks import (
     Track,
     TrackFrame,
+    applied_jobs_from,
+    count_applied_before,
     drop_old_beliefs,
     first_pending_frame,
     last_belief,
     select_frames,
 )
 from shared.errors import Conflict, Gone, PlacewiseError
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH
-from shared.evaluation.places.levels import LevelScheme, photos_inside
+from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import WakeupQueue
+from shared.search_api.background import background_frames
 from shared.search_api.comparison import query_expired_error
+from shared.search_api.protocol import RowReference
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import FrameEvidence, frame_evidence
+from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
 
 START_ACCURACY_M = 50.0
@@ -120,27 +121,40 @@ def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEv
     if job.state != JobState.SUCCEEDED:
         error: PlacewiseError = Conflict("job_cancelled", f"The job {job.id} was cancelled.")
         raise _FrameFailed(error.as_problem())
-    result = run_similarity_search(
-        gateway, query_from_job(gateway, job), SearchParams(top_k=EVIDENCE_DEPTH)
-    )
-    places = result.places
-    best_place = None
-    if places is not None:
-        ranking = locate_hits(result.hits, result.photos)
-        inside = photos_inside(places.levels[0], ranking)
-        best_place = (inside.tolist(), places.probabilities[0])
+    query = query_from_job(gateway, job)
     measured = FrameForm.model_validate(pending.frame.measurements)
     with gateway.catalog.read() as session:
         photo_count = CatalogPhotoGraph(session, pending.track.map_id).photo_count
+        background = _background(session, pending.frame, query.generation.id)
+    hits = rank_live_photos(gateway, replace(query, background=background), HITS)
     return frame_evidence(
         pending.frame.captured_at,
-        [str(hit.photo_id) for hit in result.hits],
-        [hit.ranked_by for hit in result.hits],
+        [str(hit.photo_id) for hit in hits],
+        [hit.ranked_by for hit in hits],
         photo_count,
-        not_in_map=None if places is None else places.not_in_map,
-        best_place=best_place,
         fix=measured.fix(),
         odometry=measured.odometry(),
+    )
+
+
+def _background(
+    session: Session, frame: TrackFrame, generation_id: UUID
+) -> tuple[RowReference, ...]:
+    """Return the descriptors of the frame's background, as far as they are of this generation."""
+    numbers = background_frames(count_applied_before(session, frame))
+    if not numbers:
+        return ()
+    job_ids = applied_jobs_from(session, frame, numbers[0])
+    chosen = [job_ids[number - numbers[0]] for number in numbers]
+    results = {
+        job.id: job.result
+        for job in session.scalars(select(Job).where(Job.id.in_(chosen)))
+        if job.result and job.result.get("generation_id") == str(generation_id)
+    }
+    return tuple(
+        RowReference(object_key=result["object_key"], row=result["row"])
+        for job_id in chosen
+        if (result := results.get(job_id))
     )
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import utm
 from PIL import Image
 
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.evaluation.seqslam import seqslam_matches
 from shared.evaluation.sequences import (
+    KIDNAPS,
     FrameResult,
+    evaluate_kidnapped,
     evaluate_sequence,
+    kidnapping_figures,
     prepare_map,
     sequence_figures,
     split_sequences,
@@ -20,6 +25,7 @@ from shared.evaluation.sequences import (
 from shared.synthetic_city.plan import CityOptions, make_plan
 from shared.tracks.belief import TrackStatus
 from shared.tracks.motion import MOTION_MODELS
+from tests.unit.data_sets import write_csv, write_photos
 
 
 def season_folders(root: Path, count: int) -> Path:
@@ -48,6 +54,78 @@ def test_two_folders_of_seasons_are_followed_by_their_numbers(tmp_path: Path) ->
     assert figures["recall"]["filter"] > figures["recall"]["single"]
     assert figures["recall"]["filter"] > 0.9
     assert figures["frames_outside"] == 0
+
+
+def follow(root: Path, views: np.ndarray, noise: float, motion: str) -> dict[str, Any]:
+    """Evaluate the sequences of a set whose photos look like the views of their places."""
+    found = open_evaluation_set(root)
+    rng = np.random.default_rng(1)
+    database, queries = (
+        np.stack([views[int(photo.path.stem)] for photo in photos])
+        for photos in (found.database, found.queries)
+    )
+    database, queries = (rows + noise * rng.normal(size=rows.shape) for rows in (database, queries))
+    database, queries = (
+        (rows / np.linalg.norm(rows, axis=1)[:, None]).astype("f4") for rows in (database, queries)
+    )
+    speeds = MOTION_MODELS[motion]
+    map_ = prepare_map(found, database, speeds)
+    sequences = split_sequences(found.queries)
+    frames = [evaluate_sequence(map_, found, m, queries[m], speeds)[0] for m in sequences]
+    kidnapped = [
+        n for m in sequences for n in evaluate_kidnapped(map_, found, m, queries[m], speeds, 50)
+    ]
+    return sequence_figures(frames) | kidnapping_figures(kidnapped)
+
+
+def test_a_map_with_labels_only_is_followed_by_the_photos_of_its_labels(tmp_path: Path) -> None:
+    views = np.random.default_rng(0).normal(size=(80, 24))
+    for table in ("database", "queries"):
+        write_photos(tmp_path, [f"{table}/{number}.jpg" for number in range(80)])
+        write_csv(
+            tmp_path / f"{table}.csv",
+            ("path", "place", "frame", "sequence"),
+            [(f"{number}.jpg", f"room {number // 4}", number, table) for number in range(80)],
+        )
+    figures = follow(tmp_path, views, 1.3, "walk")
+    assert figures["recall"]["single"] < 0.8
+    assert figures["recall"]["filter"] > figures["recall"]["single"] + 0.1
+
+
+def test_sequences_of_the_msls_layout_are_followed_by_their_frame_numbers(tmp_path: Path) -> None:
+    views = np.random.default_rng(0).normal(size=(200, 24))
+    for city, side in product(("cph", "sf"), ("database", "query")):
+        folder = tmp_path / "train_val" / city / side
+        numbers = range(100) if city == "cph" else range(100, 200)
+        keys = [f"{number:03d}" for number in numbers]
+        metres = [(350_000.0 + 10 * number, 6_170_000.0) for number in numbers]
+        write_photos(folder / "images", [f"{key}.jpg" for key in keys])
+        places = [utm.to_latlon(*each, 33, "U") for each in metres]
+        tables: dict[str, tuple[tuple[str, ...], list[tuple[Any, ...]]]] = {
+            "raw.csv": (
+                ("key", "lon", "lat", "ca", "captured_at", "pano"),
+                [
+                    (k, b, a, 0.0, "2019-01-01", False)
+                    for k, (a, b) in zip(keys, places, strict=True)
+                ],
+            ),
+            "postprocessed.csv": (
+                ("key", "easting", "northing", "night", "view_direction"),
+                [(k, *each, False, "Forward") for k, each in zip(keys, metres, strict=True)],
+            ),
+            "seq_info.csv": (
+                ("key", "sequence_key", "frame_number"),
+                [(key, city + side, number) for number, key in enumerate(keys)],
+            ),
+            "subtask_index.csv": (("key", "all", "s2w"), [(key, True, False) for key in keys]),
+        }
+        for name, (header, rows) in tables.items():
+            write_csv(folder / name, ("", *header), [(n, *row) for n, row in enumerate(rows)])
+    figures = follow(tmp_path, views, 1.3, "bicycle")
+    assert figures["recall"]["single"] < 0.8
+    assert figures["recall"]["filter"] > figures["recall"]["single"] + 0.1
+    assert figures["kidnapped"] == 2 * KIDNAPS
+    assert figures["found_within_40_frames"] > 0.8
 
 
 def result(

@@ -38,19 +38,17 @@ def at(seconds: float) -> datetime:
     return START + timedelta(seconds=seconds)
 
 
-def frame(
-    seconds: float, probabilities: Sequence[float], not_in_map: float = 0.05
-) -> FrameEvidence:
-    """A frame with a hit at each photo 0, 1, ..."""
+def frame(seconds: float, probabilities: Sequence[float]) -> FrameEvidence:
+    """A frame with a hit at each photo 0, 1, ...; other photos have the rest."""
     hits = tuple(
         Hit(photo=str(number), score=probability, probability=probability)
         for number, probability in enumerate(probabilities)
     )
-    return FrameEvidence(time=at(seconds), hits=hits, not_in_map=not_in_map)
+    return FrameEvidence(time=at(seconds), hits=hits)
 
 
 def pointing_at(photo: int, count: int, seconds: float, probability: float = 0.7) -> FrameEvidence:
     """A frame that shows one of `count` photos."""
-    probabilities = np.full(count, (0.95 - probability) / (count - 1))
+    probabilities = np.full(count, (1.0 - probability) / (count - 1))
     probabilities[photo] = probability
     return frame(seconds, probabilities.tolist())

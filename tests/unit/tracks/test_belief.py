@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 
 import numpy as np
 import pytest
 
-from shared.tracks.belief import Belief
+from shared.tracks.belief import FORMAT_VERSION, START_GAIN, Belief
 from shared.tracks.evidence import FrameEvidence, frame_evidence, rank_shares
 from shared.tracks.motion import MOTION_MODELS, motion_model
 from tests.unit.tracks.maps import at
@@ -39,27 +40,38 @@ def test_a_belief_is_read_as_it_was_written() -> None:
         b"",
         b"x" * 10,
         zlib.compress(b"{}"),
-        zlib.compress(b'{"version": 2}'),
         zlib.compress(b"[]"),
         b"x" * 1_000_001,
         belief(elsewhere=0.9).to_bytes(),
     ],
-    ids=["empty", "damaged", "no version", "newer", "a list", "too long", "more than 1"],
+    ids=["empty", "damaged", "no version", "a list", "too long", "more than 1"],
 )
 def test_bytes_that_are_no_belief_are_an_error(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"belief|Belief"):
         Belief.from_bytes(data)
 
 
-def test_the_probabilities_of_a_frame_add_up_to_one() -> None:
-    best = [True, False, False], 0.6
-    evidence = frame_evidence(
-        at(0), ["a", "b", "c"], [0.9, 0.5, 0.4], 1000, not_in_map=0.2, best_place=best
-    )
-    probabilities = [hit.probability for hit in evidence.hits]
-    assert probabilities[0] == pytest.approx(0.6)
-    assert sum(probabilities) < 0.8
-    assert probabilities[1] > probabilities[2]
+def test_a_belief_of_a_newer_release_is_an_error_that_names_both_formats() -> None:
+    content = json.loads(zlib.decompress(belief().to_bytes()))
+    newer = zlib.compress(json.dumps(content | {"version": FORMAT_VERSION + 1}).encode())
+    message = f"format {FORMAT_VERSION + 1}; this release reads formats up to {FORMAT_VERSION}"
+    with pytest.raises(ValueError, match=message):
+        Belief.from_bytes(newer)
+
+
+def test_a_belief_of_the_release_before_is_read_with_the_gain_of_a_new_track() -> None:
+    content = json.loads(zlib.decompress(belief(gain=2.0, gain_weight=50.0).to_bytes()))
+    del content["gain"], content["gain_weight"]
+    older = zlib.compress(json.dumps(content | {"version": 1}).encode())
+    assert Belief.from_bytes(older).gain == START_GAIN
+
+
+def test_the_probabilities_of_a_frame_and_of_all_other_photos_add_up_to_one() -> None:
+    shares, rest = rank_shares(np.array([0.9, 0.5, 0.4]), 1000)
+    assert shares.sum() + rest == pytest.approx(1.0)
+    evidence = frame_evidence(at(0), ["a", "b", "c"], [0.9, 0.5, 0.4], 1000)
+    assert [hit.probability for hit in evidence.hits] == shares.tolist()
+    assert shares[0] > shares[1] > shares[2] > 0
 
 
 def test_equal_scores_say_nothing_about_the_hits() -> None:
@@ -75,6 +87,8 @@ def test_equal_scores_say_nothing_about_the_hits() -> None:
 def test_evidence_is_read_as_it_was_written() -> None:
     evidence = frame_evidence(at(0), ["a"], [0.9], 10)
     assert FrameEvidence.model_validate_json(evidence.model_dump_json()) == evidence
+    of_an_earlier_release = evidence.model_dump(mode="json") | {"not_in_map": 0.02}
+    assert FrameEvidence.model_validate(of_an_earlier_release) == evidence
 
 
 @pytest.mark.parametrize("motion", ["", "fly", "nan", "-1", "0", "inf"])

@@ -10,9 +10,18 @@ import pytest
 from numpy.typing import NDArray
 
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
-from shared.tracks.belief import Belief
+from shared.tracks.belief import START_GAIN, Belief
 from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
-from shared.tracks.filter import CARRIED_AWAY, ENTERING, LEAVING, SPACING_M, TrackFilter
+from shared.tracks.filter import (
+    CARRIED_AWAY,
+    CHANCE_GAIN,
+    ENTERING,
+    LEAVING,
+    NEWS_WEIGHT,
+    OUTSIDE_GAIN,
+    SPACING_M,
+    TrackFilter,
+)
 from shared.tracks.motion import MOTION_MODELS, motion_model
 from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_map
 
@@ -24,8 +33,8 @@ def random_frames(seed: int, steps: int) -> list[FrameEvidence]:
     rng = np.random.default_rng(seed)
     frames = []
     for step in range(steps):
-        shares = rng.dirichlet(np.full(COUNT + 1, 0.5)) * 0.98 + 0.02 / (COUNT + 1)
-        frames.append(frame(2.0 * step, shares[:COUNT].tolist(), float(shares[COUNT])))
+        shares = rng.dirichlet(np.full(COUNT, 0.5)) * 0.98 + 0.02 / COUNT
+        frames.append(frame(2.0 * step, shares.tolist()))
     return frames
 
 
@@ -40,25 +49,23 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     kernel = moving * kernel + (1 - moving) * np.eye(COUNT)
     start = np.append(np.full(COUNT, (1 - OUT_OF_MAP_SHARE) / COUNT), OUT_OF_MAP_SHARE)
     shown = np.array([[hit.probability for hit in f.hits] for f in frames])
-    prior_odds = OUT_OF_MAP_SHARE / (1 - OUT_OF_MAP_SHARE)
-    likelihood = np.column_stack(
-        [
-            [[hit.probability / (1 - f.not_in_map) * COUNT for hit in f.hits] for f in frames],
-            [np.sqrt(f.not_in_map / (1 - f.not_in_map) / prior_odds) for f in frames],
-        ]
-    )
-    news = np.ones(len(frames))
+    gains, belief = [], None
+    for each in frames:
+        gains.append(belief.gain if belief else START_GAIN)
+        belief = TrackFilter(line_map(COUNT), WALK).advance(belief, each)
+    outside = np.exp(OUTSIDE_GAIN * np.maximum(0.0, np.array(gains) - CHANCE_GAIN))
+    likelihood = np.column_stack([shown * COUNT, outside])
+    new = np.ones(len(frames))
     for step in range(1, len(frames)):
-        now, before = (
-            np.maximum(shown[n] - (1 - OUT_OF_MAP_SHARE) / COUNT, 0) for n in (step, step - 1)
-        )
+        now, before = (np.maximum(shown[n] - 1 / COUNT, 0) for n in (step, step - 1))
         if now.sum() > 0 and before.sum() > 0:
-            news[step] = 1 - np.sqrt(now * before).sum() / np.sqrt(now.sum() * before.sum())
+            news = 1 - np.sqrt(now * before).sum() / np.sqrt(now.sum() * before.sum())
+            new[step] = min(1.0, NEWS_WEIGHT * news)
     moves = []
     for step in range(len(frames)):
         move = np.zeros((COUNT + 1, COUNT + 1))
         carried, leaving, entering = (
-            rate * news[step] for rate in (CARRIED_AWAY, LEAVING, ENTERING)
+            rate * new[step] for rate in (CARRIED_AWAY, LEAVING, ENTERING)
         )
         # A first frame moves nothing: all photos are equally probable before it.
         walked = np.eye(COUNT) if step == 0 else kernel
@@ -70,10 +77,10 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     smoothed = np.zeros((len(frames), COUNT + 1))
     first = start @ moves[0]
     for path in itertools.product(range(COUNT + 1), repeat=len(frames)):
-        probability = first[path[0]] * likelihood[0, path[0]] ** news[0]
+        probability = first[path[0]] * likelihood[0, path[0]] ** new[0]
         for step in range(1, len(frames)):
             probability *= moves[step][path[step - 1], path[step]]
-            probability *= likelihood[step, path[step]] ** news[step]
+            probability *= likelihood[step, path[step]] ** new[step]
         for step, state in enumerate(path):
             smoothed[step, state] += probability
     normalised: NDArray[np.float64] = smoothed / smoothed.sum(axis=1, keepdims=True)
@@ -153,12 +160,47 @@ def test_a_camera_that_leaves_the_map_is_lost_and_nowhere_else() -> None:
     statuses = []
     for step in range(20, 60):
         shares = rng.dirichlet(np.full(500, 0.05)) * 0.7
-        belief = track_filter.advance(belief, frame(step, shares.tolist(), 0.3))
+        belief = track_filter.advance(belief, frame(step, shares.tolist()))
         statuses.append(belief.status)
     assert statuses.index("lost") < 20
     assert "tracking" not in statuses[20:]
     assert belief is not None
     assert belief.outside > 0.5
+
+
+def test_a_track_of_weak_evidence_measures_the_outside_by_its_own_level() -> None:
+    """Frames that would be foreign in a ride of clear views are usual in one of dim views."""
+    outside = {}
+    for clear in (0.2, 0.02):
+        track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
+        for step in range(60):
+            shown = clear if step < 40 else 0.02
+            belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, shown))
+        assert belief is not None
+        outside[clear] = belief.outside
+    assert outside[0.2] > 3 * outside[0.02]
+
+
+def test_the_gain_is_learnt_from_tracked_frames_and_follows_the_light() -> None:
+    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
+    gains = []
+    for step in range(400):
+        shown = 0.5 if step < 100 else 0.1
+        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, shown))
+        gains.append(belief.gain)
+    assert gains[0] < 1.0 < 2.0 < gains[99]
+    assert gains[399] < 0.8 * gains[99]
+
+
+def test_a_frame_counts_by_the_share_of_its_evidence_that_is_new() -> None:
+    track_filter = TrackFilter(line_map(100), WALK)
+    first = track_filter.advance(None, pointing_at(20, 100, 0, 0.4))
+    odds = []
+    for second in (20, 21):  # the same view again, and the next one
+        belief = track_filter.advance(first, pointing_at(second, 100, 0.1, 0.4))
+        shown = sum(belief.probabilities[belief.photos.index(each)] for each in ("20", "21"))
+        odds.append(shown / (1 - shown))
+    assert odds[1] > 2 * odds[0]
 
 
 def test_odometry_decides_between_two_directions_of_the_same_view() -> None:
@@ -239,7 +281,6 @@ def test_probabilities_add_up_to_one_for_any_times_odometry_and_hits(seed: int) 
                 Hit(photo=str(photo), score=share, probability=min(1.0, share))
                 for photo, share in zip(photos.tolist(), shares.tolist(), strict=False)
             ),
-            not_in_map=float(1 - shares[:7].sum()) if seed % 3 else 0.0,
             odometry=Odometry(
                 distance_m=float(rng.choice([0.0, 1e-9, 5.0, 1e6])),
                 distance_accuracy_m=float(rng.choice([1e-9, 1.0, 1e6])),
