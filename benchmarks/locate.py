@@ -34,7 +34,7 @@ from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.ranking import describe_evaluation_set
-from shared.evaluation.sequences import COARSE_RADII_M, split_sequences
+from shared.evaluation.sequences import split_sequences
 from shared.geodesy import distance_m
 from shared.geotagging.evidence import (
     KnownPosition,
@@ -54,26 +54,26 @@ POINT_FRAMES = 5
 POINT_NOISE_M = 5.0
 CLOCK_ERROR_SECONDS = 10.0
 RADIUS_M = 100.0
-SCHEME = LevelScheme(labels_are_paths=False, radii_m=(25.0, *COARSE_RADII_M))
-OWN_PHOTOS_SAMPLED = 1000
 CERTAINTY = 0.95
+OWN_PHOTOS_SAMPLED = 1000
+SCHEME = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0, 500.0, 2000.0))
 DEGREES_PER_M = 360 / 40_030_000
 SOURCES = ("picture", "picture, neighbours", "picture, neighbours, GPX", "neighbours", "GPX")
 
 
 @dataclass(frozen=True)
-class LocatedMap:
-    """The photos of a map, with the place model that is fitted on them."""
+class DescribedMap:
+    """The photos of a map, with descriptors and the place model that is fitted to them."""
 
     photos: Sequence[DatasetPhoto]
+    locations: Sequence[PhotoLocation]
     rows: NDArray[np.float32]
     """(n, D), of unit length"""
-    locations: Sequence[PhotoLocation]
     model: PlaceModel
 
     @classmethod
-    def fit(cls, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32]) -> LocatedMap:
-        """Fit the place model."""
+    def of(cls, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32]) -> DescribedMap:
+        """Fit the place model on up to OWN_PHOTOS_SAMPLED of the photos, as an evaluation does."""
 
         def rank(photo: int) -> IndexRanking:
             scores = (rows @ rows[photo]).astype(np.float64)
@@ -82,19 +82,24 @@ class LocatedMap:
             return order, scores[order]
 
         locations = [PhotoLocation(each.latitude, each.longitude, each.place) for each in photos]
-        sampler = OwnPhotoSampler(
-            locations, [each.captured_at for each in photos], SCHEME, SCHEME.radii_m[0], rank
-        )
-        sampled = np.random.default_rng(0).permutation(len(photos))[:OWN_PHOTOS_SAMPLED].tolist()
+        times = [photo.captured_at for photo in photos]
+        sampler = OwnPhotoSampler(locations, times, SCHEME, SCHEME.radii_m[0], rank)
+        known = np.flatnonzero([location.is_known for location in locations])
+        sampled = np.random.default_rng(0).permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
         spread = sampler.spread(sampled)
         fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), SCHEME, spread)
-        return cls(photos, rows, locations, fitted.model)
+        return cls(photos, locations, rows, fitted.model)
+
+    def rank(self, scores: NDArray[np.float32]) -> list[int]:
+        """Return the first EVIDENCE_DEPTH photos for their (n,) scores."""
+        best: list[int] = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
+        return best
 
     def neighbours(self, photo: int) -> list[RankedPhoto]:
         """Return the ranking of a photo of the map, without it."""
         scores = self.rows @ self.rows[photo]
         scores[photo] = -np.inf
-        order = np.argsort(-scores, kind="stable")[: min(EVIDENCE_DEPTH, len(scores) - 1)]
+        order = [each for each in self.rank(scores) if each != photo]
         return [RankedPhoto(float(scores[each]), self.locations[each]) for each in order]
 
 
@@ -124,7 +129,7 @@ def main() -> None:
 
 def describe_rides(
     city: Path,
-) -> tuple[LocatedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
+) -> tuple[DescribedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
     """Describe a city as a new map would be, and return its rides with their (frames, n) scores."""
     name = next(each for each in evaluation_set_names(city) if each.endswith("_rides"))
     evaluation_set = open_evaluation_set(city, name)
@@ -135,7 +140,7 @@ def describe_rides(
         )
         with describe_evaluation_set(describer.describe, evaluation_set) as matrices:
             database, queries = (np.array(rows) for rows in matrices)
-    map_ = LocatedMap.fit(evaluation_set.database, database)
+    map_ = DescribedMap.of(evaluation_set.database, database)
     rides = []
     for members in split_sequences(evaluation_set.queries):
         frames = [evaluation_set.queries[member] for member in members]
@@ -143,9 +148,9 @@ def describe_rides(
     return map_, rides
 
 
-def picture_of(map_: LocatedMap, scores: NDArray[np.float32]) -> PictureEvidence:
+def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEvidence:
     """Return what the search of the map says about a frame, as `placewise locate` reads it."""
-    order = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
+    order = map_.rank(scores)
     ranking = [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
     neighbours = map_.neighbours(order[0])
     estimate = map_.model.estimate(ranking, neighbours, SCHEME, CERTAINTY, SCHEME.radii_m[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
@@ -59,6 +61,11 @@ CORS_EXPOSED_HEADERS = (
     "X-Request-ID",
 )
 
+# Routes that parse a multipart body as it arrives, and limit it.
+FORM_PATHS = re.compile(
+    rf"{API_PREFIX}/(upload|upload/batch|similarity|models|vocabularies/import|tracks/[^/]+/frames)"
+)
+
 
 def create_app(gateway: GatewayContext) -> FastAPI:
     """Create the FastAPI application that uses the stores and clients of `gateway`."""
@@ -77,7 +84,10 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     gateway_metrics = GatewayMetrics(gateway, app.state.admission)
     # Starlette runs the middleware that is added last first.
     app.add_middleware(
-        BodySizeLimitMiddleware, exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"}
+        BodySizeLimitMiddleware,
+        form_paths=FORM_PATHS,
+        exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
+        limits={f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES},
     )
     app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)
     app.add_middleware(AuthenticationMiddleware, authenticator=gateway.authenticator)

@@ -2,15 +2,16 @@
 
 `SecurityHeadersMiddleware` sets headers on every response, errors included, unless the route has
 set them itself, as the web page on `/` and the API documentation do. `BodySizeLimitMiddleware`
-limits bodies that are read into memory (JSON); multipart bodies and manifests are limited by their
-streaming parsers. `ExceptionHandlerMiddleware` must be inside the middleware that adds headers:
-Starlette's own handler of unexpected exceptions is outside of all middleware, so its responses
-would lack them.
+limits bodies that are read into memory (JSON); forms and manifests are limited by the streaming
+parsers of their routes. `ExceptionHandlerMiddleware` must be inside the middleware that adds
+headers: Starlette's own handler of unexpected exceptions is outside of all middleware, so its
+responses would lack them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container
+import re
+from collections.abc import Container, Mapping
 
 from fastapi import Request
 from starlette.datastructures import MutableHeaders
@@ -69,18 +70,32 @@ MAX_JSON_BYTES = 1_000_000
 class BodySizeLimitMiddleware:
     """Responds 413 (`body_too_large`) to bodies over MAX_JSON_BYTES without reading the rest.
 
-    Multipart bodies are exempt.
+    Args:
+        app: The application.
+        form_paths: Matches the paths of the routes that limit multipart bodies themselves. Any
+            other route would read such a body into memory.
+        exempt_paths: Paths of the routes that limit all their bodies themselves.
+        limits: Other limits than MAX_JSON_BYTES, by path.
     """
 
-    def __init__(self, app: ASGIApp, exempt_paths: Container[str] = ()) -> None:
-        """`exempt_paths` are routes that limit all their bodies themselves."""
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        form_paths: re.Pattern[str],
+        exempt_paths: Container[str],
+        limits: Mapping[str, int],
+    ) -> None:
         self._app = app
+        self._form_paths = form_paths
         self._exempt_paths = exempt_paths
+        self._limits = limits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_multipart(scope) or scope["path"] in self._exempt_paths:
+        if scope["type"] != "http" or self._is_exempt(scope):
             await self._app(scope, receive, send)
             return
+        limit = self._limits.get(scope["path"], MAX_JSON_BYTES)
         size = 0
 
         async def counted_receive() -> Message:
@@ -88,18 +103,22 @@ class BodySizeLimitMiddleware:
             message = await receive()
             size += len(message.get("body", b""))
             # The route sees a client disconnect; its response is replaced by the 413.
-            return message if size <= MAX_JSON_BYTES else {"type": "http.disconnect"}
+            return message if size <= limit else {"type": "http.disconnect"}
 
         async def guarded_send(message: Message) -> None:
-            if size <= MAX_JSON_BYTES:
+            if size <= limit:
                 await send(message)
             elif message["type"] == "http.response.start":
-                error = TooLarge(
-                    "body_too_large", f"The body is larger than {MAX_JSON_BYTES} bytes."
-                )
+                error = TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
                 await problem_response(error, Request(scope))(scope, receive, send)
 
         await self._app(scope, counted_receive, guarded_send)
+
+    def _is_exempt(self, scope: Scope) -> bool:
+        path = scope["path"]
+        if path in self._exempt_paths:
+            return True
+        return _is_multipart(scope) and self._form_paths.fullmatch(path) is not None
 
 
 def _is_multipart(scope: Scope) -> bool:

@@ -145,7 +145,8 @@ class SecretFilesSource(PydanticBaseSettingsSource):
         """Return the text of the file of one setting, or None, the variable's name, and False.
 
         Raises:
-            Misconfigured: `bad_setting` if the file cannot be read, or the setting is given twice.
+            Misconfigured: `bad_setting` if the file is empty or cannot be read, or the setting is
+                given twice.
         """
         name = field_name.upper()
         variable = f"{name}_FILE"
@@ -159,6 +160,9 @@ class SecretFilesSource(PydanticBaseSettingsSource):
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "the file is not UTF-8 text"
             raise Misconfigured("bad_setting", f"{variable}={path}: {reason}") from None
+        if not text.strip():
+            # An empty ADMIN_KEY would leave a server without a key.
+            raise Misconfigured("bad_setting", f"{variable}={path}: the file is empty")
         return text.strip(), variable, False
 
     def __call__(self) -> dict[str, Any]:

@@ -114,9 +114,11 @@ def picture_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
     do not explain to a Gaussian that has most of its weight within the outer circle. The photos
     outside of all circles share what is left with the photos of the map that were not found.
     """
-    scores = np.array([photo.score for photo in evidence.similar], dtype=np.float64)
+    # Answers are in the order of the match probability, which can differ from that of the scores.
+    similar = sorted(evidence.similar, key=lambda photo: photo.score, reverse=True)
+    scores = np.array([photo.score for photo in similar], dtype=np.float64)
     shares, rest = rank_shares(scores, max(evidence.photo_count, len(scores)))
-    at = [plane.to_metres(photo.latitude, photo.longitude) for photo in evidence.similar]
+    at = [plane.to_metres(photo.latitude, photo.longitude) for photo in similar]
     if not evidence.circles:
         known = 1 - evidence.not_in_map
         components = [

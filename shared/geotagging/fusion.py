@@ -51,7 +51,8 @@ def propose_position(
         radius_m: Radius of the proposal.
 
     Returns:
-        The most probable circle; None if no source has a position.
+        The most probable circle; None if no source has a position, or the photo was certainly taken
+        elsewhere.
     """
     plane = _plane(picture, neighbours, track)
     if plane is None:
@@ -67,6 +68,8 @@ def propose_position(
         text = f"GPX track, {_after(track.seconds)} a point"
         sources.append((position_mixture(track, plane), text, "not on the GPX track"))
     product = reduce(Mixture.times, (mixture for mixture, _, _ in sources))
+    if not len(product.weights):
+        return None
     centre, probability = product.best_circle(radius_m)
     latitude, longitude = plane.to_degrees(*centre)
     reasons = []

@@ -107,10 +107,9 @@ class Mixture:
     def best_circle(self, radius_m: float) -> tuple[tuple[float, float], float]:
         """Return the centre of a circle of a radius that is very probable, and its probability.
 
+        The mixture has a Gaussian.
         The centre is the mean within the most probable circle around one of the largest Gaussians.
         """
-        if not len(self.weights):
-            return (0.0, 0.0), 0.0
         points, weights = self._points()
         tried = self.means[np.argsort(-self.weights, kind="stable")[:CENTRES]]
         inside = _within(points, tried, radius_m)

@@ -33,6 +33,9 @@ MAX_NAME = 1000
 MAX_UNLOCATED = 100
 """Photos without coordinates in one call; each takes some milliseconds"""
 MAX_SIMILAR = 100
+POSITIONS_PATH = "/positions"
+MAX_BODY_BYTES = 4_000_000
+"""Of a folder with 10,000 photos, a track, and 100 photos to locate with 50 similar ones each"""
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
@@ -70,7 +73,7 @@ class CircleBody(_Finite):
 
     latitude: Latitude
     longitude: Longitude
-    radius_m: float = Field(gt=0, le=1e6)
+    radius_m: float = Field(ge=0.001, le=1e6)
     probability: Probability
 
 
@@ -160,7 +163,7 @@ def read_header(
     return PhotoHeaderResponse.model_validate(header)
 
 
-@router.post("/positions", operation_id="propose_positions", dependencies=[READ])
+@router.post(POSITIONS_PATH, operation_id="propose_positions", dependencies=[READ])
 def propose_positions(
     gateway: GatewayDep, query: MapQuery, body: PositionsBody
 ) -> ProposalsResponse:

@@ -11,6 +11,7 @@ import pytest
 from sqlalchemy import select, update
 from starlette.datastructures import Headers
 
+from services.gateway.app import FORM_PATHS
 from services.gateway.authentication import ApiKeyAuthenticator
 from shared.catalog.api_keys import ApiKey
 from shared.catalog.photos import Photo
@@ -198,6 +199,20 @@ def test_calls_of_its_map_are_open_to_a_key_and_those_of_all_maps_are_not(
     assert door(limited, "GET", "/maps/b", params={"map": "a"}).status_code == 403
     photo = {"files": {"file": ("photo.jpg", photo_bytes(1))}, "params": {"map": "a"}}
     assert door(limited, "POST", "/upload", **photo).status_code == 202
+
+
+def test_the_calls_that_receive_a_form_are_those_without_a_limit_on_its_body(door: Door) -> None:
+    paths = door.app.openapi()["paths"]
+    forms = [
+        path
+        for path, methods in paths.items()
+        for call in methods.values()
+        if "multipart/form-data" in call.get("requestBody", {}).get("content", {})
+    ]
+    assert len(forms) >= 6
+    for path in paths:
+        filled = re.sub(r"\{\w+\}", str(new_id()), path)
+        assert (FORM_PATHS.fullmatch(filled) is not None) == (path in forms), path
 
 
 def test_a_key_for_some_maps_is_listed_with_them_and_can_not_be_an_admin(door: Door) -> None:

@@ -87,3 +87,25 @@ def test_bodies_that_cannot_be_computed_are_refused(service: Service) -> None:
     for photos in ([half], many, [{"name": "a", "latitude": 95, "longitude": 0}]):
         answer = service("POST", "/positions", json={"photos": photos})
         assert problem(answer, 422, "invalid_field")
+
+
+@only_sqlite
+def test_a_folder_of_thousands_of_photos_is_one_call(service: Service) -> None:
+    similar = [
+        {"name": f"IMG_20260501_{number:06}.jpg", "latitude": 45.0, "longitude": 7.0, "score": 0.9}
+        for number in range(50)
+    ]
+    search = {"similar": similar, "circles": [], "not_in_map": 0.02}
+    unknown = [{**dated(f"unknown/{number}.jpg", number), "search": search} for number in range(20)]
+    known = [dated(f"folder/known/{number}.jpg", number, 45.0) for number in range(9_000)]
+    assert len(propose(service, *unknown, *known)) == 20
+    large = service("POST", "/positions", content=b" " * 4_000_001)
+    assert problem(large, 413, "body_too_large")
+
+
+@only_sqlite
+@pytest.mark.parametrize("path", ["/positions", "/photo-headers"])
+def test_a_large_body_is_not_read_because_it_is_called_a_form(service: Service, path: str) -> None:
+    form = {"Content-Type": "multipart/form-data; boundary=a"}
+    answer = service("POST", path, content=b"x" * 4_000_001, headers=form)
+    assert problem(answer, 413, "body_too_large")

@@ -8,11 +8,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import httpx2
+import pytest
 
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.jobs import InProcessWakeups
 from tests.integration.in_process_api import API, Service
-from tests.support.photos import photo_bytes
+from tests.support.photos import encoded, photo_bytes, photo_image
+
+# No URL depends on the database.
+pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
 
 MAP = "words"
 URLS = re.compile(r".+_url|image_path")
@@ -127,6 +131,11 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     service.drain()
     call("get_track_frame", "GET", f"{track}/frames/{frame['frame_id']}")
     call("get_track", "GET", track)
+
+    wide = {"file": ("wide.jpg", encoded(photo_image(7, 1700, 64), "JPEG"))}
+    waiting = call("upload", "POST", "/upload", files=wide)
+    call("get_preview", "GET", f"/uploads/{waiting['file_id']}/preview")
+    call.cancel(waiting)
 
     photo = {"file": ("photo.jpg", photo_bytes(6))}
     batch = call("upload_batch", "POST", "/upload/batch", files=photo)

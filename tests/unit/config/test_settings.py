@@ -443,6 +443,9 @@ def test_a_secret_file_that_cannot_be_read_or_is_ambiguous_is_refused(
     with pytest.raises(Misconfigured, match=r"ADMIN_KEY_FILE=.*missing: No such file") as error:
         read_settings()
     assert error.value.code == "bad_setting"
+    (tmp_path / "missing").write_text("\n")
+    with pytest.raises(Misconfigured, match="the file is empty"):
+        read_settings()
     (tmp_path / "missing").write_text("0123456789abcdef")
     monkeypatch.setenv("ADMIN_KEY", "another-key-of-an-operator")
     with pytest.raises(Misconfigured, match="both set") as error:

@@ -107,6 +107,22 @@ def test_a_picture_alone_is_as_probable_as_its_estimate() -> None:
     assert proposal.radius_m == RADIUS_M
 
 
+def test_a_picture_of_another_place_than_the_maps_proposes_nothing() -> None:
+    elsewhere = PictureEvidence(picture((0, 0, 0.9)).similar, [], 1.0, 1000)
+    assert propose_position(elsewhere, None, None, RADIUS_M) is None
+
+
+def test_similar_photos_count_by_their_scores_in_any_order() -> None:
+    """Answers are in the order of the match probability."""
+    similar = picture((0, 0, 0.9), (900, 0, 0.5), (1800, 0, 0.4)).similar
+    by_score, reversed_ = (
+        proposed(PictureEvidence(photos, [], 0.02, 1000)) for photos in (similar, similar[::-1])
+    )
+    assert metres_from(by_score, 0, 0) < 1
+    assert metres_from(reversed_, 0, 0) < 1
+    assert reversed_.probability == pytest.approx(by_score.probability)
+
+
 def test_a_neighbour_in_time_decides_between_two_places_that_look_alike() -> None:
     alike = picture((0, 0, 0.80), (1500, 0, 0.79), (1510, 0, 0.78), (4000, 0, 0.4), probability=0.5)
     assert proposed(alike).probability < 0.6
