@@ -112,6 +112,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
     Raises:
         Conflict: `run_in_use`.
+        Misconfigured: `out_unwritable`.
     """
     lock = FileLock(folder / LOCK_FILE, timeout=0)
     try:
@@ -120,6 +121,10 @@ def lock_folder(folder: Path) -> Iterator[None]:
         raise Conflict(
             "run_in_use", f"Another process trains in {folder}. Wait for it, or stop it."
         ) from None
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"Can't write to {folder}: {error.strerror}."
+        ) from error
     try:
         yield
     finally:

@@ -25,7 +25,14 @@ from shared.descriptors.backbones.trained import TrainedBackbone
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
-from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
+from shared.errors import (
+    Conflict,
+    InvalidRequest,
+    Misconfigured,
+    NotFound,
+    PlacewiseError,
+    Unprocessable,
+)
 from tests.support.training_runs import (
     CITY,
     assert_same_weights,
@@ -327,6 +334,13 @@ def test_damaged_and_foreign_files_of_a_run_are_clear_errors(copy: Path, places:
     assert refusal_of_resume(copy)[0] == "run_unreadable"
     config.write_text("lr: [")
     assert refusal_of_resume(copy)[0] == "bad_config"
+
+
+def test_a_folder_that_can_not_be_locked_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(Misconfigured) as refused, lock_folder(tmp_path / "file"):
+        pass
+    assert refused.value.code == "out_unwritable"
 
 
 def test_a_run_or_grid_that_another_process_trains_is_left_alone(copy: Path) -> None:

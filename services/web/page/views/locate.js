@@ -23,7 +23,7 @@ export async function showLocate(view, { signal }) {
   const least = h("input", { type: "number", min: 0, max: 100, step: 1, value: 95, required: true });
   const progress = h("div", {});
   const result = h("div", { class: "view" });
-  const track = [];
+  let track = [];
   let photos = [];
 
   const propose = async () => {
@@ -34,7 +34,9 @@ export async function showLocate(view, { signal }) {
   };
   const fail = (error) => !signal.aborted && noteError(error);
   const take = async (files) => {
-    for (const { file } of files.filter(({ path }) => /\.gpx$/i.test(path))) track.push(...readTrack(await file.text(), file.name));
+    const tracks = files.filter(({ path }) => /\.gpx$/i.test(path));
+    if (tracks.length) track = [];
+    for (const { file } of tracks) track.push(...readTrack(await file.text(), file.name));
     const chosen = files.filter(({ path }) => PHOTO.test(path));
     if (!chosen.length && !photos.length) {
       note(track.length ? "Now add the photos of the trip." : "There are no photos in it.");
