@@ -115,3 +115,17 @@ def _draw(path: Path, place: int, number: int, side: int) -> None:
     own = np.random.default_rng((place, number)).integers(-30, 30, (6, 6, 3))
     pixels = np.clip(coarse + own, 0, 255).astype(np.uint8)
     Image.fromarray(pixels).resize((side, side), Image.Resampling.BICUBIC).save(path, quality=90)
+
+
+class StopAfter(NullDisplay):
+    """Requests a stop at the `times`-th report of progress in `what`."""
+
+    def __init__(self, stop: StopRequest, what: str, times: int) -> None:
+        super().__init__()
+        self._stop, self._what, self._left = stop, what, times
+
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        if what.startswith(self._what):
+            self._left -= 1
+            if self._left == 0:
+                self._stop.is_requested = True

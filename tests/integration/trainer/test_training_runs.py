@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,44 +15,27 @@ from typer.testing import CliRunner
 from services.cli.main import build_app
 from services.trainer import run
 from services.trainer.arguments import build_arguments, load_yaml
-from services.trainer.grid import GridPlan, run_grid
 from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
-from services.trainer.run_folder import lock_folder
 from shared.descriptors.backbones.trained import TrainedBackbone
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
 from shared.errors import (
-    Conflict,
     InvalidRequest,
-    Misconfigured,
-    NotFound,
     PlacewiseError,
     Unprocessable,
 )
 from tests.support.training_runs import (
     CITY,
+    StopAfter,
     assert_same_weights,
     run_arguments,
     train,
     weights,
-    write_tiny_places,
 )
 
 Json = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_places(tmp_path_factory.mktemp("places"))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 OWN_CODE = """
@@ -74,28 +54,6 @@ class Strongest(Aggregator):
     def forward(self, maps):
         return normalise_rows(maps.amax((-2, -1)))
 """
-
-
-class StopAfter(NullDisplay):
-    """Asks for the end once `what` has been heard of `times` times."""
-
-    def __init__(self, stop: StopRequest, what: str, times: int) -> None:
-        super().__init__()
-        self._stop, self._what, self._left = stop, what, times
-
-    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
-        if what.startswith(self._what):
-            self._left -= 1
-            if self._left == 0:
-                self._stop.is_requested = True
-
-
-@pytest.fixture(scope="module")
-def whole(places: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Json]:
-    """A run that nobody interrupted, its loggers and its test included."""
-    out = tmp_path_factory.mktemp("whole")
-    said = run_arguments(places, out, experiment_phase="all", logger="csv,tensorboard")
-    return out / "run", train(said)
 
 
 def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Path, Json]) -> None:
@@ -158,63 +116,6 @@ def test_the_same_run_twice_gives_the_same_weights(
     assert_same_weights(folder / "checkpoints/last.ckpt", Path(again["last"]))
 
 
-@pytest.mark.parametrize(
-    ("what", "times"),
-    [("epoch 1", 2), ("epoch 1", 3), ("epoch 2", 1), ("places", 1), ("places", 4)],
-    ids=["in an epoch", "at its last step", "in the next", "measuring", "measuring the last"],
-)
-def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
-    what: str, times: int, whole: tuple[Path, Json], places: Path, tmp_path: Path
-) -> None:
-    folder, report = whole
-    stop = StopRequest()
-    (name,) = report["sets"]
-    display = StopAfter(stop, name if what == "places" else what, times)
-    with pytest.raises(RunStopped):
-        run.run(build_arguments(run_arguments(places, tmp_path)), display, stop)
-    resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
-    assert [epoch["figures"] for epoch in resumed["epochs"]] == [
-        epoch["figures"] for epoch in report["epochs"]
-    ]
-    assert resumed["images"] == report["images"]
-    assert_same_weights(folder / "checkpoints/last.ckpt", Path(resumed["last"]))
-    assert_same_weights(Path(report["best"]["path"]), Path(resumed["best"]["path"]))
-
-
-def test_a_run_that_an_earlier_release_began_goes_on(
-    whole: tuple[Path, Json], places: Path, tmp_path: Path
-) -> None:
-    """Lightning's Trainer wrote its checkpoint: random numbers in the state of a callback."""
-    stop = StopRequest()
-    with pytest.raises(RunStopped):
-        run.run(
-            build_arguments(run_arguments(places, tmp_path)), StopAfter(stop, "epoch 1", 2), stop
-        )
-    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    stored = torch.load(last, weights_only=True)
-    stored["callbacks"] = {"TrainingCallback": stored.pop("rng_state")}
-    del stored["MixedPrecision"]  # written with 16-mixed only
-    torch.save(stored, last)
-    resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
-    assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(resumed["last"]))
-
-
-def test_a_finished_run_learns_longer_and_continues_its_csv_file(
-    whole: tuple[Path, Json], tmp_path: Path
-) -> None:
-    folder, _ = whole
-    copy = Path(shutil.copytree(folder, tmp_path / "run"))
-    changes = {"max_epochs": 3, "logger": "csv", "experiment_phase": "train"}
-    report = run.resume(copy, changes, NullDisplay(), StopRequest())
-    assert [epoch["number"] for epoch in report["epochs"]] == [0, 1, 2]
-    (file,) = (copy / "csv").rglob("metrics.csv")
-    with file.open(newline="") as opened:
-        rows = list(csv.DictReader(opened))
-    assert [int(row["step"]) for row in rows if row["loss"]] == list(range(1, 10))
-    validated = [row["step"] for row in rows if not row["loss"]]
-    assert validated == ["3", "6", "9"]
-
-
 def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
     places: Path, tmp_path: Path
 ) -> None:
@@ -239,120 +140,6 @@ def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
     assert f"--data {places} --set {name}" in report["next"][0]
 
 
-def test_a_resumed_run_can_not_become_another(
-    whole: tuple[Path, Json], places: Path, tmp_path: Path
-) -> None:
-    folder, _ = whole
-    copy = Path(shutil.copytree(folder, tmp_path / "run"))
-    changed = {"batch_size": 3, "lr": 0.5, "miner_margin": 0.3, "augmentation": "none"}
-    with pytest.raises(Conflict, match="batch_size") as caught:
-        run.resume(copy, changed, NullDisplay(), StopRequest())
-    for change in ("lr (0.001 -> 0.5)", "miner_margin (0.1 -> 0.3)", "augmentation (randaugment"):
-        assert change in caught.value.detail
-    more = write_tiny_places(tmp_path / "more", places=7)
-    with pytest.raises(Conflict, match="are not those that the run"):
-        run.resume(copy, {"data_root": str(more)}, NullDisplay(), StopRequest())
-    with pytest.raises(NotFound, match="there is no"):
-        run.resume(tmp_path, {}, NullDisplay(), StopRequest())
-
-
-def refusal_of_resume(path: Path, **changes: Any) -> tuple[str, str]:
-    """Code and detail of the error with which `--resume` is refused."""
-    config = path / "config.yaml"
-    before = config.read_bytes() if config.is_file() else None
-    with pytest.raises(PlacewiseError) as caught:
-        run.resume(path, changes, NullDisplay(), StopRequest())
-    assert before is None or config.read_bytes() == before, "a refused resume changes nothing"
-    return caught.value.code, caught.value.detail
-
-
-@pytest.fixture
-def copy(whole: tuple[Path, Json], tmp_path: Path) -> Path:
-    """The finished run, to be damaged."""
-    return Path(shutil.copytree(whole[0], tmp_path / "run"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"seed": 2}, "seed (1 -> 2)"),
-        ({"compatible": True}, "optimizer (adam -> adamw)"),
-        ({"max_epochs": 1}, "was trained for 6 steps, but the run ends after 3"),
-        ({"max_steps": 5}, "ends after 5"),
-        ({"interpolation": "bicubic"}, "interpolation (bilinear -> bicubic)"),
-    ],
-)
-def test_a_run_is_not_resumed_with_what_contradicts_its_training(
-    copy: Path, changes: Json, reason: str
-) -> None:
-    code, detail = refusal_of_resume(copy, **changes)
-    assert code == "run_differs"
-    assert reason in detail
-
-
-def test_a_run_is_not_resumed_for_a_test_and_a_trial_step_leaves_it_as_it_was(copy: Path) -> None:
-    code, detail = refusal_of_resume(copy, experiment_phase="test")
-    assert code == "bad_argument"
-    assert "--model_path" in detail
-    before = {file: file.read_bytes() for file in copy.rglob("*") if file.is_file()}
-    answer = run.resume(copy, {"fast_dev_run": True, "max_epochs": 3}, NullDisplay(), StopRequest())
-    assert answer == {"fast_dev_run": True}
-    assert {file: file.read_bytes() for file in copy.rglob("*") if file.is_file()} == before
-
-
-def test_damaged_and_foreign_files_of_a_run_are_clear_errors(copy: Path, places: Path) -> None:
-    config, last = copy / "config.yaml", copy / "checkpoints" / "last.ckpt"
-    written = config.read_text()
-    config.write_text(written.replace("lr: 0.001", "lr: 0.5"))
-    assert refusal_of_resume(copy)[0] == "run_differs"
-    assert "lr (0.001 -> 0.5)" in refusal_of_resume(copy)[1]
-    config.write_text(written)
-
-    data = last.read_bytes()
-    last.write_bytes(data[: len(data) // 2])
-    assert refusal_of_resume(copy)[0] == "checkpoint_unreadable"
-    best = next(file for file in last.parent.iterdir() if file != last)
-    last.write_bytes(best.read_bytes())
-    code, detail = refusal_of_resume(copy)
-    assert code == "checkpoint_unreadable"
-    assert "full training state" in detail
-
-    stored = torch.load(io.BytesIO(data), weights_only=True)
-    name = next(iter(stored["state_dict"]))
-    stored["state_dict"][name] = torch.zeros(1)
-    torch.save(stored, last)
-    code, detail = refusal_of_resume(copy)
-    assert code == "run_differs"
-    assert "another network" in detail
-    last.unlink()
-    assert refusal_of_resume(copy)[0] == "run_not_found"
-    last.write_bytes(data)
-
-    (copy / "history.json").write_text('{"training_set": {}, "epochs": [], "best": []}')
-    assert refusal_of_resume(copy)[0] == "run_unreadable"
-    (copy / "history.json").unlink()
-    assert refusal_of_resume(copy)[0] == "run_unreadable"
-    config.write_text("lr: [")
-    assert refusal_of_resume(copy)[0] == "bad_config"
-
-
-def test_a_folder_that_can_not_be_locked_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(Misconfigured) as refused, lock_folder(tmp_path / "file"):
-        pass
-    assert refused.value.code == "out_unwritable"
-
-
-def test_a_run_or_grid_that_another_process_trains_is_left_alone(copy: Path) -> None:
-    with lock_folder(copy):
-        code, detail = refusal_of_resume(copy, max_epochs=3)
-    assert code == "run_in_use"
-    assert str(copy) in detail
-    plan, nothing = GridPlan((), {}), lambda outcomes: None
-    with lock_folder(copy), pytest.raises(Conflict, match="Another process"):
-        run_grid(plan, copy, NullDisplay(), StopRequest(), nothing)
-
-
 def test_a_compiled_network_learns_the_same_and_leaves_an_ordinary_checkpoint(
     whole: tuple[Path, Json], places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -373,11 +160,11 @@ def test_a_compiled_network_learns_the_same_and_leaves_an_ordinary_checkpoint(
 def test_the_trained_model_keeps_the_size_and_the_interpolation_of_its_validation(
     places: Path, tmp_path: Path
 ) -> None:
-    said = run_arguments(
+    fields = run_arguments(
         places, tmp_path, val_image_size=[48, 64], interpolation="bicubic",
         randaugment_magnitude=5, max_steps=1, experiment_phase="all"
     )  # fmt: skip
-    best = Path(train(said)["best"]["path"])
+    best = Path(train(fields)["best"]["path"])
     config = load_checkpoint(best).config
     assert (config.image_size, config.interpolation) == ((48, 64), "bicubic")
     served = TrainedBackbone.from_checkpoint("gsv:walks", best, torch.device("cpu"))
@@ -399,15 +186,15 @@ def test_own_code_is_trained_stopped_resumed_and_tested_by_its_name(
         "miner_name": "pytorch_metric_learning.miners:BatchHardMiner",
         "experiment_phase": "all",
     }
-    said = run_arguments(places, tmp_path, **own)
+    fields = run_arguments(places, tmp_path, **own)
     stop = StopRequest()
     with pytest.raises(RunStopped):
-        run.run(build_arguments(said), StopAfter(stop, "epoch 1", 2), stop)
+        run.run(build_arguments(fields), StopAfter(stop, "epoch 1", 2), stop)
     monkeypatch.delitem(AGGREGATORS, aggregator)  # as in another process
     report = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
     assert not [line for line in report["next"] if "models add" in line]
     tested = train(
-        {**said, "experiment_phase": "test", "run_name": "t", "model_path": report["last"]}
+        {**fields, "experiment_phase": "test", "run_name": "t", "model_path": report["last"]}
     )
     assert tested["test"].keys() == report["test"].keys()
     del AGGREGATORS[aggregator], STAGES[backbone]
@@ -417,8 +204,8 @@ def test_frozen_layers_keep_their_weights_and_the_others_learn(
     places: Path, tmp_path: Path
 ) -> None:
     display = NullDisplay()
-    said = run_arguments(places, tmp_path, layers_to_freeze=0, max_steps=2)
-    report = train(said, display)
+    fields = run_arguments(places, tmp_path, layers_to_freeze=0, max_steps=2)
+    report = train(fields, display)
     begun = train(
         run_arguments(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0")
     )
@@ -435,13 +222,13 @@ def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_pat
     broken = sorted((mine / "gsv_xs" / "train" / CITY).iterdir())[0]
     broken.write_bytes(broken.read_bytes()[:100])
     display = NullDisplay()
-    said = run_arguments(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
-    report = train(said, display)
+    fields = run_arguments(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
+    report = train(fields, display)
     assert list(report["bad_photos"]) == [str(broken)]
     assert report["images"] == 17
     assert any(broken.name in line for line in display.messages)
     with pytest.raises(Unprocessable, match=broken.name[:20]) as caught:
-        train({**said, "on_bad_image": "error", "run_name": "strict"})
+        train({**fields, "on_bad_image": "error", "run_name": "strict"})
     assert caught.value.code == "undecodable_photo"
 
 
@@ -449,19 +236,19 @@ def test_a_checkpoint_alone_is_tested(
     whole: tuple[Path, Json], places: Path, tmp_path: Path
 ) -> None:
     _, trained = whole
-    said = {
+    fields = {
         **run_arguments(
             places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]
         ),
     }
-    del said["image_size"]  # the checkpoint knows it
-    report = train(said)
+    del fields["image_size"]  # the checkpoint knows it
+    report = train(fields)
     assert report["test"] == trained["test"]
     assert all(Path(file).is_file() for file in report["predictions"].values())
-    native = train({**said, "test_image_size": "native", "run_name": "native"})
+    native = train({**fields, "test_image_size": "native", "run_name": "native"})
     assert native["test"].keys() == trained["test"].keys()
     with pytest.raises(InvalidRequest, match="--model_path"):
-        train({**said, "model_path": "", "run_name": "none"})
+        train({**fields, "model_path": "", "run_name": "none"})
 
 
 def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
@@ -470,7 +257,7 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("others", "code", "said"),
+    ("others", "code", "expected"),
     [
         ({"data_root": None}, "data_root_missing", "--data_root DIR"),
         ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
@@ -485,30 +272,30 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_not_there_is_named_with_what_is_known(
-    others: Json, code: str, said: str, places: Path, tmp_path: Path
+    others: Json, code: str, expected: str, places: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(PlacewiseError) as caught:
         train(run_arguments(places, tmp_path, **others))
     assert caught.value.code == code
-    assert said in caught.value.detail
+    assert expected in caught.value.detail
 
 
 def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_path: Path) -> None:
-    said = run_arguments(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
+    fields = run_arguments(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
     with pytest.raises(Unprocessable) as caught:
-        train(said)
+        train(fields)
     assert caught.value.code in ("loss_not_finite", "features_not_finite")
 
 
 def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_others(
     places: Path, tmp_path: Path
 ) -> None:
-    said = run_arguments(places, tmp_path, max_epochs=1)
-    del said["default_root_dir"], said["run_name"], said["agg_arch"]
+    fields = run_arguments(places, tmp_path, max_epochs=1)
+    del fields["default_root_dir"], fields["run_name"], fields["agg_arch"]
     file = tmp_path / "grid.yaml"
     mixvpr = {"agg_arch": "MixVPR", "agg_config": {"nonsense": 1}}
     file.write_text(
-        json.dumps({"base": said, "grid": {"agg": [{"agg_arch": "AVG"}, {"agg_arch": "GeM"}]},
+        json.dumps({"base": fields, "grid": {"agg": [{"agg_arch": "AVG"}, {"agg_arch": "GeM"}]},
                     "runs": [{"name": "wrong", **mixvpr}]})
     )  # fmt: skip
     out = tmp_path / "grid"
