@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -361,7 +362,7 @@ def _print_proposals(
     names = ", ".join(written.written[:3]) + (" ..." if len(written.written) > 3 else "")
     err_console.print(
         f"{len(written.written)} files written{': ' if names else ''}{names}. "
-        f"Undo: placewise locate {printable_path(folder)} --undo",
+        f"Undo: {sys.argv[0]} locate {printable_path(folder)} --undo",
         soft_wrap=True,
         markup=False,
     )
