@@ -21,7 +21,6 @@ from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
     check_spec_matches,
-    ensure_model_row,
     generation_spec_columns,
 )
 from shared.catalog.database.base import db_now
@@ -145,7 +144,7 @@ def _create_first_generation(
             state=GenerationState.ACTIVE,
             activated_at=db_now(),
             **generation_spec_columns(
-                ensure_model_row(session, extractor),
+                session,
                 DescriptorPipeline(extractor, centres),
                 vocabulary.id if vocabulary else None,
             ),
