@@ -14,6 +14,9 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
+# tests/e2e/test_estimates.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
 
 
