@@ -195,6 +195,8 @@ class TestSearchWorkerByInt8(TestSearchWorker):
 class TestSearchWorkerOfFloat16Rows(SearchPortContract):
     """The same promises for rows that are stored in half precision, compared as they are stored."""
 
+    length_error = 2.0**-11
+
     @pytest.fixture
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
         return SmallMap(catalog, store, RowType.FLOAT16)
@@ -218,7 +220,6 @@ class TestSearchWorkerOfFloat16Rows(SearchPortContract):
         assert np.array_equal(rows, np.stack(list(places.rows.values())))
 
 
-@whatever_the_catalog
 class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):
     """The same promises where sign codes of such rows select the rows first."""
 
