@@ -40,6 +40,7 @@ from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
 from shared.catalog.database.schema import migrate, sqlite_file
 from shared.catalog.database.session import Catalog, TransactionTimeouts
+from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
@@ -148,7 +149,9 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         store = open_installation_store(catalog, settings, exclusive=True)
         wakeups = InProcessWakeups()
         with catalog.write() as session:
-            get_or_create_default_map(session, settings.new_map_extractor)
+            get_or_create_default_map(
+                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
+            )
             # The lock proves that no other worker is alive: rows are left from a killed process.
             delete_dead_search_workers(session, all_workers=True)
             delete_processes(session, "extractor")

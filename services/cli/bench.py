@@ -263,6 +263,40 @@ def search(
     )
 
 
+@app.command("rivals")
+def rivals(
+    photos: Annotated[int, typer.Option(min=100, help="Number of photos in the map.")] = 10_000,
+    dimension: Annotated[
+        int, typer.Option(min=64, help="Descriptor dimension, a multiple of 64.")
+    ] = 98_304,
+    pca: Annotated[
+        int,
+        typer.Option(
+            min=2, max=4000, help="Dimension for engines that can't index whole descriptors."
+        ),
+    ] = 1024,
+    queries: Annotated[int, typer.Option(min=2)] = 50,
+    folder: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Folder for the files; 12 GB by default."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare search with faiss, Qdrant, LanceDB and pgvector.
+
+    Requires more packages: uv pip install --group rivals
+    """
+    _run_benchmark(
+        "rivals",
+        as_json,
+        photos=photos,
+        dimension=dimension,
+        pca=pca,
+        queries=queries,
+        folder=folder,
+    )
+
+
 @app.command("catalog")
 def catalog(
     photos: Annotated[int, typer.Option(min=100_000, help="Number of rows to create.")] = 1_000_000,

@@ -42,7 +42,7 @@ def list_maps(
             print_json(maps)
             return
         counts = ("photos", "searchable", "queries")
-        table = Table("map", *counts, "extractor", "vocabulary", "dimension", "labels")
+        table = Table("map", *counts, "extractor", "vocabulary", "dimension", "rows", "labels")
         for map_ in maps:
             table.add_row(
                 map_.name,
@@ -52,6 +52,7 @@ def list_maps(
                 map_.extractor,
                 map_.vocabulary or "",
                 _format_dimension(map_),
+                map_.rows,
                 "paths" if map_.place_labels_are_paths else "names",
             )
         print_table(table)
@@ -78,6 +79,13 @@ def create(
             help="`/` separates the levels of place labels, as in `tower/floor 7/elevator`.",
         ),
     ] = False,
+    rows: Annotated[
+        str | None,
+        typer.Option(
+            help="Type of the stored descriptors: float32, or float16 in half the space. "
+            "Default: the setting DESCRIPTOR_ROWS."
+        ),
+    ] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -88,7 +96,7 @@ def create(
             extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
             created = client.create_map(
-                name, extractor, place_labels_are_paths=place_labels_are_paths
+                name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
             )
         print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 

@@ -28,6 +28,7 @@ from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 MAX_CLUSTERS_SHOWN = 3  # per explanation
 BAR_WIDTH = 20  # characters
 CALIBRATION_SOURCES = {
+    "prior": "on generated maps; this map has few photos",
     "own_photos": "on photos of this map",
     "labelled_queries": "on labelled queries",
 }

@@ -119,7 +119,7 @@ def _create_first_generation(
     if shipped is not None:
         store.put(key, encode_centres(shipped[0]))
     with catalog.write() as session:
-        lock_map(session, map_id)
+        map_ = lock_map(session, map_id)
         existing = active_generation(session, map_id)
         if existing is not None:  # another worker has created it
             vocabulary = None
@@ -143,6 +143,7 @@ def _create_first_generation(
             map_id=map_id,
             state=GenerationState.ACTIVE,
             activated_at=db_now(),
+            row_type=map_.row_type,
             **generation_spec_columns(
                 session,
                 DescriptorPipeline(extractor, centres),

@@ -82,7 +82,7 @@ def _publish_photos(
             store,
             generation_id=generation_id,
             chunk_id=chunk_id,
-            rows=rows,
+            rows=rows.astype(batch.target.generation.row_type, copy=False),
             photo_ids=[photo_id_of(job) for job in batch.ready],
             spec=batch.target.generation.spec,
         )

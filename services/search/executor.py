@@ -139,7 +139,7 @@ def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
     """
     from shared.codes.rotation import get_rotation
 
-    row_bytes = 4 * dimension
+    row_bytes = 4 * dimension  # of float32; float16 rows are half as long, but are converted
     code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
 

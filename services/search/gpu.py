@@ -2,7 +2,7 @@
 
 A generation's rows are held in the GPU's memory as float16 if they fit. One product gives every
 row's score to within a bound; rows that may be among the best are compared exactly on the CPU, by
-their float32 rows. So the results are the same as those of the CPU.
+their stored rows. So the results are the same as those of the CPU.
 
 Error bound of a float16 row: a row x is stored as the float16 numbers h nearest to it, scaled by
 256 so that none underflows; a query u of length 1 is stored as two float16 vectors whose sum v
@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.int8_search import Candidates
+from shared.storage.chunks import StoredRows
 
 PARTIAL_SUM_TERMS = 2048  # products of a row that are summed in float32
 ACCUMULATION_ERROR = 2.0**-22  # error of each addition, relative to the sum of all magnitudes
@@ -168,7 +169,7 @@ class GpuDevice:
             raise GpuError(str(error)) from error
         return GpuSnapshot(self.torch_device, gpu_chunks)
 
-    def _copy_as_float16(self, rows: NDArray[np.float32]) -> GpuChunk:
+    def _copy_as_float16(self, rows: StoredRows) -> GpuChunk:
         parts, part_terms = _partial_sum_layout(rows.shape[1])
         numbers = torch.zeros(
             (_round_up(len(rows), ROWS_ALIGNED), parts * part_terms),

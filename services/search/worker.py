@@ -80,7 +80,7 @@ class QueryRowReader:
             return self._read_cached(request.object_key, request.row)
         if request.row >= len(chunk.rows):
             raise reference_expired_error(f"row {request.row} of {request.object_key}")
-        row: Row = chunk.rows[request.row]
+        row: Row = chunk.rows[request.row].astype(np.float32)
         return row
 
     def read_background(self, references: Sequence[RowReference]) -> list[Row]:

@@ -159,7 +159,7 @@ def _stream_rows(store: ObjectStore, header: bytes, chunks: list[_ChunkRows]) ->
         if chunk.rows:
             rows = read_chunk(store, chunk.object_key, chunk.sha256)
             for row in chunk.rows:
-                yield rows[row].tobytes()
+                yield rows[row].astype(np.float32).tobytes()
 
 
 def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:

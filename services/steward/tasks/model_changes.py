@@ -321,6 +321,10 @@ def _queue_photos(
     for begin in range(0, len(missing), REINDEX_JOBS_PER_TRANSACTION):
         batch = missing[begin : begin + REINDEX_JOBS_PER_TRANSACTION]
         with catalog.write() as session:
+            # The new jobs refer to the map, which PostgreSQL locks for that. Finishing a model
+            # change locks the map before the job, so the same order prevents a deadlock.
+            reference = select(Map.id).where(Map.id == generation.map_id)
+            session.execute(reference.with_for_update(read=True, key_share=True))
             # Of several stewards, one queues at a time; and none for a cancelled model change.
             current = session.get_one(Job, job.id, with_for_update=True)
             if current.waiting_for not in ADVANCED_WAITS:
