@@ -9,7 +9,7 @@ import contextlib
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
@@ -21,7 +21,14 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.style import StyleType
 from rich.text import Text
 
@@ -67,12 +74,22 @@ def print_json(value: Any) -> None:
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json")))
 
 
+def print_message(message: str) -> None:
+    """Print a part of the answer to stdout, as it is: the terminal wraps it."""
+    console.print(message, soft_wrap=True, markup=False)
+
+
+def print_note(message: str) -> None:
+    """As `print_message`, to stderr: about the command, not a part of its answer."""
+    err_console.print(message, soft_wrap=True, markup=False)
+
+
 def print_result(result: Any, as_json: bool, message: str) -> None:
     """Print the result of a command as JSON, or a message about it."""
     if as_json:
         print_json(result)
     else:
-        console.print(message, soft_wrap=True, markup=False)
+        print_message(message)
 
 
 MIN_NAME_WIDTH = 12  # characters
@@ -210,13 +227,20 @@ def progress_bar() -> Progress:
     )
 
 
-def print_failures(report: dict[str, Any], *outcomes: str) -> None:
-    """Print the items of a report with their reasons.
+def stage_bars(progress: Progress, prefix: str = "") -> Callable[[str, int, int], None]:
+    """Return a callback of (stage, done, total) that shows a bar per stage."""
+    bars: dict[str, TaskID] = {}
 
-    Args:
-        report: Lists of items with `path`, `reason` and optionally `filename`.
-        outcomes: The lists to print, such as `refused` and `failed`.
-    """
+    def report(stage: str, done: int, total: int) -> None:
+        if stage not in bars:
+            bars[stage] = progress.add_task(f"{prefix}{stage}", total=total)
+        progress.update(bars[stage], completed=done, total=total)
+
+    return report
+
+
+def print_failures(report: dict[str, Any], *outcomes: str) -> None:
+    """Print the items of a report's lists `outcomes`: `path`, `reason`, `filename` if any."""
     for outcome in outcomes:
         if report[outcome]:
             err_console.print(f"{len(report[outcome])} {outcome}:")
@@ -253,12 +277,7 @@ def atomic_write(out: Path) -> Iterator[BinaryIO]:
 
 
 def check_output_path(out: Path, suffix: str, what: str) -> None:
-    """Check an output path before the long computation of its content.
-
-    Args:
-        out: The path.
-        suffix: The required file name extension.
-        what: What is written, for the error message, such as "a vocabulary".
+    """Check an output path before the long computation of its content, `what` in the error.
 
     Raises:
         InvalidRequest: `bad_out` if the extension is wrong or the folder does not exist.

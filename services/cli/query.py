@@ -18,8 +18,8 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    console,
     print_json,
+    print_message,
     print_table,
     report_errors,
 )
@@ -28,6 +28,7 @@ from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 MAX_CLUSTERS_SHOWN = 3  # per explanation
 BAR_WIDTH = 20  # characters
 CALIBRATION_SOURCES = {
+    "prior": "on generated maps; this map has few photos",
     "own_photos": "on photos of this map",
     "labelled_queries": "on labelled queries",
 }
@@ -142,16 +143,14 @@ def query(
             )
         print_table(table)
         if levels:
-            console.print(_summarize_levels(answer.estimate), soft_wrap=True, markup=False)
+            print_message(_summarize_levels(answer.estimate))
             print_table(_levels_table(answer.estimate))
         else:
-            console.print(_format_estimate(answer.estimate), soft_wrap=True, markup=False)
-        console.print(
+            print_message(_format_estimate(answer.estimate))
+        print_message(
             f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
             f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
-            f"Searched {target}",
-            soft_wrap=True,
-            markup=False,
+            f"Searched {target}"
         )
 
 

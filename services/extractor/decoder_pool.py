@@ -95,11 +95,8 @@ class DecoderPool:
 
     def _schedule(self, data: bytes, decode: Decode) -> ProcessFuture[DecodedPhoto]:
         try:
-            return self._pool.schedule(
-                decode,
-                args=[data],
-                timeout=self._settings.decode_timeout_seconds,
-            )
+            timeout = self._settings.decode_timeout_seconds
+            return self._pool.schedule(decode, args=[data], timeout=timeout)
         except RuntimeError as error:  # raised by pebble when the pool is not running
             raise _pool_broken_error() from error
 

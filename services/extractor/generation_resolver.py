@@ -21,7 +21,6 @@ from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
     check_spec_matches,
-    ensure_model_row,
     generation_spec_columns,
 )
 from shared.catalog.database.base import db_now
@@ -146,7 +145,7 @@ def _create_first_generation(
             activated_at=db_now(),
             row_type=map_.row_type,
             **generation_spec_columns(
-                ensure_model_row(session, extractor),
+                session,
                 DescriptorPipeline(extractor, centres),
                 vocabulary.id if vocabulary else None,
             ),

@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -27,7 +26,6 @@ from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.errors import NotFound, PlacewiseError
 from shared.imaging.decode import DecodedPhoto
-from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token
 from shared.storage import ObjectStore
@@ -79,7 +77,7 @@ def read_rows_to_project(
     with catalog.read() as session:
         source = active_generation(session, jobs[0].map_id)
         live = get_live_photos(session, photo_ids).keys()
-    if source is None or source.spec != unprojected_spec(target):
+    if source is None or source.spec != target.extractor.spec(target.centres):
         return None
     rows = read_stored_rows(catalog, store, source.id, photo_ids)
     if live - rows.keys():
@@ -90,34 +88,24 @@ def read_rows_to_project(
     return [job for job, _ in jobs_with_rows], np.stack([row for _, row in jobs_with_rows])
 
 
-def unprojected_spec(target: ResolvedGeneration) -> dict[str, Any]:
-    """Return the spec of the target's descriptors before the projection."""
-    return target.extractor.spec(target.centres)
-
-
 @dataclass(slots=True)
 class DescribeBatch:
-    """Claimed jobs of one kind, map and generation, from their preparation to publication.
-
-    Attributes:
-        jobs: All jobs of the batch.
-        target: The generation that the batch is described into.
-        ready: Jobs to describe.
-        decoded: Their decoded photos, in the same order; empty with `stored_rows`.
-        failed: Jobs whose photo can't be described, each with the reason.
-        deleted: Jobs whose photo was deleted meanwhile.
-        stored_rows: Unprojected rows of `ready`, to be projected instead of decoding photos.
-        seconds: Duration of each stage.
-    """
+    """Claimed jobs of one kind, map and generation, from their preparation to publication."""
 
     jobs: list[Job]
     target: ResolvedGeneration
     ready: list[Job] = field(default_factory=list)
+    """Jobs to describe."""
     decoded: list[DecodedPhoto] = field(default_factory=list)
+    """The photos of `ready`, in the same order; empty with `stored_rows`."""
     failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
+    """Jobs whose photo can't be described, each with the reason."""
     deleted: list[Job] = field(default_factory=list)
+    """Jobs whose photo was deleted meanwhile."""
     stored_rows: Rows | None = None
+    """Unprojected rows of `ready`, to be projected instead of decoding photos."""
     seconds: dict[str, float] = field(default_factory=dict)
+    """Duration of each stage."""
 
     @property
     def token(self) -> UUID:
@@ -126,10 +114,6 @@ class DescribeBatch:
     @property
     def kind(self) -> JobKind:
         return JobKind(self.jobs[0].kind)
-
-    def pixels(self) -> list[Pixels]:
-        """Return the (height, width, 3) pixels of each job of `ready`."""
-        return [decoded.pixels for decoded in self.decoded]
 
     def reject(self, index: int, error: PlacewiseError) -> None:
         """Move the job at this index of `ready` to `failed`."""
@@ -244,7 +228,7 @@ def describe_batch(batch: DescribeBatch) -> Rows:
                 assert target.projection is not None
                 rows = target.projection.project(batch.stored_rows)
             else:
-                pixels = batch.pixels()
+                pixels = [decoded.pixels for decoded in batch.decoded]
                 rows = target.extractor.describe(pixels, target.centres, target.projection)
         except PhotoTooLargeForGpu as error:
             batch.reject(error.place, error)

@@ -187,8 +187,9 @@ class EstimateResponse(ResponseModel):
     radius_95_m: float | None = Field(None, description="the same with 95 %")
     calibration_source: str | None = Field(
         None,
-        description="what the probabilities were fitted on: `own_photos` or `labelled_queries` of "
-        "this map; null without levels",
+        description="what determines the probabilities most: `own_photos` or `labelled_queries` of "
+        "this map, or the `prior` of generated maps, near which a map of fewer than 200 evaluated "
+        "photos stays; null without levels",
     )
 
 

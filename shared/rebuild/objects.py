@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import insert, select
+from sqlalchemy import insert, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.batch_items import BatchItem
@@ -32,7 +32,7 @@ from shared.catalog.maps import (
 from shared.catalog.photos import Photo, get_live_photos
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
-from shared.ingest.store_photo import insert_photo, retry_on_conflict
+from shared.ingest.store_photo import insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto, validate_photo
 from shared.rebuild.rows import ROWS_PER_STATEMENT, Progress
 from shared.storage import ObjectStore
@@ -257,9 +257,7 @@ def recover_originals(
             recovered.unreadable.append(key)
             continue
         uploaded_at = datetime.fromtimestamp(modified_at, UTC)
-        recovered.photos += retry_on_conflict(
-            partial(_store, catalog, settings, incoming, uploaded_at, extractor)
-        )
+        recovered.photos += _store(catalog, settings, incoming, uploaded_at, extractor)
     return recovered
 
 
@@ -277,7 +275,8 @@ def _store(
         if session.scalar(same.limit(1)) is not None:
             return False  # an unacknowledged second upload of the same bytes
         map_id = _default_map(session, settings, extractor)
-        insert_photo(session, map_id, incoming).photo.uploaded_at = uploaded_at
+        photo = insert_photo(session, map_id, incoming).photo
+        session.execute(update(Photo).where(Photo.id == photo.id).values(uploaded_at=uploaded_at))
         return True
 
 

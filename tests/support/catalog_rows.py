@@ -11,7 +11,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import select, update
+from sqlalchemy import select, text, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
@@ -245,6 +245,12 @@ def expire_lease(catalog: Catalog, *job_ids: UUID) -> None:
     """The worker that has the jobs was last heard of too long ago."""
     for job_id in job_ids:
         set_columns(catalog, job_id, lease_until=db_now_plus(-1.0))
+
+
+def is_lock_awaited(catalog: Catalog) -> bool:
+    """Whether a transaction waits for a lock of another one; PostgreSQL only."""
+    with catalog.read() as session:
+        return bool(session.scalar(text("SELECT count(*) FROM pg_locks WHERE NOT granted")))
 
 
 def end_pauses(catalog: Catalog) -> None:

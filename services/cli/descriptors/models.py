@@ -40,9 +40,9 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    console,
     err_console,
     print_json,
+    print_message,
     print_result,
     print_table,
     progress_bar,
@@ -230,10 +230,7 @@ def fetch(
         return
     _print_weights(weights, dimension)
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
-        console.print(
-            f"To allow maps to use it, set TORCHHUB_ALLOWED={escape(config.name)}",
-            soft_wrap=True,
-        )
+        print_message(f"To allow maps to use it, set TORCHHUB_ALLOWED={config.name}")
 
 
 def _fetch_dinov2(backbone: str, settings: Settings, on_progress: OnProgress) -> None:
@@ -265,7 +262,7 @@ def _print_weights(weights: LocalWeights, dimension: int | None) -> None:
         f"Source: {weights.source}. Path: {weights.path}.",
         f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.",
     ):
-        console.print(escape(line), soft_wrap=True)
+        print_message(line)
 
 
 @contextlib.contextmanager

@@ -204,12 +204,7 @@ def _format_provenance(provenance: Json) -> str:
     if "backbone" not in provenance:
         return "of unknown origin"
     preprocessing = provenance["preprocessing"]
-    parts = (
-        provenance["backbone"],
-        provenance["layer"],
-        provenance["facet"],
-        preprocessing["name"],
-    )
+    parts = (*(provenance[key] for key in ("backbone", "layer", "facet")), preprocessing["name"])
     return " ".join(str(part) for part in parts if part is not None)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from services.cli.client import connect
 from services.cli.ingest.anyloc_reader import AnylocFolder, read_anyloc_folder
@@ -18,9 +17,9 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    err_console,
     print_failures,
     print_json,
+    print_note,
     progress_bar,
     report_errors,
 )
@@ -82,17 +81,11 @@ def _build_report(source: AnylocFolder, uploaded: Json) -> Json:
     return {
         "database": str(source.database),
         "rows": source.rows,
-        "photos": uploaded["photos"],
         "unlisted": source.unlisted,
-        "imported": uploaded["uploaded"],
-        "already_there": uploaded["already_there"],
+        "imported": uploaded.pop("uploaded"),
         "missing": source.missing,
         "duplicates": source.duplicates,
-        "refused": uploaded["refused"],
-        "failed": uploaded["failed"],
-        "searchable": uploaded["searchable"],
-        "vocabulary": uploaded["vocabulary"],
-        "fitted": uploaded["fitted"],
+        **uploaded,
         "notes": [DESCRIPTORS_NOTE, *_vocabulary_note(source)],
     }
 
@@ -112,17 +105,16 @@ def _vocabulary_note(source: AnylocFolder) -> list[str]:
 
 def _print_report(report: Json) -> None:
     for note in report["notes"]:
-        err_console.print(escape(note), soft_wrap=True)
-    err_console.print(
+        print_note(note)
+    print_note(
         f"{report['rows']} database rows: {report['imported']} photos imported, "
         f"{report['already_there']} already stored, {len(report['duplicates'])} duplicates, "
         f"{len(report['missing'])} missing, {len(report['refused'])} refused. "
-        f"{report['unlisted']} photos had no database row.",
-        soft_wrap=True,
+        f"{report['unlisted']} photos had no database row."
     )
-    err_console.print(
+    print_note(
         f"The map now has {report['searchable']} searchable photos "
         f"(vocabulary: {report['vocabulary']})."
     )
     print_failures(report, "missing", "duplicates", "refused", "failed")
-    err_console.print(f"Next: {sys.argv[0]} query PHOTO")
+    print_note(f"Next: {sys.argv[0]} query PHOTO")

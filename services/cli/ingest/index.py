@@ -40,9 +40,9 @@ from services.cli.output import (
     ServerOption,
     atomic_write,
     check_output_path,
-    err_console,
     print_failures,
     print_json,
+    print_note,
     progress_bar,
     report_errors,
 )
@@ -173,7 +173,7 @@ def index(
 def _connect(server: str | None, map_name: str | None, key: str | None) -> Iterator[Client]:
     with connect(server, map_name, key) as client:
         target = describe_target(client, server, map_name)
-        err_console.print(f"Indexing into {target}", soft_wrap=True, markup=False)
+        print_note(f"Indexing into {target}")
         yield client
 
 
@@ -236,23 +236,21 @@ def _finish_command(
 
 
 def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
-    err_console.print(
+    print_note(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
         f"The map now has {report['searchable']} searchable photos "
-        f"(vocabulary: {report['vocabulary']}).",
-        soft_wrap=True,
+        f"(vocabulary: {report['vocabulary']})."
     )
     if report.get("other_files") or report.get("without_coordinates"):
-        err_console.print(
+        print_note(
             f"{_count(report['other_files'], 'other file')} skipped, "
-            f"{_count(report['without_coordinates'], 'photo')} without coordinates.",
-            soft_wrap=True,
+            f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
     print_failures(report, "refused", "failed")
     options = f" --map {map_name}" if map_name else ""
     options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    err_console.print(f"Next: {sys.argv[0]} {command}{options}", soft_wrap=True)
+    print_note(f"Next: {sys.argv[0]} {command}{options}")
 
 
 def _count(number: int, noun: str) -> str:

@@ -32,9 +32,10 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_table,
     printable_path,
     progress_bar,
@@ -348,23 +349,19 @@ def _print_proposals(
         )
     if located:
         print_table(table)
-    console.print(
+    print_message(
         f"{len(photos) - len(located)} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "
-        f"{100 * accept:g} %.",
-        soft_wrap=True,
-        markup=False,
+        f"{100 * accept:g} %."
     )
     if written is None:
         if accepted:
-            err_console.print("Nothing is written. --write sidecar, exif, csv or gpx writes them.")
+            print_note("Nothing is written. --write sidecar, exif, csv or gpx writes them.")
         return
     names = ", ".join(written.written[:3]) + (" ..." if len(written.written) > 3 else "")
-    err_console.print(
+    print_note(
         f"{len(written.written)} files written{': ' if names else ''}{names}. "
-        f"Undo: {sys.argv[0]} locate {printable_path(folder)} --undo",
-        soft_wrap=True,
-        markup=False,
+        f"Undo: {sys.argv[0]} locate {printable_path(folder)} --undo"
     )
     for name, reason in written.skipped.items():
         err_console.print(f"[red]skipped[/red] {escape(name)}: {escape(reason)}", soft_wrap=True)
@@ -374,10 +371,7 @@ def _report_undo(report: UndoReport, as_json: bool) -> None:
     if as_json:
         print_json(asdict(report))
     else:
-        err_console.print(
-            f"{len(report.restored)} files restored, {len(report.removed)} removed.",
-            soft_wrap=True,
-        )
+        print_note(f"{len(report.restored)} files restored, {len(report.removed)} removed.")
         for name in report.changed_since:
             err_console.print(
                 f"[red]changed since[/red] {escape(name)}: left as it is", soft_wrap=True

@@ -15,7 +15,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
-from services.cli.output import err_console, report_errors
+from services.cli.output import err_console, print_note, report_errors
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
 
@@ -39,12 +39,12 @@ def serve() -> None:
         is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
 
         def announce(running: Standalone) -> None:
-            _print(_startup_message(running, settings))
+            print_note(_startup_message(running, settings))
             if is_first_start and settings.database_url is None:
                 from services.cli.descriptors.local_weights import suggest_extractor
 
                 if suggestion := suggest_extractor(settings):
-                    _print(f"  note:     {suggestion}")
+                    print_note(f"  note:     {suggestion}")
             if settings.debug and can_reload():
 
                 def restart() -> None:
@@ -120,7 +120,7 @@ def search() -> None:
     with report_errors(as_json=False):
         from services.search.service import serve_search
 
-        serve_search(read_settings(), _print)
+        serve_search(read_settings(), print_note)
 
 
 def gateway() -> None:
@@ -131,7 +131,7 @@ def gateway() -> None:
     with report_errors(as_json=False):
         from services.gateway.service import serve_gateway
 
-        serve_gateway(read_settings(), _print)
+        serve_gateway(read_settings(), print_note)
 
 
 def extractor() -> None:
@@ -142,7 +142,7 @@ def extractor() -> None:
     with report_errors(as_json=False):
         from services.extractor.service import serve_extractor
 
-        serve_extractor(read_settings(), _print)
+        serve_extractor(read_settings(), print_note)
 
 
 def steward() -> None:
@@ -153,7 +153,7 @@ def steward() -> None:
     with report_errors(as_json=False):
         from services.steward.service import serve_steward
 
-        serve_steward(read_settings(), _print)
+        serve_steward(read_settings(), print_note)
 
 
 def migrate() -> None:
@@ -166,8 +166,4 @@ def migrate() -> None:
         from services.service_process import migrate_catalog
 
         installation_id = migrate_catalog(read_settings())
-    _print(f"The catalog's schema is up to date (installation {installation_id})")
-
-
-def _print(message: str) -> None:
-    err_console.print(message, soft_wrap=True)
+    print_note(f"The catalog's schema is up to date (installation {installation_id})")

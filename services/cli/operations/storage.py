@@ -19,6 +19,8 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_result,
     report_errors,
 )
@@ -93,23 +95,20 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
     checked = ", ".join(f"{count} {kind}s" for kind, count in sorted(report.checked.items()))
-    console.print(
+    print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
-        f"{len(report.faults)} faults",
-        soft_wrap=True,
+        f"{len(report.faults)} faults"
     )
     if report.orphans:
-        console.print(
+        print_message(
             f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are not in the "
             "catalog: uploads in progress or left by a crash. The steward moves old ones to the "
-            "trash.",
-            soft_wrap=True,
+            "trash."
         )
     if report.trash_objects:
-        console.print(
+        print_message(
             f"{report.trash_objects} objects ({report.trash_bytes / 1e6:.1f} MB) are in the trash. "
-            "`placewise storage restore-trash` restores them.",
-            soft_wrap=True,
+            "`placewise storage restore-trash` restores them."
         )
     for fault in report.faults[:MAX_FAULTS_SHOWN]:
         console.print(
@@ -117,17 +116,17 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
             soft_wrap=True,
         )
     if len(report.faults) > MAX_FAULTS_SHOWN:
-        console.print(
+        print_message(
             f"and {len(report.faults) - MAX_FAULTS_SHOWN} more. --json lists all of them."
         )
     repaired = {"chunk", "manifest", "photo"} if queued is not None else set()
     for kind in dict.fromkeys(fault.what for fault in report.faults):
         if kind not in repaired:
-            err_console.print(f"{kind}s: {REMEDIES[kind]}", soft_wrap=True)
+            print_note(f"{kind}s: {REMEDIES[kind]}")
     if queued is not None:
-        console.print(f"Queued {queued} photos for description.")
+        print_message(f"Queued {queued} photos for description.")
     if any(f.wrong == "missing" and f.what == "original" for f in report.faults):
-        err_console.print("Photos without their originals can't be described again.")
+        print_note("Photos without their originals can't be described again.")
 
 
 app = typer.Typer(
@@ -173,16 +172,15 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
+    print_message(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
     _print_orphans(count)
     if confirm:
-        console.print("This catalog is now the owner of the store.")
+        print_message("This catalog is now the owner of the store.")
     else:
-        console.print(
+        print_message(
             "Nothing was changed. Pass --confirm to make this catalog the owner. Services with "
             "another catalog then refuse to start with this store. Objects that are not in the "
-            "catalog are kept but not searchable, until `placewise storage collect --confirm`.",
-            soft_wrap=True,
+            "catalog are kept but not searchable, until `placewise storage collect --confirm`."
         )
 
 
@@ -202,17 +200,17 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
+    print_message(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
     _print_orphans(count)
     if confirm:
-        console.print(
+        print_message(
             f"Moved {moved} objects to the trash. They are deleted after "
             f"{settings.trash_days:g} days (TRASH_DAYS)."
         )
         return
     if hold is not None:
-        console.print(f"Garbage collection is on hold: {escape(hold.describe())}", soft_wrap=True)
-    console.print("Nothing was changed. Pass --confirm to move them to the trash.")
+        print_message(f"Garbage collection is on hold: {hold.describe()}")
+    print_message("Nothing was changed. Pass --confirm to move them to the trash.")
 
 
 @app.command("restore-trash")
@@ -239,9 +237,9 @@ def restore(
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})
         return
-    console.print(f"Restored {restored} objects to their keys.")
+    print_message(f"Restored {restored} objects to their keys.")
     if skipped:
-        console.print(f"{skipped} objects stay in the trash: their keys are in use again.")
+        print_message(f"{skipped} objects stay in the trash: their keys are in use again.")
 
 
 def _as_dict(count: StoreCount) -> dict[str, Any]:
@@ -254,4 +252,4 @@ def _as_dict(count: StoreCount) -> dict[str, Any]:
 
 def _print_orphans(count: StoreCount) -> None:
     for prefix, number in sorted(count.orphans.items()):
-        console.print(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")
+        print_message(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")

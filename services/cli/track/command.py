@@ -25,8 +25,8 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    err_console,
     print_json,
+    print_note,
     print_table,
     printable_path,
     progress_bar,
@@ -144,7 +144,7 @@ def track(
             except Conflict as error:
                 if error.code != "track_too_long":
                     raise
-                err_console.print(error.detail, soft_wrap=True, markup=False)
+                print_note(error.detail)
                 result = client.track(begun.track_id)
             draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
             photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
@@ -237,9 +237,7 @@ def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
     print_table(table)
     states = [frame.state for frame in track.frames if frame.state is not None]
     tracked = sum(state.status == "tracking" for state in states)
-    err_console.print(
+    print_note(
         f"{tracked} of {len(track.frames)} frames are tracked. Track {track.track_id}"
-        f"{''.join(f', {printable_path(file)}' for file in files)}",
-        soft_wrap=True,
-        markup=False,
+        f"{''.join(f', {printable_path(file)}' for file in files)}"
     )

@@ -96,7 +96,7 @@ def add_levels(
             "not_in_map_probability": estimate.not_in_map,
             "radius_68_m": estimate.radius_68_m,
             "radius_95_m": estimate.radius_95_m,
-            "calibration_source": model.source,
+            "calibration_source": model.calibration_source,
         }
     )
 

@@ -30,7 +30,7 @@ from tests.support.small_map import (
 
 OpenPort = Callable[..., SearchBackend]
 # How rows are scanned has nothing to do with the catalog.
-whatever_the_catalog = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+whatever_the_catalog = pytest.mark.databases("sqlite")
 
 
 class SearchPortContract:

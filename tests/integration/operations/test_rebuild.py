@@ -41,6 +41,9 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import stored_rows
 from tests.support.photos import photo_bytes
 
+# tests/faults/test_rebuild_catalog.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 SAID: dict[str, Any] = {
     "latitude": 45.5,
     "longitude": 7.25,
@@ -95,6 +98,7 @@ def two_maps(service: Service) -> dict[str, str]:
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_every_photo_is_searchable_again_with_its_metadata(
     service: Service,
     store: FolderStore,

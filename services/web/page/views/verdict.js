@@ -86,6 +86,7 @@ function ringsInWords(estimate) {
 /** What the probabilities were fitted on, and how they become better. */
 function source({ calibration_source: fitted }) {
   const words = {
+    prior: ["This map has few photos: these probabilities are mostly those of other maps. ", h("a", { href: "#/add" }, "Add more photos"), " or test photos."],
     own_photos: ["These probabilities were fitted on the map’s own photos. ", h("a", { href: "#/add" }, "Add test photos"), " of another day to correct them."],
     labelled_queries: ["These probabilities were fitted on test photos."],
   }[fitted];
