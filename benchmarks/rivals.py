@@ -87,8 +87,9 @@ class Town:
 
     def project(self, rows: Rows) -> Rows:
         """Return the (n, pca) L2-normalised projection of rows."""
-        projected: Rows = (rows - self.mean) @ self.components
-        return projected / np.linalg.norm(projected, axis=1, keepdims=True)
+        projected = (rows - self.mean) @ self.components
+        unit: Rows = projected / np.linalg.norm(projected, axis=1, keepdims=True)
+        return unit
 
     def best(self, queries: Rows) -> list[set[int]]:
         """Return the numbers of the K best photos of each query, by brute force in float64."""
@@ -201,11 +202,12 @@ class FaissIvf(FaissIndex):
     def build(self, pieces: Iterator[Rows], dimension: int) -> None:
         super().build(pieces, dimension)
         expected = self.town.best(self.town.tuning)
-        while self.index.nprobe < self.index.nlist:
+        ivf = faiss.extract_index_ivf(self.index)
+        while ivf.nprobe < ivf.nlist:
             found = [self.search(query) for query in self.town.tuning]
             if recall(found, expected) >= MIN_TUNED_RECALL:
                 break
-            self.index.nprobe *= 2
+            ivf.nprobe *= 2
 
 
 class FaissFlatPca(FaissIndex):
@@ -283,15 +285,17 @@ class Pgvector(Rival):
         import psycopg
 
         # The one of this package has pgvector; one of the system may not.
-        (package,) = importlib.util.find_spec(self.packages[0]).submodule_search_locations  # type: ignore[union-attr,misc]
-        programs = Path(package, "pginstall18", "bin")
+        spec = importlib.util.find_spec(self.packages[0])
+        assert spec is not None
+        assert spec.origin is not None
+        programs = Path(spec.origin).parent / "pginstall18" / "bin"
         with patch.dict(os.environ, PATH=f"{programs}{os.pathsep}{os.environ['PATH']}"):
             server = self.resources.enter_context(start_postgres(own=True))
         url = server.admin.set(drivername="postgresql").render_as_string(hide_password=False)
         self._connection = self.resources.enter_context(psycopg.connect(url, autocommit=True))
         run = self._connection.execute
         run("CREATE EXTENSION vector")
-        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({dimension}))")  # type: ignore[arg-type]
+        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({dimension}))")
         first = 0
         for rows in pieces:
             with self._connection.cursor().copy("COPY photos FROM STDIN") as copy:
