@@ -15,14 +15,7 @@ from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
 from services.cli.evaluation.live_map import answers_table
-from services.cli.output import (
-    Json,
-    Table,
-    print_json,
-    print_message,
-    print_table,
-    printable_path,
-)
+from services.cli.output import Json, Table, print_json, print_message, print_table, printable_path
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
