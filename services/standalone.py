@@ -102,11 +102,7 @@ class Standalone:
 
 
 def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None]) -> None:
-    """Run all services until the process is stopped by a signal.
-
-    Args:
-        settings: The settings.
-        on_ready: Called once the server listens.
+    """Run all services until the process is stopped by a signal; `on_ready` once it listens.
 
     Raises:
         PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
