@@ -278,7 +278,9 @@ def rivals(
     queries: Annotated[int, typer.Option(min=2)] = 50,
     folder: Annotated[
         Path | None,
-        typer.Option(exists=True, file_okay=False, help="Folder for the files; 12 GB by default."),
+        typer.Option(
+            exists=True, file_okay=False, help="Folder for the files; 9 GB for 10,000 photos."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
