@@ -17,7 +17,10 @@ def test_exact_engines_find_all_of_the_best_photos_and_a_projection_fewer(tmp_pa
     rivals = (Placewise, PlacewiseFloat16, FaissFlat, FaissFlatPca)
     report = measure(
         Progress(disable=True),
-        photos=300, dimension=512, pca=8, queries=5,
+        photos=300,
+        dimension=512,
+        pca=8,
+        queries=5,
         folder=tmp_path,
         rivals=rivals,
     )
@@ -46,7 +49,10 @@ def test_missing_packages_are_named_before_anything_is_made(
     with pytest.raises(Misconfigured, match=r"lancedb, qdrant_client.*--group rivals"):
         measure(
             Progress(disable=True),
-            photos=300, dimension=512, pca=8, queries=5,
+            photos=300,
+            dimension=512,
+            pca=8,
+            queries=5,
             folder=tmp_path,
         )
     assert list(tmp_path.iterdir()) == []
