@@ -48,7 +48,7 @@ from services.gateway.uploads.query_photo import (
     query_job_search_params,
     receive_query_photo,
 )
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
