@@ -110,7 +110,6 @@ def rank_by_similarity(queries: Descriptors, database: Descriptors, k: int) -> I
     Args:
         queries: (n, D) L2-normalised descriptors.
         database: (m, D) L2-normalised descriptors.
-        k: ranking depth.
 
     Returns:
         (n, min(k, m)) int64 database indices, most similar first; ties are ordered by index.
@@ -133,7 +132,6 @@ def recall_at_k(
         ranked: (queries, depth) database indices, best first.
         positives: database indices of each query's positives. A query without positives counts as
             a miss; filter such queries beforehand to exclude them.
-        ks: the values of k.
 
     Returns:
         k -> recall from 0 to 1; NaN without queries.

@@ -146,7 +146,6 @@ def compare_with_run(
 
     Args:
         folder: the earlier run's output folder.
-        set_name: the evaluation set.
         fingerprint: the set's fingerprint in this run.
         measured: this run's metrics.
         positives: database indices of each query's positives.

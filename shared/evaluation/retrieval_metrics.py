@@ -125,8 +125,6 @@ def match_distances(
     """Compute the distance of each ranked photo from its query.
 
     Args:
-        queries: the queries.
-        database: the database photos.
         ranked: (queries, k) database indices.
 
     Returns:

@@ -123,11 +123,8 @@ def evaluate_sequence(
     """Follow one sequence.
 
     Args:
-        map_: The map.
-        evaluation_set: The set.
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        motion: The motion model.
 
     Returns:
         The frames, and the CPU seconds of the filter per frame.
@@ -179,13 +176,9 @@ def evaluate_kidnapped(
     The frames outside the map are left out; the sequence goes on from its beginning at its end.
 
     Args:
-        map_: The map.
-        evaluation_set: The set.
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        motion: The motion model.
         every: Number of frames between two kidnappings.
-        seed: Of the places.
 
     Returns:
         For each of KIDNAPS, the frames until the place is tracked and right; None if it is not
@@ -216,7 +209,6 @@ def frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[
     """Return the evidence of the frames of a sequence.
 
     Args:
-        map_: The map.
         times: (n,) when the frames were taken.
         rows: (n, D) their descriptors, of unit length.
     """
