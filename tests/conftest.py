@@ -71,6 +71,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = selected
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test of the catalog on both databases, or on those that its nearest marker names."""
+    if "database" in metafunc.fixturenames:
+        marker = metafunc.definition.get_closest_marker("databases")
+        metafunc.parametrize("database", marker.args if marker else ("sqlite", "postgresql"))
+
+
 def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
     """The relative position of each file among those of these kinds, from 0 to 1."""
     files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
@@ -168,11 +175,11 @@ def spare_databases(postgres: PostgresServer, migrated_postgres: str) -> SpareDa
     return SpareDatabases(postgres, migrated_postgres)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def catalog(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
-    """An empty, migrated catalog: each test that takes it runs on SQLite and on PostgreSQL."""
+@pytest.fixture
+def catalog(database: str, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
+    """An empty, migrated catalog: each test that takes it runs on the databases of its marker."""
     with contextlib.ExitStack() as stack:
-        if request.param == "sqlite":
+        if database == "sqlite":
             copy = shutil.copy(request.getfixturevalue("migrated_sqlite"), tmp_path)
             url = f"sqlite:///{copy}"
         else:

@@ -49,14 +49,9 @@ class ConcurrencyLimit:
     def __init__(
         self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
     ) -> None:
-        """Create the limit.
+        """Create the limit for all callers together, and for one API key or client address.
 
-        Args:
-            what: Names the requests, and the settings of both limits, in error messages.
-            code: Error code of the refusal.
-            total: Limit for all callers together.
-            per_caller: Limit for one API key, and for one client address.
-            retry_after_seconds: Sent as `Retry-After`.
+        `what` names the requests, and the settings of both limits, in error messages with `code`.
         """
         self._what = what
         self._code = code

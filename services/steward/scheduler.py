@@ -232,7 +232,9 @@ class Scheduler:
             PeriodicTask(
                 "free trash",
                 10.0,
-                lambda: _free_trash(store, FREE_TRASH_FACTOR * settings.min_free_bytes, metrics),
+                lambda: metrics.objects_deleted.labels("free_trash").inc(
+                    store.free_trash(FREE_TRASH_FACTOR * settings.min_free_bytes)
+                ),
             ),
         ]
 
@@ -302,7 +304,3 @@ def _collect_orphans(
     deleted, remaining = empty_expired_trash(catalog, store, settings.trash_days)
     metrics.objects_deleted.labels("collect_orphans").inc(deleted)
     metrics.trash_bytes.set(remaining.size_bytes)
-
-
-def _free_trash(store: OwnedStore, min_free_bytes: int, metrics: StewardMetrics) -> None:
-    metrics.objects_deleted.labels("free_trash").inc(store.free_trash(min_free_bytes))

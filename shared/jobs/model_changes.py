@@ -96,6 +96,7 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
         map_id=job.map_id,
         state=GenerationState.ACTIVE if first else GenerationState.BUILDING,
         activated_at=db_now() if first else None,
+        row_type=map_.row_type,
         **columns,
     )
     session.add(generation)

@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation, GenerationState, lock_generation
+from shared.catalog.generations import Generation, GenerationState, RowType, lock_generation
 from shared.catalog.maps import (
     DEFAULT_MAP,
     Map,
@@ -289,7 +289,7 @@ def _default_map(session: Session, settings: Settings, extractor: str | None) ->
         # The extractor may not be loadable here; the photos are then described with the default.
         with contextlib.suppress(Misconfigured):
             name = settings.extractor_config(extractor).name
-    return get_or_create_default_map(session, name).id
+    return get_or_create_default_map(session, name, RowType(settings.descriptor_rows)).id
 
 
 def _is_known(session: Session, key: str) -> bool:

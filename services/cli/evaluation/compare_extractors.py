@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,15 @@ from rich.progress import Progress
 from rich.table import Column
 
 from services.cli.environment import read_settings
-from services.cli.evaluation.data_sets import progress_bars
 from services.cli.evaluation.describers import checkpoint_describer, extractor_describer
 from services.cli.output import (
     Table,
-    console,
     print_json,
+    print_message,
     print_table,
     printable_path,
     progress_bar,
+    stage_bars,
 )
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
@@ -60,9 +60,6 @@ def whiten_set(
     Args:
         database: (m, D) rows.
         queries: (n, D) rows.
-        components: Number of dimensions to keep.
-        device: Device of the projection.
-        on_progress: Called with stage, done and total.
 
     Returns:
         (m, components) and (n, components) rows, and the milliseconds to project one row.
@@ -78,22 +75,17 @@ def whiten_set(
     whitening = fit_pca_stream(batches, len(sampled), dimension, components, on_progress)
     projection = PcaProjection(whitening, device)
     started = time.perf_counter()
-    reduced = [_project(rows, projection, block_rows, device) for rows in (database, queries)]
+    reduced = [_project(rows, projection, block_rows) for rows in (database, queries)]
     seconds = time.perf_counter() - started
     return reduced[0], reduced[1], 1000 * seconds / max(1, len(database) + len(queries))
 
 
-def _project(rows: Rows, projection: PcaProjection, block_rows: int, device: torch.device) -> Rows:
+def _project(rows: Rows, projection: PcaProjection, block_rows: int) -> Rows:
     reduced = np.empty((len(rows), projection.kept), np.float32)
-    for begin, block in _blocks(rows, block_rows):
-        projected = projection(torch.from_numpy(block).to(device)).cpu().numpy()
-        reduced[begin : begin + len(block)] = projected
-    return reduced
-
-
-def _blocks(rows: Rows, block_rows: int) -> Iterator[tuple[int, Rows]]:
     for begin in range(0, len(rows), block_rows):
-        yield begin, np.array(rows[begin : begin + block_rows])
+        block = slice(begin, begin + block_rows)
+        reduced[block] = projection.project(np.array(rows[block]))
+    return reduced
 
 
 FLOAT32_BYTES = 4
@@ -193,7 +185,7 @@ def compare_extractors(
         return
     _print_comparison(evaluation_set, compared)
     if out is not None:
-        console.print(printable_path(out / "report.html"), soft_wrap=True, markup=False)
+        print_message(printable_path(out / "report.html"))
 
 
 def _validate_entries(
@@ -239,7 +231,7 @@ def _evaluate_entry(
             entry.name, None, evaluation_set, settings, progress, fit=entry.fit
         )
     )
-    on_progress = progress_bars(progress, entry.spec_text)
+    on_progress = stage_bars(progress, f"{entry.spec_text}: ")
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
     )
@@ -323,11 +315,9 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         )
     print_table(table)
     clusters = compared[0].measured.clusters
-    console.print(
+    print_message(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; confidence intervals over "
         f"{clusters.count} {clusters.kind}. ms: inference and aggregation per photo, measured when "
-        "its descriptor was computed. bytes: float32 descriptor size.",
-        soft_wrap=True,
-        markup=False,
+        "its descriptor was computed. bytes: float32 descriptor size."
     )

@@ -15,7 +15,7 @@ from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
 from services.cli.evaluation.live_map import answers_table
-from services.cli.output import Json, Table, console, print_json, print_table, printable_path
+from services.cli.output import Json, Table, print_json, print_message, print_table, printable_path
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
@@ -146,9 +146,7 @@ def output_results(
     for result in results:
         _print_result(result)
     if options.out is not None:
-        console.print(
-            f"{printable_path(options.out / 'report.html')}", soft_wrap=True, markup=False
-        )
+        print_message(f"{printable_path(options.out / 'report.html')}")
 
 
 def _print_result(result: EvaluationResult) -> None:
@@ -170,7 +168,7 @@ def _print_result(result: EvaluationResult) -> None:
         f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
     )
     print_table(table)
-    console.print(
+    print_message(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; "
         + (
@@ -178,22 +176,18 @@ def _print_result(result: EvaluationResult) -> None:
             if measured.recall_intervals
             else f"{measured.clusters.count} {measured.clusters.kind} are too few for confidence "
             "intervals."
-        ),
-        soft_wrap=True,
-        markup=False,
+        )
     )
     if result.places is not None:
         print_table(answers_table(result.places))
     if result.against is not None:
         for k, difference in result.against.differences.items():
             bounds = difference.interval_in_points()
-            console.print(
+            print_message(
                 f"R@{k} {100 * difference.mean:+.1f} points{f' ({bounds})' if bounds else ''} "
                 f"compared with "
                 f"{result.against.other}: {difference.won} queries gained, "
-                f"{difference.lost} lost.",
-                soft_wrap=True,
-                markup=False,
+                f"{difference.lost} lost."
             )
 
 

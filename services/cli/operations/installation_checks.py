@@ -19,7 +19,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from sqlalchemy import func, select
-from sqlalchemy.exc import SQLAlchemyError
 
 from placewise.client import Client
 from services.cli.descriptors.local_weights import find_dinov2_weights, suggest_extractor
@@ -31,12 +30,11 @@ from services.cli.operations.deployment_checks import (
     check_redis,
     check_search,
     check_steward,
+    open_for_check,
 )
-from services.cli.operations.store_checks import collection_check, permissions_check
-from shared.catalog.database.errors import explain_outage
+from services.cli.operations.store_checks import CHECK_FILE, collection_check, permissions_check
 from shared.catalog.database.schema import check_pages, check_schema
 from shared.catalog.photos import Photo
-from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
@@ -57,13 +55,12 @@ Check = Callable[[Settings], str]
 def list_checks(settings: Settings, server: str | None, key: str | None) -> list[tuple[str, Check]]:
     """Return the checks of this installation, each with the name of the part that it checks.
 
-    Args:
-        settings: The settings, which decide what an installation has.
-        server: URL of a gateway that is checked as well.
-        key: API key for that gateway.
+    A gateway at the URL `server` is checked as well, with the API key `key`.
     """
-    checks: list[tuple[str, Check]] = [("python", _check_python)]
-    checks.append(("settings", _check_settings))
+    checks: list[tuple[str, Check]] = [
+        ("python", lambda _: f"Python {sys.version.split()[0]}"),
+        ("settings", _check_settings),
+    ]
     if settings.s3_endpoint is None or settings.database_url is None:
         checks.append(("folder", _check_home))  # other services need no writable folder
         checks.append(("permissions", permissions_check))
@@ -71,8 +68,7 @@ def list_checks(settings: Settings, server: str | None, key: str | None) -> list
         checks.append(("uploads", _check_upload_dir))
     else:
         checks.append(("objects", check_object_store))
-    checks.append(("collection", collection_check))
-    checks.append(("journal", _check_journal))
+    checks += [("collection", collection_check), ("journal", _check_journal)]
     if settings.database_url is None:
         checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
@@ -201,10 +197,6 @@ def _default_extractor_config(settings: Settings) -> ExtractorConfig:
 MIN_FREE_DISK_BYTES = 1_000_000_000
 
 
-def _check_python(_settings: Settings) -> str:
-    return f"Python {sys.version.split()[0]}"
-
-
 def _check_settings(settings: Settings) -> str:
     """Report the settings; they are valid, or no check would run."""
     if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
@@ -249,18 +241,9 @@ def _check_journal(settings: Settings) -> str:
     """Check that the catalog contains every change recorded in the object store's journal."""
     if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
         return "nothing is stored yet"
-    catalog = open_catalog(settings, "doctor")
-    try:
+    with open_for_check(settings, CHECK_FILE) as catalog:
         check_schema(catalog)
         lag = catalog_lag(catalog, open_store(settings, exclusive=False))
-    except SQLAlchemyError as error:
-        raise explain_outage(error) or Misconfigured(
-            "catalog_unreadable",
-            f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
-            "restore it from a backup.",
-        ) from error
-    finally:
-        catalog.close()
     if lag is not None:
         raise Misconfigured("catalog_behind", lag.detail)
     return "the catalog is up to date with the object store"
@@ -313,19 +296,8 @@ def _check_server(settings: Settings) -> str:
         return f"running on {running.url}: {searchable} of {stored} photos searchable ({names})"
     if not (settings.placewise_home / "catalog.sqlite").exists():
         return "not running, nothing is stored yet (start it with make run)"
-    catalog = open_catalog(settings, "doctor")
-    try:
+    with open_for_check(settings, CHECK_FILE) as catalog:
         check_pages(catalog, max_bytes=None)
         with catalog.read() as session:
-            photos = session.scalar(
-                select(func.count()).select_from(Photo).where(Photo.deleted_at.is_(None))
-            )
-    except SQLAlchemyError as error:
-        raise Misconfigured(
-            "catalog_unreadable",
-            f"The catalog in {settings.placewise_home} can't be read ({type(error).__name__}). "
-            "Check its permissions, or restore it from a backup.",
-        ) from error
-    finally:
-        catalog.close()
+            photos = session.scalar(select(func.count()).where(Photo.deleted_at.is_(None)))
     return f"not running; {photos} photos are stored (start it with make run)"

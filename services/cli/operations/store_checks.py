@@ -6,9 +6,8 @@ from pathlib import Path
 from uuid import UUID
 
 from sqlalchemy import select
-from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.database.errors import explain_outage
+from services.cli.operations.deployment_checks import open_for_check
 from shared.catalog.installation import Installation
 from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
@@ -18,6 +17,8 @@ from shared.storage import FolderStore, OwnedStore
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner, store_taken_error
 from shared.storage.trash import read_hold
+
+CHECK_FILE = "Check its permissions, or restore it from a backup."
 
 
 def collection_check(settings: Settings) -> str:
@@ -85,15 +86,5 @@ def _installation_id(settings: Settings) -> UUID | None:
     file = _sqlite_file(settings)
     if file is not None and not file.exists():
         return None
-    catalog = open_catalog(settings, "doctor")
-    try:
-        with catalog.read() as session:
-            return session.scalar(select(Installation.id))
-    except SQLAlchemyError as error:
-        raise explain_outage(error) or Misconfigured(
-            "catalog_unreadable",
-            f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
-            "restore it from a backup.",
-        ) from error
-    finally:
-        catalog.close()
+    with open_for_check(settings, CHECK_FILE) as catalog, catalog.read() as session:
+        return session.scalar(select(Installation.id))

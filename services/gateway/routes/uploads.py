@@ -130,13 +130,9 @@ class UploadOutcome:
 
     @classmethod
     def of(cls, stored: StoreResult, job: Job | None, key: str, map_name: str) -> UploadOutcome:
-        """Build the response.
+        """Build the response from the photo's job in its current state, if any.
 
-        Args:
-            stored: The stored or existing photo.
-            job: Its job in the current state, if any.
-            key: Object key of the received bytes.
-            map_name: Map of the photo.
+        `key` is the object key of the received bytes.
         """
         status_url = url_in_map(
             f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
@@ -170,15 +166,8 @@ async def respond_to_upload(
 ) -> UploadResponse:
     """Build the response to an upload, after waiting for its job if the request prefers it.
 
-    Args:
-        request: Its `Prefer: wait=N` sets how long to wait.
-        response: Gets the status and the headers.
-        gateway: The gateway context.
-        map_name: Map of the photo.
-        stored: The stored or existing photo.
-        key: Object key of the received bytes.
-        on_described: Called in a worker thread with the 201 response if the photo was described
-            within the wait, to store it for repetitions of the request.
+    `on_described` is called in a worker thread with the 201 response if the photo was described
+    within the wait, to store it for repetitions of the request.
     """
     job = stored.job
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)

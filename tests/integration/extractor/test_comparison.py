@@ -45,7 +45,7 @@ from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 
 # tests/e2e/test_rerank_and_explain.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 @pytest.fixture

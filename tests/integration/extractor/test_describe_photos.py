@@ -36,6 +36,9 @@ from tests.integration.workplace import Workplace, expected_row, once, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
 
+# tests/e2e/test_upload.py and test_model_changes.py do the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> None:
     photo_ids = averages.upload(*range(9))  # three batches
@@ -113,6 +116,7 @@ def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
         assert job.error["detail"]
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_two_workers_at_once_describe_each_photo_once(
     averages: Workplace, make_worker: Callable[[], ExtractorWorker]
 ) -> None:
@@ -129,6 +133,7 @@ def test_two_workers_at_once_describe_each_photo_once(
         assert session.scalar(select(func.count()).select_from(Generation)) == 1
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_of_two_workers_that_begin_a_maps_first_generation_one_wins(
     averages: Workplace,
     make_worker: Callable[[], ExtractorWorker],

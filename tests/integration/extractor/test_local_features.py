@@ -29,6 +29,9 @@ from tests.integration.comparisons import (
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_rerank_and_explain.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 WORDS = "test-tiny-vlad"
 
 

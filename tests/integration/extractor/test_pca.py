@@ -40,7 +40,7 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_vocabulary_command.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 PHOTOS = 14
 KEPT = 5

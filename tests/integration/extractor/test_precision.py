@@ -21,6 +21,9 @@ from shared.jobs import JobKind, JobState
 from tests.integration.workplace import Workplace, same
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_model_changes.py changes models on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.fixture
 def make_set(

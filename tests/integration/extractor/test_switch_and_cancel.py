@@ -31,7 +31,7 @@ from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_model_changes.py and test_serve_models.py switch maps on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 @pytest.mark.parametrize("in_the_slice", [False, True])

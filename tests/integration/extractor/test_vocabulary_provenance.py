@@ -20,7 +20,7 @@ from shared.storage.keys import new_vocabulary_key
 from tests.integration.workplace import FIT, Workplace
 
 # tests/e2e/test_vocabulary_command.py exports and imports vocabularies on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 WIDTH = 16  # of the tiny backbone's local features
 

@@ -32,7 +32,7 @@ from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.photos import photo_bytes
 
-pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+pytestmark = pytest.mark.databases("sqlite")
 
 EXAMPLES = int(os.environ.get("PLACEWISE_FUZZ_EXAMPLES", "2"))  # of calls; a sixth: of sequences
 PROMISED = [

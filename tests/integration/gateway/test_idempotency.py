@@ -28,6 +28,9 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 
+# tests/contract/catalog/test_idempotency.py runs the statements on SQLite, too.
+pytestmark = pytest.mark.databases("postgresql")
+
 REPLAYED = "idempotent-replayed"
 
 
@@ -315,6 +318,7 @@ def test_a_gateway_that_crashed_blocks_its_key_no_longer_than_its_lease(
 
 
 @pytest.mark.parametrize("make", [call_upload, call_evaluation, call_map], ids=lambda f: f.__name__)
+@pytest.mark.databases("sqlite", "postgresql")
 def test_the_same_call_at_two_gateways_at_once_has_one_effect(
     catalog: Catalog,
     store: FolderStore,

@@ -46,6 +46,9 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
+# tests/e2e/test_maps.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 ROUNDS = 50
 
 
@@ -153,6 +156,7 @@ def finish_changes(service: Service) -> None:
 # --- what people see -------------------------------------------------------------------------
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     service: Service, catalog: Catalog, store: FolderStore
 ) -> None:
@@ -216,6 +220,7 @@ def test_the_default_map_is_made_anew_and_empty(
     assert rows(catalog)["maps"] == 1
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
     service.let_threads_call()
@@ -226,6 +231,7 @@ def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> Non
     service.json("POST", "/maps", 201, json={"name": "town"})
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_a_map_is_made_once_by_many_at_once(service: Service) -> None:
     def make(_: int) -> int:
         return service("POST", "/maps", json={"name": "town"}).status_code

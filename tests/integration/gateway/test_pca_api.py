@@ -16,7 +16,7 @@ from tests.integration.in_process_api import Service
 from tests.support.problems import field_refused, problem
 
 # tests/e2e/test_vocabulary_command.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 PHOTOS = 8
 

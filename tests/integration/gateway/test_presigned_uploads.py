@@ -31,6 +31,9 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.servers import S3Server, start_moto
 
+# tests/e2e/test_s3.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 PHOTO = photo_bytes(1)
 
 

@@ -16,7 +16,7 @@ from tests.integration.in_process_api import API, Service
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 # No URL depends on the database.
-pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+pytestmark = pytest.mark.databases("sqlite")
 
 MAP = "words"
 URLS = re.compile(r".+_url|image_path")

@@ -31,7 +31,6 @@ BEGIN = datetime(2026, 5, 1, 12, tzinfo=UTC)
 STREET = range(5)
 METRES_APART = 80.0
 DEGREES_PER_METRE = 1 / 111_195
-only_sqlite = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
 
 
 def time_of(number: float) -> str:
@@ -134,7 +133,7 @@ def count(catalog: Catalog, table: Any) -> int:
         return session.scalar(select(func.count()).select_from(table)) or 0
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_a_frame_that_is_sent_twice_is_one_frame(street: Service) -> None:
     track_id = begin(street)
     first = send(street, track_id, 0)
@@ -156,7 +155,7 @@ def test_a_frame_that_is_sent_twice_is_one_frame(street: Service) -> None:
     assert stored <= {query_key(UUID(job_id)) for job_id in originals}, "repeated photos are gone"
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_a_late_frame_changes_the_states_after_it(
     street: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,7 +187,7 @@ def test_a_late_frame_changes_the_states_after_it(
     assert [time.isoformat() for time in kept] == [time_of(1.5), time_of(2), time_of(3)]
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_a_frame_is_searched_without_what_the_earlier_frames_share(
     street: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,7 +204,7 @@ def test_a_frame_is_searched_without_what_the_earlier_frames_share(
     assert backgrounds == [[], rows[:1], rows[:2]]
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_two_clients_on_one_track_get_an_error(street: Service) -> None:
     track_id = begin(street)
     mine = send(street, track_id, 0, expected_version=0)
@@ -216,7 +215,7 @@ def test_two_clients_on_one_track_get_an_error(street: Service) -> None:
     send(street, track_id, 2, expected_version=conflict["version"])
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_two_gateways_apply_a_frame_once(street: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     track_id = begin(street)
     send(street, track_id, 0)
@@ -238,7 +237,7 @@ def test_two_gateways_apply_a_frame_once(street: Service, monkeypatch: pytest.Mo
     assert (track.version, track.revision) == (1, 1)
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_frames_are_applied_in_order_and_a_failed_one_is_left_out(street: Service) -> None:
     track_id = begin(street)
     first = send(street, track_id, 0)
@@ -256,7 +255,7 @@ def test_frames_are_applied_in_order_and_a_failed_one_is_left_out(street: Servic
     assert result["similar_images"][0]["latitude"] == 45
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_the_map_may_change_between_two_frames(street: Service) -> None:
     track_id = begin(street)
     track = ride(street, track_id, 0, 1)
@@ -283,7 +282,7 @@ def nearest(service: Service, number: int) -> str:
     return str(service.json("GET", "/search", params={"near": near})["images"][0]["image_id"])
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
     alone, labelled, placed = (
         begin(street),
@@ -306,7 +305,7 @@ def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
     assert smoothed[0]["state"]["probability"] >= started[0] - 1e-9
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_a_track_of_places_follows_their_labels(service: Service) -> None:
     for number in STREET:
         time = (BEGIN - timedelta(days=9) + timedelta(seconds=number)).isoformat()
@@ -319,7 +318,7 @@ def test_a_track_of_places_follows_their_labels(service: Service) -> None:
     assert track["state"]["latitude"] is None
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_what_belongs_to_a_track_stays_and_goes_with_it(street: Service, catalog: Catalog) -> None:
     pending, done = begin(street), begin(street)
     job_id = send(street, pending, 0)["job_id"]
@@ -357,7 +356,7 @@ BAD_FIELDS: list[dict[str, Any]] = [
 ]
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_invalid_fields_are_refused_by_name_and_leave_nothing(service: Service) -> None:
     track_id = begin(service)
     for fields in BAD_FIELDS:
@@ -406,7 +405,7 @@ FRAMES = st.lists(
 )
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_any_times_and_odometry_lead_to_a_state(
     street: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -437,7 +436,7 @@ def test_any_times_and_odometry_lead_to_a_state(
     check()
 
 
-@only_sqlite
+@pytest.mark.databases("sqlite")
 def test_a_full_track_takes_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracks_table, "MAX_TRACK_FRAMES", 1)
     track_id = begin(service)

@@ -7,6 +7,7 @@ import json
 from typing import Any
 from uuid import UUID, uuid4
 
+import numpy as np
 import pytest
 from sqlalchemy import delete, func, insert, select
 
@@ -37,7 +38,11 @@ from shared.storage import FolderStore
 from shared.storage.chunks import manifest_key
 from shared.storage.keys import JOURNAL, ORIGINALS
 from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import stored_rows
 from tests.support.photos import photo_bytes
+
+# tests/faults/test_rebuild_catalog.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
 
 SAID: dict[str, Any] = {
     "latitude": 45.5,
@@ -93,6 +98,7 @@ def two_maps(service: Service) -> dict[str, str]:
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_every_photo_is_searchable_again_with_its_metadata(
     service: Service,
     store: FolderStore,
@@ -130,6 +136,21 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     assert write_journal(service.catalog, store).lines > 0
     assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
     assert verify_store(service.catalog, store, originals=True).faults == []
+
+
+def test_a_map_with_float16_rows_goes_on_with_them(service: Service, store: FolderStore) -> None:
+    service.json("POST", "/maps", 201, json={"name": "half", "rows": "float16"})
+    photos = service.indexed(1, 2, 3, map_name="half")
+    before = [answers(service, photo_id, "half") for photo_id in photos]
+    write_journal(service.catalog, store)
+    lose_catalog(service.catalog)
+    service, _ = rebuilt(service)
+    assert [answers(service, photo_id, "half") for photo_id in photos] == before
+    service.indexed(4, map_name="half")
+    (generation,) = service.json("GET", "/generations", params={"map": "half"})
+    assert generation["rows"] == "float16"
+    rows = stored_rows(service.catalog, store, UUID(generation["generation_id"]))
+    assert [row.dtype for row in rows.values()] == 4 * [np.dtype(np.float16)]
 
 
 def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(

@@ -17,6 +17,9 @@ from shared.storage.chunks import manifest_key
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 
+# tests/e2e/test_backup_and_verify.py does the same on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def looked(service: Service, *, originals: bool = False) -> IntegrityReport:
     return verify_store(service.catalog, service.store, originals=originals)
@@ -85,6 +88,7 @@ def test_rows_that_belong_to_other_photos_are_found(service: Service) -> None:
     assert "1 photos have another row" in report.faults[0].detail
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_photos_without_a_descriptor_are_found_and_described_again(service: Service) -> None:
     first, _ = service.indexed(1, 2)
     with service.catalog.write() as session:

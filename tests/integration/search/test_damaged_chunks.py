@@ -22,7 +22,7 @@ from tests.integration.in_process_api import Service
 from tests.support.problems import problem
 from tests.support.servers import S3Server
 
-pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+pytestmark = pytest.mark.databases("sqlite")
 
 
 @pytest.fixture(params=["folder", "bucket"])

@@ -33,7 +33,7 @@ from tests.support.search_tier import SearchServer, SearchTier
 from tests.support.small_map import SmallMap, assert_answers, unit_rows
 
 # tests/e2e/test_search_service.py has two shards on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 SLOTS = 7  # three shards have three, two and two of them
 BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth

@@ -29,7 +29,7 @@ from tests.support.catalog_rows import (
 )
 
 # tests/e2e/test_estimates.py has a map on SQLite evaluated by itself.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 LEAST = 20
 

@@ -23,7 +23,7 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
 # tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")

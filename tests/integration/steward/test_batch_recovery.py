@@ -26,7 +26,7 @@ from tests.support.archives import PACKED, zip_of
 from tests.support.catalog_rows import read_job
 
 # tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 def assert_each_is_there_once(batches: Batches, job_id: UUID, photos: int) -> None:

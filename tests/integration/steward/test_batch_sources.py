@@ -25,7 +25,7 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
 # tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 def test_every_photo_below_a_prefix_comes_in_and_again_nothing_twice(batches: Batches) -> None:

@@ -29,6 +29,9 @@ from tests.support.catalog_rows import (
     stored_rows,
 )
 
+# tests/faults/test_kills.py merges chunks on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def test_small_chunks_of_a_slot_become_one(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3, 1))

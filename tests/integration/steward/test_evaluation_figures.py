@@ -23,7 +23,7 @@ from tests.support.catalog_rows import (
 )
 
 # tests/e2e/test_estimates.py evaluates a map on SQLite.
-pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+pytestmark = pytest.mark.databases("postgresql")
 
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:

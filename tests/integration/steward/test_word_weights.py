@@ -32,6 +32,9 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_chunk, add_generation, add_photo, read_job
 from tests.support.problems import problem
 
+# tests/e2e/test_word_weights_command.py runs the job on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 WORDS, WIDTH = 4, 8
 TRIED = 60  # photos
 FEW = 5  # of them, where nothing depends on what they show
@@ -320,6 +323,7 @@ def test_a_foreign_vocabulary_is_not_weighed_by_itself(city: City, service: Serv
 
 
 @pytest.mark.usefixtures("small_samples")
+@pytest.mark.databases("sqlite", "postgresql")
 def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
     city: City,
 ) -> None:

@@ -22,6 +22,7 @@ from shared.codes.int8_codes import int8_codes
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import SearchResponse
+from shared.storage.chunks import StoredRows
 
 DIMENSION = 7168
 
@@ -32,7 +33,7 @@ def photo(number: int) -> UUID:
     return UUID(int=number + 1)
 
 
-def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
+def snapshot_of(rows: StoredRows, pieces: int = 3, by: str = "signs") -> Snapshot:
     """The rows in so many chunks, with one kind of codes or none."""
     bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
     chunks = [
@@ -50,7 +51,7 @@ def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
 
 
 def brute_force(
-    rows: Rows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
+    rows: StoredRows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
 ) -> list[tuple[UUID, float]]:
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
@@ -88,7 +89,7 @@ def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
 class Case:
     """A map of rows, with duplicates and zeros among them, and a query."""
 
-    rows: Rows
+    rows: StoredRows
     pieces: int
     query: Rows
     selected: NDArray[np.bool_]
@@ -113,8 +114,9 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
     query = rng.standard_normal(dimension).astype(np.float32)
     if draw(st.booleans()):  # of a place on the map
         query = query * np.float32(0.005) + rows[rng.integers(count)]
+    stored: StoredRows = rows.astype(draw(st.sampled_from([np.float32, np.float16])))
     return Case(
-        rows=rows,
+        rows=stored,
         pieces=draw(st.integers(1, 4)),
         query=query,
         selected=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
