@@ -5,8 +5,9 @@
 Some engines take whole descriptors, others at most some thousand numbers: those get a PCA of the
 rows, fitted on a sample of them. Columns: length of an indexed row; time to build the index from
 the rows, without the PCA; p50 of a query and of the projection before it; private memory that the
-process gains (of PostgreSQL: the size of table and index, which it caches); disk; and recall@10,
-the share of the 10 best photos by brute force over whole rows that are among the 10 found.
+process gains (of PostgreSQL also the size of table and index, which it caches); disk; and
+recall@10, the share of the 10 best photos by brute force over whole rows that are among the 10
+found.
 
 Qdrant's embedded mode is a NumPy scan: only its server has an index. autofaiss, with which
 clip-retrieval makes its indices, takes `IVF` with flat lists for these sizes.
@@ -87,8 +88,9 @@ class Town:
 
     def project(self, rows: Rows) -> Rows:
         """Return the (n, pca) L2-normalised projection of rows."""
-        projected: Rows = (rows - self.mean) @ self.components
-        return projected / np.linalg.norm(projected, axis=1, keepdims=True)
+        projected = (rows - self.mean) @ self.components
+        unit: Rows = projected / np.linalg.norm(projected, axis=1, keepdims=True)
+        return unit
 
     def best(self, queries: Rows) -> list[set[int]]:
         """Return the numbers of the K best photos of each query, by brute force in float64."""
@@ -201,11 +203,12 @@ class FaissIvf(FaissIndex):
     def build(self, pieces: Iterator[Rows], dimension: int) -> None:
         super().build(pieces, dimension)
         expected = self.town.best(self.town.tuning)
-        while self.index.nprobe < self.index.nlist:
+        ivf = faiss.extract_index_ivf(self.index)
+        while ivf.nprobe < ivf.nlist:
             found = [self.search(query) for query in self.town.tuning]
             if recall(found, expected) >= MIN_TUNED_RECALL:
                 break
-            self.index.nprobe *= 2
+            ivf.nprobe *= 2
 
 
 class FaissFlatPca(FaissIndex):
@@ -283,15 +286,17 @@ class Pgvector(Rival):
         import psycopg
 
         # The one of this package has pgvector; one of the system may not.
-        (package,) = importlib.util.find_spec(self.packages[0]).submodule_search_locations  # type: ignore[union-attr,misc]
-        programs = Path(package, "pginstall18", "bin")
+        spec = importlib.util.find_spec(self.packages[0])
+        assert spec is not None
+        assert spec.origin is not None
+        programs = Path(spec.origin).parent / "pginstall18" / "bin"
         with patch.dict(os.environ, PATH=f"{programs}{os.pathsep}{os.environ['PATH']}"):
             server = self.resources.enter_context(start_postgres(own=True))
         url = server.admin.set(drivername="postgresql").render_as_string(hide_password=False)
         self._connection = self.resources.enter_context(psycopg.connect(url, autocommit=True))
         run = self._connection.execute
         run("CREATE EXTENSION vector")
-        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({dimension}))")  # type: ignore[arg-type]
+        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({dimension}))")
         first = 0
         for rows in pieces:
             with self._connection.cursor().copy("COPY photos FROM STDIN") as copy:
@@ -330,7 +335,8 @@ def measure(
 ) -> Report:
     """Build each engine over `photos` rows, one after another, and search for revisited places.
 
-    Files are written to a temporary folder below `folder`: three times the rows at once.
+    Files are written to a temporary folder below `folder`: twice the rows at once. An index of
+    whole rows takes as much memory, and twice as much while it is built.
 
     Raises:
         Misconfigured: `no_benchmarks` if packages of the engines are not installed.

@@ -214,12 +214,7 @@ class ChunkLoader:
     """Opens the chunks of one generation."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
-        """Create a loader.
-
-        Args:
-            store: The object store.
-            folder: Cache folder of the generation, for downloads and for computed codes.
-        """
+        """`folder` is the generation's cache, for downloads and for computed codes."""
         self._store = store
         self._files = MappedFileCache(store, folder)
 

@@ -53,20 +53,14 @@ NO_SCORES = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Number of results, minimum score, strategy, and limits of a search.
-
-    Attributes:
-        k: Number of results.
-        min_score: Minimum cosine; None for no minimum.
-        mode: Search strategy.
-        most_rows: Maximum number of rows compared exactly.
-        most_seconds: Time limit in seconds.
-    """
+    """Number of results, strategy, and limits of a search."""
 
     k: int
     min_score: float | None = None
+    """Minimum cosine."""
     mode: Mode = Mode.AUTO
     most_rows: int | None = None
+    """Maximum number of rows compared exactly."""
     most_seconds: float | None = None
 
 

@@ -88,13 +88,7 @@ class GpuDevice:
     def __init__(
         self, torch_device: torch.device, free_bytes: Callable[[], float], headroom_bytes: int
     ) -> None:
-        """Create a device.
-
-        Args:
-            torch_device: The PyTorch device.
-            free_bytes: Returns the bytes of its memory that are free now.
-            headroom_bytes: Bytes to reserve for products.
-        """
+        """`free_bytes` returns what is free now; `headroom_bytes` are reserved for products."""
         self.torch_device = torch_device
         self._free_bytes = free_bytes
         self._headroom_bytes = headroom_bytes
@@ -154,12 +148,7 @@ class GpuDevice:
     def load(
         self, chunks: Sequence[LoadedChunk], old: GpuSnapshot | None, max_bytes: float
     ) -> GpuSnapshot | None:
-        """Load a snapshot's rows into GPU memory, reusing those of `old`.
-
-        Args:
-            chunks: The chunks of the snapshot.
-            old: Rows of the previous snapshot, if any.
-            max_bytes: Maximum number of bytes to copy.
+        """Load a snapshot's rows into GPU memory, reusing those of the previous one, if any.
 
         Returns:
             The rows; None if they don't fit, or more than `max_bytes` would have to be copied.

@@ -257,15 +257,7 @@ class SignCodeSearch:
         min_score: float | None,
         prefetch: Callable[[Indices], None],
     ) -> None:
-        """Create a search.
-
-        Args:
-            blocks: Codes and rows.
-            query: The query.
-            k: Number of results.
-            min_score: Minimum score; None for no minimum.
-            prefetch: Called with rows before they are compared exactly.
-        """
+        """Create a search; `prefetch` is called with rows before they are compared exactly."""
         self._blocks = blocks
         self._query = query
         self._k = k

@@ -204,11 +204,9 @@ def row_of(photo_id: UUID) -> Rows:
     return unit
 
 
-def stored_rows(
-    catalog: Catalog, store: ObjectStore, generation_id: UUID
-) -> dict[UUID, StoredRows]:
+def stored_rows(catalog: Catalog, store: ObjectStore, generation_id: UUID) -> dict[UUID, Rows]:
     """The descriptor that the generation holds of each photo, read from its chunk."""
-    found: dict[UUID, StoredRows] = {}
+    found: dict[UUID, Any] = {}  # as stored: float16 rows, too
     with catalog.read() as session:
         pairs = session.execute(
             select(Descriptor, Chunk)

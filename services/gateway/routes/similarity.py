@@ -19,6 +19,7 @@ from services.gateway.dependencies import (
     GatewayDep,
     JobId,
     MapQuery,
+    load_job_of_map,
     parse_prefer_wait,
     wait_for_job,
 )
@@ -164,12 +165,7 @@ async def read_similarity_result(
     For an uploaded photo with `rerank` or `explain`, the comparison starts now. If it takes longer
     than COMPARE_WAIT_SECONDS, the response is 202 with its job.
     """
-
-    def load() -> Job:
-        with gateway.catalog.read() as session:
-            return get_job(session, get_map(session, query.map).id, job_id)
-
-    job = await run_in_threadpool(load)
+    job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
     if job.kind not in QUERY_JOBS:
         raise Conflict("no_result", f"The job {job.id} ({job.kind}) has no similarity result.")
     if job.state in UNFINISHED_STATES:
