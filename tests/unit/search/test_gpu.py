@@ -26,8 +26,8 @@ from shared.errors import Misconfigured
 from shared.search_api.protocol import Mode
 from tests.unit.search.search_rows import (
     Case,
-    assert_best,
     answer,
+    assert_best,
     brute_force,
     cases,
     hits_of,
