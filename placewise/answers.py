@@ -354,6 +354,7 @@ class Generation(Answer):
     extractor: str
     dimension: int
     pca_from: int | None
+    rows: str = "float32"
     vocabulary_id: UUID | None
     photos: int
     spec: dict[str, Any]
@@ -418,6 +419,7 @@ class Map(Answer):
     dimension: int | None
     pca_from: int | None
     place_labels_are_paths: bool = False
+    rows: str = "float32"
     created_at: datetime
 
 

@@ -509,19 +509,30 @@ class AsyncClient(AsyncTransport):
         return [Map(**item) for item in await self._call("GET", "/maps")]
 
     async def create_map(
-        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+        self,
+        name: str,
+        extractor: str | None = None,
+        *,
+        place_labels_are_paths: bool = False,
+        rows: str | None = None,
     ) -> Map:
-        """Create a map; `extractor` defaults to the server's setting."""
+        """Create a map; `extractor` and `rows` (float32 or float16) default to the settings."""
         body = drop_none(
             name=name,
             extractor=extractor,
             place_labels_are_paths=place_labels_are_paths or None,
+            rows=rows,
         )
         return Map(**await self._call("POST", "/maps", json=body))
 
-    async def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
-        """Change whether `/` separates the levels of the map's place labels."""
-        body = {"place_labels_are_paths": place_labels_are_paths}
+    async def update_map(
+        self, name: str, *, place_labels_are_paths: bool | None = None, rows: str | None = None
+    ) -> Map:
+        """Change whether `/` separates the levels of place labels, and the rows' type.
+
+        `rows` (float32 or float16) applies to generations that are created from then on.
+        """
+        body = drop_none(place_labels_are_paths=place_labels_are_paths, rows=rows)
         return Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
     async def delete_map(self, name: str) -> DeletedMap:

@@ -500,19 +500,30 @@ class Client(Transport):
         return [Map(**item) for item in self._call("GET", "/maps")]
 
     def create_map(
-        self, name: str, extractor: str | None = None, *, place_labels_are_paths: bool = False
+        self,
+        name: str,
+        extractor: str | None = None,
+        *,
+        place_labels_are_paths: bool = False,
+        rows: str | None = None,
     ) -> Map:
-        """Create a map; `extractor` defaults to the server's setting."""
+        """Create a map; `extractor` and `rows` (float32 or float16) default to the settings."""
         body = drop_none(
             name=name,
             extractor=extractor,
             place_labels_are_paths=place_labels_are_paths or None,
+            rows=rows,
         )
         return Map(**self._call("POST", "/maps", json=body))
 
-    def update_map(self, name: str, *, place_labels_are_paths: bool) -> Map:
-        """Change whether `/` separates the levels of the map's place labels."""
-        body = {"place_labels_are_paths": place_labels_are_paths}
+    def update_map(
+        self, name: str, *, place_labels_are_paths: bool | None = None, rows: str | None = None
+    ) -> Map:
+        """Change whether `/` separates the levels of place labels, and the rows' type.
+
+        `rows` (float32 or float16) applies to generations that are created from then on.
+        """
+        body = drop_none(place_labels_are_paths=place_labels_are_paths, rows=rows)
         return Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
     def delete_map(self, name: str) -> DeletedMap:

@@ -40,14 +40,11 @@ from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
 from shared.catalog.database.schema import migrate, sqlite_file
 from shared.catalog.database.session import Catalog, TransactionTimeouts
+from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import (
-    delete_dead_search_workers,
-    delete_processes,
-    process_heartbeat,
-)
+from shared.catalog.processes import delete_dead_search_workers, delete_processes, process_heartbeat
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
@@ -101,11 +98,7 @@ class Standalone:
 
 
 def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None]) -> None:
-    """Run all services until the process is stopped by a signal.
-
-    Args:
-        settings: The settings.
-        on_ready: Called once the server listens.
+    """Run all services until the process is stopped by a signal; `on_ready` once it listens.
 
     Raises:
         PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
@@ -152,7 +145,9 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         store = open_installation_store(catalog, settings, exclusive=True)
         wakeups = InProcessWakeups()
         with catalog.write() as session:
-            get_or_create_default_map(session, settings.new_map_extractor)
+            get_or_create_default_map(
+                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
+            )
             # The lock proves that no other worker is alive: rows are left from a killed process.
             delete_dead_search_workers(session, all_workers=True)
             delete_processes(session, "extractor")

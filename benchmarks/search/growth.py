@@ -61,6 +61,7 @@ def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCode
             np.newaxis
         ],
         row_addresses=nothing,
+        number_bytes=np.empty(0, np.int64),
         norms=np.ones(len(codes), np.float32),
         zero_rows=np.empty(0, np.int64),
         keep_alive=codes,

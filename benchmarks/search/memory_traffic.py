@@ -92,7 +92,9 @@ def count_bytes_read() -> Iterator[ByteCounter]:
         "hamming_distances": _distance_bytes,
         "add_hamming_distances": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
         "weighted_bit_sums": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
-        "exact_products": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
+        "exact_products": lambda _, __, number_bytes, rows, query, *___: (
+            int(number_bytes[0]) * len(query) * len(rows)
+        ),
     }
 
     def counted(loop: Callable[..., Any], bytes_of: Callable[..., int]) -> Callable[..., Any]:

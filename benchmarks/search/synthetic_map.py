@@ -31,7 +31,7 @@ from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.catalog.installation import open_installation_store
 from shared.catalog.maps import Map, create_map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
@@ -56,6 +56,7 @@ class SyntheticMap:
     map_id: UUID
     generation_id: UUID
     dimension: int
+    row_type: RowType = RowType.FLOAT32
     photo_ids: list[UUID] = field(default_factory=list)
     """In the order in which they were added; those that were deleted, too."""
 
@@ -72,7 +73,7 @@ class SyntheticMap:
             self.store,
             generation_id=self.generation_id,
             chunk_id=chunk_id,
-            rows=rows,
+            rows=rows.astype(self.row_type, copy=False),
             photo_ids=photo_ids,
             spec={},
         )
@@ -162,7 +163,11 @@ class SyntheticMap:
 
 @contextlib.contextmanager
 def create_synthetic_map(
-    home: Path, dimension: int, *, search_memory_budget: int
+    home: Path,
+    dimension: int,
+    *,
+    search_memory_budget: int,
+    row_type: RowType = RowType.FLOAT32,
 ) -> Iterator[SyntheticMap]:
     """Create an empty map in the folder `home`, in a SQLite catalog."""
     chosen = Settings(
@@ -182,6 +187,7 @@ def create_synthetic_map(
                 spec={"clusters": None},
                 spec_fingerprint="0" * 64,
                 dimension=dimension,
+                row_type=row_type,
                 model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
             )
             session.add(generation)
@@ -189,7 +195,7 @@ def create_synthetic_map(
             catalog, chosen, exclusive=True
         )  # marks the folder as the catalog's
         store = FolderStore(home / "objects")
-        world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension)
+        world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension, row_type)
         yield world
     finally:
         catalog.close()

@@ -12,7 +12,7 @@ from rich.progress import Progress
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
 from services.cli.environment import read_settings
-from services.cli.output import err_console
+from services.cli.output import print_note
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
 
@@ -40,11 +40,9 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
-    err_console.print(
+    print_note(
         f"No server runs on {settings.placewise_home}: starting one for this command. "
-        "--server URL or PLACEWISE_HOME selects another.",
-        soft_wrap=True,
-        markup=False,
+        "--server URL or PLACEWISE_HOME selects another."
     )
     from services.standalone import run_standalone  # clients of a running server don't need it
 

@@ -9,7 +9,7 @@ from pydantic import SecretStr, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from services.cli.output import JsonOption, Table, console, print_json, print_table, report_errors
+from services.cli.output import JsonOption, Table, print_json, print_message, print_table
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -59,8 +59,7 @@ def is_secret(field: FieldInfo) -> bool:
 
 def config(as_json: JsonOption = False) -> None:
     """Print the effective settings. Secrets are masked."""
-    with report_errors(as_json):
-        settings = read_settings()
+    settings = read_settings()
     values = settings.model_dump(mode="json")
     if as_json:
         print_json({name.upper(): value for name, value in values.items()})
@@ -70,7 +69,7 @@ def config(as_json: JsonOption = False) -> None:
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
     print_table(table)
-    console.print(f"New maps use the extractor {settings.new_map_extractor}.", soft_wrap=True)
+    print_message(f"New maps use the extractor {settings.new_map_extractor}.")
 
 
 def require_packages(*names: str) -> None:

@@ -35,7 +35,7 @@ from shared.errors import NotFound, Unavailable, Unprocessable
 from shared.extractor_config.names import TRAINED_MODEL_PREFIX
 from shared.ids import new_id
 from shared.jobs import Job
-from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.transitions import succeed_job
 from shared.storage import ObjectStore
 from shared.storage.copying import (
@@ -54,13 +54,7 @@ class ModelFileCache:
     """Least-recently-used cache of model files on this machine; processes may share its folder."""
 
     def __init__(self, store: ObjectStore, folder: Path, max_bytes: int) -> None:
-        """Create a cache.
-
-        Args:
-            store: The object store.
-            folder: The cache's folder, created at the first download.
-            max_bytes: Maximum size of the cached files, not counting the one downloaded last.
-        """
+        """`max_bytes` limits the cached files, not counting the one downloaded last."""
         self._store = store
         self._folder = folder
         self._max_bytes = max_bytes
@@ -169,14 +163,7 @@ class ModelImporter:
     """Imports uploaded checkpoints as models, in one step on the CPU."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
-        """Create an importer.
-
-        Args:
-            catalog: The catalog.
-            store: The object store.
-            folder: Folder of `ModelFileCache`, for large temporary files; the cache deletes
-                leftovers.
-        """
+        """`folder` is that of `ModelFileCache`, which deletes left-over temporary files."""
         self._catalog = catalog
         self._store = store
         self._folder = folder
@@ -224,10 +211,8 @@ class ModelImporter:
 
     def _commit(self, job: Job, registration: ModelRegistration) -> None:
         """Add the catalog row and end the job; a file without its row is deleted as an orphan."""
-        token = job.lease_token
-        assert token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:
-            for owned in lock_leased_jobs(session, token, [job]):
+            for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
                 model, added = register_model(session, registration)
                 succeed_job(
                     owned,
@@ -254,7 +239,10 @@ class ModelImporter:
             download_object(self._store, key, path)
             yield path
         except NotFound as error:
-            raise _checkpoint_lost_error() from error
+            raise Unprocessable(
+                "checkpoint_lost",
+                "The checkpoint is missing from the object store. Upload it again.",
+            ) from error
         finally:
             path.unlink(missing_ok=True)
 
@@ -305,9 +293,10 @@ class _JsonConverter:
         return self._text(value)
 
     def _text(self, value: Any) -> str:
-        if isinstance(value, str):
-            self._spend(len(value))
-        return _to_json_text(value)
+        text = value if isinstance(value, str) else f"<{type(value).__name__}>"
+        self._spend(len(text))
+        # PostgreSQL can't store NUL characters or lone surrogates.
+        return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
 
     def _spend(self, characters: int) -> None:
         self._remaining -= characters
@@ -318,15 +307,3 @@ class _JsonConverter:
 def _is_short(value: Any) -> bool:
     """Whether it is an integer that every supported database stores as a number."""
     return isinstance(value, int) and value.bit_length() < 64
-
-
-def _to_json_text(value: Any) -> str:
-    # PostgreSQL can't store NUL characters or lone surrogates.
-    text = value if isinstance(value, str) else f"<{type(value).__name__}>"
-    return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
-
-
-def _checkpoint_lost_error() -> Unprocessable:
-    return Unprocessable(
-        "checkpoint_lost", "The checkpoint is missing from the object store. Upload it again."
-    )

@@ -17,7 +17,6 @@ from sqlalchemy.orm import Session
 from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
-    ensure_model_row,
     generation_spec_columns,
 )
 from shared.catalog.database.session import Catalog
@@ -68,15 +67,7 @@ def start_generation_with_new_vocabulary(
 ) -> None:
     """Store a vocabulary and create its generation in one transaction.
 
-    Args:
-        catalog: The catalog.
-        store: The object store.
-        job: The model change.
-        extractor: The extractor of the generation.
-        centres: The vocabulary.
-        origin: How the vocabulary was made.
-        provenance: Details of its origin.
-        progress_done: Progress of the job before any photo is described.
+    `progress_done` is the progress of the job before any photo is described.
     """
     key = new_vocabulary_key()
     store.put(key, encode_centres(centres))
@@ -91,14 +82,8 @@ def start_generation_with_new_vocabulary(
                 sha256=centres.sha256,
                 provenance=provenance,
             )
-            create_generation(
-                session,
-                owned,
-                **generation_spec_columns(
-                    ensure_model_row(session, extractor),
-                    DescriptorPipeline(extractor, centres),
-                    vocabulary.id,
-                ),
+            _create_generation(
+                session, owned, DescriptorPipeline(extractor, centres), vocabulary.id
             )
             _set_describe_progress(session, owned, progress_done, vocabulary_id=str(vocabulary.id))
 
@@ -113,16 +98,7 @@ def start_generation_with_stored_vocabulary(
     """Create the generation of a stored vocabulary and whitening; None for an extractor without."""
     with catalog.write() as session:
         for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
-            create_generation(
-                session,
-                owned,
-                **generation_spec_columns(
-                    ensure_model_row(session, pipeline.extractor),
-                    pipeline,
-                    vocabulary_id,
-                    whitening_id,
-                ),
-            )
+            _create_generation(session, owned, pipeline, vocabulary_id, whitening_id)
             _set_describe_progress(session, owned, 0)
 
 
@@ -138,8 +114,7 @@ def start_whitened_generation(
 ) -> None:
     """Store a PCA whitening, which is `pipeline.projection`, and create its generation.
 
-    The catalog rows are written in one transaction. `progress_done` is the progress of the job
-    before any photo is described.
+    As `start_generation_with_new_vocabulary`, in one transaction.
     """
     assert pipeline.projection is not None
     key = new_whitening_key()
@@ -156,13 +131,19 @@ def start_whitened_generation(
                 object_key=key,
                 sha256=pipeline.projection.sha256,
             )
-            model = ensure_model_row(session, pipeline.extractor)
-            create_generation(
-                session,
-                owned,
-                **generation_spec_columns(model, pipeline, vocabulary_id, whitening.id),
-            )
+            _create_generation(session, owned, pipeline, vocabulary_id, whitening.id)
             _set_describe_progress(session, owned, progress_done, whitening_id=str(whitening.id))
+
+
+def _create_generation(
+    session: Session,
+    job: Job,
+    pipeline: DescriptorPipeline,
+    vocabulary_id: UUID | None,
+    whitening_id: UUID | None = None,
+) -> None:
+    columns = generation_spec_columns(session, pipeline, vocabulary_id, whitening_id)
+    create_generation(session, job, **columns)
 
 
 def _set_describe_progress(session: Session, job: Job, progress_done: int, **params: Any) -> None:
@@ -226,14 +207,8 @@ def run_fit_steps(
 ) -> bool:
     """Run steps of a fit for about STEP_SECONDS; checkpoint the job if the fit is not finished.
 
-    Args:
-        catalog: The catalog.
-        store: The object store.
-        job: The model change.
-        fit: The fit, which is resumed from its checkpoint if there is one.
-        step: Runs one step of the fit.
-        resumed_param: Parameter of the job that says that a checkpoint exists.
-        progress_done: Progress of the job before the fit.
+    The fit is resumed from its checkpoint if the job's parameter `resumed_param` says that there is
+    one. `progress_done` is the progress of the job before the fit.
 
     Returns:
         Whether the fit is finished.

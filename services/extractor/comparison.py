@@ -233,15 +233,12 @@ class ComparisonRunner:
             raise not_finite_error()
         grid = target.extractor.backbone.grid(*prepared.query.pixels.shape[:2])
         with self._catalog.read() as session:
-            live = get_live_photos(
-                session, [candidate.photo_id for candidate in request.candidates]
-            )
+            live = get_live_photos(session, [each.photo_id for each in request.candidates])
         candidates = [candidate for candidate in request.candidates if candidate.photo_id in live]
         to_rerank, rest = candidates[: request.rerank], candidates[request.rerank :]
         query = LocalFeatures.from_features(features, grid)
-        scores = self._rerank(
-            target, query, to_rerank, [live[candidate.photo_id] for candidate in to_rerank]
-        )
+        photos = [live[candidate.photo_id] for candidate in to_rerank]
+        scores = self._rerank(target, query, to_rerank, photos)
         # The sort is stable: photos with equal scores, or without one, stay sorted by similarity.
         to_rerank.sort(key=lambda candidate: -scores.get(candidate.photo_id, -np.inf))
         ordered = [candidate.photo_id for candidate in to_rerank + rest]

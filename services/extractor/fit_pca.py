@@ -190,11 +190,9 @@ class PcaFitJob:
         )
 
     def _gathered_rows(self, job: Job) -> StoredColumns:
-        params = job.params
-        prefix = job_work_key(job.id, "rows-")
-        return StoredColumns(
-            self._store, prefix, params["dimension"], params["width"], params["rows"]
-        )
+        prefix, params = job_work_key(job.id, "rows-"), job.params
+        shape = (params["dimension"], params["width"], params["rows"])
+        return StoredColumns(self._store, prefix, *shape)
 
     def _write_part(self, job: Job, number: int, part: PcaBlock) -> None:
         buffer = io.BytesIO()

@@ -21,7 +21,6 @@ from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
     check_spec_matches,
-    ensure_model_row,
     generation_spec_columns,
 )
 from shared.catalog.database.base import db_now
@@ -120,7 +119,7 @@ def _create_first_generation(
     if shipped is not None:
         store.put(key, encode_centres(shipped[0]))
     with catalog.write() as session:
-        lock_map(session, map_id)
+        map_ = lock_map(session, map_id)
         existing = active_generation(session, map_id)
         if existing is not None:  # another worker has created it
             vocabulary = None
@@ -144,8 +143,9 @@ def _create_first_generation(
             map_id=map_id,
             state=GenerationState.ACTIVE,
             activated_at=db_now(),
+            row_type=map_.row_type,
             **generation_spec_columns(
-                ensure_model_row(session, extractor),
+                session,
                 DescriptorPipeline(extractor, centres),
                 vocabulary.id if vocabulary else None,
             ),

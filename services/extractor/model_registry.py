@@ -61,11 +61,8 @@ class ModelRegistry:
     ) -> None:
         """Create empty caches.
 
-        Args:
-            store: The object store.
-            settings: The settings.
-            load_added: Loads the weights of an added model (`AddedModelLoader.load`).
-            on_load: Called with the seconds that loading an extractor took.
+        `load_added` loads the weights of an added model (`AddedModelLoader.load`). `on_load` is
+        called with the seconds that loading an extractor took.
         """
         self._on_load = on_load
         self._store = store
@@ -77,9 +74,7 @@ class ModelRegistry:
         # Extractors with the same local features share a backbone.
         self._backbones: WeakValueDictionary[object, Backbone] = WeakValueDictionary()
         # Kept beyond eviction, so that a reloaded model does not run out of memory again.
-        self._pass_limits: defaultdict[tuple[object, ...], BatchSizeLimit] = defaultdict(
-            BatchSizeLimit
-        )
+        self._pass_limits = defaultdict[object, BatchSizeLimit](BatchSizeLimit)
         self._load_errors: dict[str, str] = {}
         self._update_state()
         self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)
@@ -93,10 +88,8 @@ class ModelRegistry:
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """Return the extractor called `name` with its weights loaded.
 
-        Args:
-            name: Name of the extractor.
-            precision: Precision of an existing generation (see `extractor_of_generation`); by
-                default that of new generations, PRECISION.
+        The precision is that of an existing generation (see `extractor_of_generation`), or by
+        default that of new generations, PRECISION.
         """
         config = self._settings.extractor_config(name)
         if precision is None:
@@ -168,36 +161,30 @@ class ModelRegistry:
         """Return the vocabulary's centres, verified against the catalog's hash."""
         with self._lock:
             if vocabulary.id not in self._centres:
-                self._centres[vocabulary.id] = self._read_centres(vocabulary)
+                centres = decode_centres(self._store.get(vocabulary.object_key))
+                if centres.sha256 != vocabulary.sha256:
+                    raise Unavailable(
+                        "vocabulary_corrupt",
+                        f"The vocabulary {vocabulary.id} is corrupt: its hash differs. "
+                        "Restore it from a backup, or fit a new one.",
+                    )
+                self._centres[vocabulary.id] = centres
             return self._centres[vocabulary.id]
-
-    def _read_centres(self, vocabulary: Vocabulary) -> ClusterCentres:
-        centres = decode_centres(self._store.get(vocabulary.object_key))
-        if centres.sha256 != vocabulary.sha256:
-            raise Unavailable(
-                "vocabulary_corrupt",
-                f"The vocabulary {vocabulary.id} is corrupt: its hash differs. "
-                "Restore it from a backup, or fit a new one.",
-            )
-        return centres
 
     def projection(self, whitening: StoredWhitening) -> PcaProjection:
         """Return the PCA projection on the device, verified against the catalog's hash."""
         with self._lock:
             if whitening.id not in self._projections:
-                self._projections[whitening.id] = self._read_projection(whitening)
+                stored = decode_whitening(self._store.get(whitening.object_key))
+                projection = PcaProjection(stored.whitening, self._device)
+                if projection.sha256 != whitening.sha256:
+                    raise Unavailable(
+                        "whitening_corrupt",
+                        f"The PCA whitening {whitening.id} is corrupt: its hash differs. "
+                        "Restore it from a backup, or start a model change.",
+                    )
+                self._projections[whitening.id] = projection
             return self._projections[whitening.id]
-
-    def _read_projection(self, whitening: StoredWhitening) -> PcaProjection:
-        stored = decode_whitening(self._store.get(whitening.object_key))
-        projection = PcaProjection(stored.whitening, self._device)
-        if projection.sha256 != whitening.sha256:
-            raise Unavailable(
-                "whitening_corrupt",
-                f"The PCA whitening {whitening.id} is corrupt: its hash differs. "
-                "Restore it from a backup, or start a model change.",
-            )
-        return projection
 
     def pipeline_of_generation(
         self,
@@ -216,7 +203,7 @@ class ModelRegistry:
         )
 
 
-def ensure_model_row(session: Session, extractor: Extractor) -> Model:
+def _ensure_model_row(session: Session, extractor: Extractor) -> Model:
     """Return the catalog's row of the extractor's weights, creating it if needed.
 
     Raises:
@@ -233,19 +220,23 @@ def ensure_model_row(session: Session, extractor: Extractor) -> Model:
 
 
 def generation_spec_columns(
-    model: Model,
+    session: Session,
     pipeline: DescriptorPipeline,
     vocabulary_id: UUID | None,
     whitening_id: UUID | None = None,
 ) -> dict[str, object]:
-    """Return the columns of a generation row that define how its descriptors are computed."""
+    """Return the columns of a generation row that define how its descriptors are computed.
+
+    Raises:
+        Misconfigured: As `_ensure_model_row`.
+    """
     spec = pipeline.spec
     return {
         "extractor": pipeline.extractor.config.name,
         "spec": spec,
         "spec_fingerprint": spec_fingerprint(spec),
         "dimension": spec["dimension"],
-        "model_id": model.id,
+        "model_id": _ensure_model_row(session, pipeline.extractor).id,
         "vocabulary_id": vocabulary_id,
         "whitening_id": whitening_id,
     }

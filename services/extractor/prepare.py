@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -27,12 +26,12 @@ from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.errors import NotFound, PlacewiseError
 from shared.imaging.decode import DecodedPhoto
-from shared.imaging.preprocessing import Pixels
+from shared.imaging.file_formats import Previews
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, Rows, read_row, rows_are_valid
-from shared.storage.keys import preview_key, query_key, thumbnail_key
+from shared.storage.keys import preview_key, query_key, query_preview_key, thumbnail_key
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +78,7 @@ def read_rows_to_project(
     with catalog.read() as session:
         source = active_generation(session, jobs[0].map_id)
         live = get_live_photos(session, photo_ids).keys()
-    if source is None or source.spec != unprojected_spec(target):
+    if source is None or source.spec != target.extractor.spec(target.centres):
         return None
     rows = read_stored_rows(catalog, store, source.id, photo_ids)
     if live - rows.keys():
@@ -90,34 +89,27 @@ def read_rows_to_project(
     return [job for job, _ in jobs_with_rows], np.stack([row for _, row in jobs_with_rows])
 
 
-def unprojected_spec(target: ResolvedGeneration) -> dict[str, Any]:
-    """Return the spec of the target's descriptors before the projection."""
-    return target.extractor.spec(target.centres)
+PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
 
 
 @dataclass(slots=True)
 class DescribeBatch:
-    """Claimed jobs of one kind, map and generation, from their preparation to publication.
-
-    Attributes:
-        jobs: All jobs of the batch.
-        target: The generation that the batch is described into.
-        ready: Jobs to describe.
-        decoded: Their decoded photos, in the same order; empty with `stored_rows`.
-        failed: Jobs whose photo can't be described, each with the reason.
-        deleted: Jobs whose photo was deleted meanwhile.
-        stored_rows: Unprojected rows of `ready`, to be projected instead of decoding photos.
-        seconds: Duration of each stage.
-    """
+    """Claimed jobs of one kind, map and generation, from their preparation to publication."""
 
     jobs: list[Job]
     target: ResolvedGeneration
     ready: list[Job] = field(default_factory=list)
+    """Jobs to describe."""
     decoded: list[DecodedPhoto] = field(default_factory=list)
+    """The photos of `ready`, in the same order; empty with `stored_rows`."""
     failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
+    """Jobs whose photo can't be described, each with the reason."""
     deleted: list[Job] = field(default_factory=list)
+    """Jobs whose photo was deleted meanwhile."""
     stored_rows: Rows | None = None
+    """Unprojected rows of `ready`, to be projected instead of decoding photos."""
     seconds: dict[str, float] = field(default_factory=dict)
+    """Duration of each stage."""
 
     @property
     def token(self) -> UUID:
@@ -126,10 +118,6 @@ class DescribeBatch:
     @property
     def kind(self) -> JobKind:
         return JobKind(self.jobs[0].kind)
-
-    def pixels(self) -> list[Pixels]:
-        """Return the (height, width, 3) pixels of each job of `ready`."""
-        return [decoded.pixels for decoded in self.decoded]
 
     def reject(self, index: int, error: PlacewiseError) -> None:
         """Move the job at this index of `ready` to `failed`."""
@@ -155,6 +143,8 @@ def prepare_batch(
     target: ResolvedGeneration,
 ) -> DescribeBatch:
     """Read and decode the photos of the claimed jobs; store thumbnails and previews of new ones.
+
+    Query photos get a preview if their format is one that not all browsers show.
 
     Where possible, stored rows are read instead (`read_rows_to_project`).
     """
@@ -191,8 +181,8 @@ def prepare_batch(
 
     batch.seconds["read"] = time.perf_counter() - started
     started = time.perf_counter()
-    is_new = batch.kind == JobKind.INDEX
-    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing, with_previews=is_new)
+    previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
+    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing, previews=previews)
     for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
             batch.failed.append((job, outcome))
@@ -201,14 +191,16 @@ def prepare_batch(
             batch.decoded.append(outcome)
     batch.seconds["decode"] = time.perf_counter() - started
 
-    if is_new:
-        # Stored here and not with the chunk, while the model runs the previous batch.
-        started = time.perf_counter()
-        for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+    # Stored here and not with the chunk, while the model runs the previous batch.
+    started = time.perf_counter()
+    for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+        if batch.kind == JobKind.INDEX:
             store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
-            if decoded.preview is not None:
-                store.put(preview_key(photo_id_of(job)), decoded.preview)
-        batch.seconds["thumbnails"] = time.perf_counter() - started
+        if decoded.preview is not None:
+            is_query = batch.kind == JobKind.DESCRIBE
+            key = query_preview_key(job.id) if is_query else preview_key(photo_id_of(job))
+            store.put(key, decoded.preview)
+    batch.seconds["thumbnails"] = time.perf_counter() - started
     return batch
 
 
@@ -244,7 +236,7 @@ def describe_batch(batch: DescribeBatch) -> Rows:
                 assert target.projection is not None
                 rows = target.projection.project(batch.stored_rows)
             else:
-                pixels = batch.pixels()
+                pixels = [decoded.pixels for decoded in batch.decoded]
                 rows = target.extractor.describe(pixels, target.centres, target.projection)
         except PhotoTooLargeForGpu as error:
             batch.reject(error.place, error)

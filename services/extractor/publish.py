@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
-from uuid import UUID
+from typing import Any
 
 import numpy as np
 from sqlalchemy import insert, select
@@ -82,7 +82,7 @@ def _publish_photos(
             store,
             generation_id=generation_id,
             chunk_id=chunk_id,
-            rows=rows,
+            rows=rows.astype(batch.target.generation.row_type, copy=False),
             photo_ids=[photo_id_of(job) for job in batch.ready],
             spec=batch.target.generation.spec,
         )
@@ -99,7 +99,14 @@ def _publish_photos(
                 cancel_job(job) if batch.kind == JobKind.REINDEX else release_job(job)
             return outcome
         live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
-        described = _already_described(session, generation_id, list(live))
+        # A batch that lost its lease after its commit has described photos already.
+        described = set(
+            session.scalars(
+                select(Descriptor.photo_id).where(
+                    Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(live)
+                )
+            )
+        )
         for job in owned.values():
             if job.photo_id not in live:
                 cancel_job(job)
@@ -108,17 +115,15 @@ def _publish_photos(
             if leased_job is not None and leased_job.photo_id in live:
                 fail_job(leased_job, error.as_problem())
                 outcome.failed += 1
-        new_rows = []
+        new_rows: list[dict[str, Any]] = []
         for row, claimed in enumerate(batch.ready):
             leased_job = owned.get(claimed.id)
             if leased_job is None or leased_job.photo_id not in live:
                 continue  # a dead row
             if leased_job.photo_id not in described:
                 new_rows.append({"photo_id": leased_job.photo_id, "row": row})
-            succeed_job(
-                leased_job,
-                {"file_id": str(leased_job.photo_id), "generation_id": str(generation_id)},
-            )
+            file_id = str(leased_job.photo_id)
+            succeed_job(leased_job, {"file_id": file_id, "generation_id": str(generation_id)})
             outcome.succeeded += 1
         if new_rows and written is not None:
             session.add(
@@ -133,13 +138,8 @@ def _publish_photos(
                 )
             )
             session.flush()
-            session.execute(
-                insert(Descriptor),
-                [
-                    {"generation_id": generation_id, "chunk_id": chunk_id, **columns}
-                    for columns in new_rows
-                ],
-            )
+            place = {"generation_id": generation_id, "chunk_id": chunk_id}
+            session.execute(insert(Descriptor), [place | columns for columns in new_rows])
             increment_map_version(session, generation.map_id)
         return outcome
 
@@ -178,15 +178,3 @@ def _accepted_generation_states(kind: JobKind) -> tuple[GenerationState, ...]:
     if kind == JobKind.INDEX:
         return (GenerationState.ACTIVE,)
     return (GenerationState.BUILDING, GenerationState.ACTIVE)
-
-
-def _already_described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> set[UUID]:
-    """Photos that have a row already, committed by a batch that then lost its lease."""
-    return set(
-        session.scalars(
-            select(Descriptor.photo_id).where(
-                Descriptor.generation_id == generation_id,
-                Descriptor.photo_id.in_(photo_ids),
-            )
-        )
-    )

@@ -84,16 +84,10 @@ class ExtractorWorker:
         only_worker: bool = False,
         registry: CollectorRegistry | None = None,
     ) -> None:
-        """Create a worker.
+        """Create a worker with a name for its leases.
 
-        Args:
-            catalog: The catalog.
-            store: The object store.
-            settings: The settings.
-            name: Name of the worker in its leases.
-            only_worker: Whether no other worker runs, so none can be of another release; this one
-                then reindexes outdated generations.
-            registry: Prometheus registry of the process.
+        As the `only_worker`, so that none can be of another release, it reindexes outdated
+        generations.
         """
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._catalog = catalog
@@ -278,14 +272,10 @@ class ExtractorWorker:
         *,
         publish_async: bool = False,
     ) -> None:
-        """Describe and publish a batch.
+        """Describe and publish a batch, and update the statistics of `result`.
 
-        Args:
-            work: The claimed jobs.
-            result: Statistics to update.
-            concurrent_jobs: Number of other jobs in progress at the same time, any of which may be
-                the cause of a crash.
-            publish_async: Whether to publish in the background while the model runs the next batch.
+        `concurrent_jobs` other jobs are in progress at the same time, any of which may be the cause
+        of a crash. With `publish_async`, the batch is published while the model runs the next one.
         """
         with work.lease:
             rows = self._describe_claimed(work, result, concurrent_jobs)

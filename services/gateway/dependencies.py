@@ -25,8 +25,8 @@ from services.gateway.authentication import Authenticator, get_caller
 from services.gateway.similarity.neighbours import NeighbourCache
 from services.http_connections import ConnectionLimits, Connections
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import UNFINISHED_STATES
-from shared.catalog.maps import DEFAULT_MAP
+from shared.catalog.jobs import UNFINISHED_STATES, get_job
+from shared.catalog.maps import DEFAULT_MAP, get_map
 from shared.config.settings import Settings
 from shared.errors import NotFound, PlacewiseError, invalid_field_error
 from shared.jobs import Job, Wakeups
@@ -213,7 +213,7 @@ class _HasId(Protocol):
 Row = TypeVar("Row", bound=_HasId)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(eq=False, slots=True)
 class GatewayContext:
     """The stores, clients and settings that the routes use."""
 
@@ -235,15 +235,14 @@ class GatewayContext:
     """Applied frames of tracks by the status of the track, or `failed`."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "job_notifier", JobNotifier(self.catalog))
-        object.__setattr__(self, "connections", Connections(ConnectionLimits.of(self.settings)))
-        track_frames = Counter(
+        self.job_notifier = JobNotifier(self.catalog)
+        self.connections = Connections(ConnectionLimits.of(self.settings))
+        self.track_frames = Counter(
             "placewise_gateway_track_frames",
             "Frames of tracks that were applied, by the status of their track.",
             ["status"],
             registry=self.registry,
         )
-        object.__setattr__(self, "track_frames", track_frames)
 
 
 async def get_gateway_context(request: Request) -> GatewayContext:
@@ -349,13 +348,18 @@ def parse_prefer_wait(request: Request, max_seconds: int) -> float:
     return min(float(match[1]), max_seconds) if match else 0.0
 
 
-def load_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
-    """Load a job; None if it does not exist."""
+def load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job:
+    """Load a job of a map; raises as `get_map` and `get_job` do."""
     with gateway.catalog.read() as session:
-        return session.get(Job, job_id)
+        return get_job(session, get_map(session, map_name).id, job_id)
 
 
 async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
     """Wait at most `seconds` for the end of the job; return None if the job was deleted."""
+
+    def load() -> Job | None:
+        with gateway.catalog.read() as session:
+            return session.get(Job, job_id)
+
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
-    return await run_in_threadpool(load_job, gateway, job_id)
+    return await run_in_threadpool(load)

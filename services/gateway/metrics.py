@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -65,22 +66,8 @@ def count_jobs(session: Session) -> list[JobCount]:
 
 router = APIRouter(tags=["operations"])
 
-# From a health probe to the longest `Prefer: wait`.
-LATENCY_BUCKETS = (
-    0.005,
-    0.01,
-    0.025,
-    0.05,
-    0.1,
-    0.25,
-    0.5,
-    1.0,
-    2.5,
-    5.0,
-    10.0,
-    30.0,
-    60.0,
-)  # seconds
+# Seconds, from a health probe to the longest `Prefer: wait`.
+LATENCY_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 METRIC_PREFIX = "placewise_gateway"
 
 
@@ -89,28 +76,25 @@ class GatewayMetrics:
 
     def __init__(self, gateway: GatewayContext, admission: AdmissionControl) -> None:
         registry = gateway.registry
-        self._requests = Counter(
-            f"{METRIC_PREFIX}_requests",
-            "Requests by route and response status.",
-            ["method", "route", "status"],
-            registry=registry,
+        counter = partial(Counter, namespace=METRIC_PREFIX, registry=registry)
+        self._requests = counter(
+            "requests", "Requests by route and response status.", ["method", "route", "status"]
         )
         self._seconds = Histogram(
-            f"{METRIC_PREFIX}_request_seconds",
+            "request_seconds",
             "Seconds from the request to the first byte of the response.",
             ["method", "route"],
+            namespace=METRIC_PREFIX,
             buckets=LATENCY_BUCKETS,
             registry=registry,
         )
-        self._received = Counter(
-            f"{METRIC_PREFIX}_received_bytes",
-            "Bytes of request bodies, mainly uploads and query photos.",
-            ["route"],
-            registry=registry,
+        self._received = counter(
+            "received_bytes", "Bytes of request bodies, mainly uploads and query photos.", ["route"]
         )
         self._in_flight = Gauge(
-            f"{METRIC_PREFIX}_requests_under_way",
+            "requests_under_way",
             "Requests in flight, including event streams.",
+            namespace=METRIC_PREFIX,
             registry=registry,
         )
         registry.register(_LoadCollector(gateway, admission))

@@ -13,11 +13,7 @@ from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_netw
 
 from starlette.datastructures import Headers
 
-from services.gateway.authentication import (
-    Authenticator,
-    Caller,
-    check_same_origin,
-)
+from services.gateway.authentication import Authenticator, Caller, check_same_origin
 from shared.config.settings import Settings
 from shared.errors import Unauthorized
 from shared.security.api_keys import Scope, expand_scopes

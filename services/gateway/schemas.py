@@ -14,7 +14,7 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import API_PREFIX
-from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.catalog.jobs import QUERY_JOBS
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
@@ -187,8 +187,9 @@ class EstimateResponse(ResponseModel):
     radius_95_m: float | None = Field(None, description="the same with 95 %")
     calibration_source: str | None = Field(
         None,
-        description="what the probabilities were fitted on: `own_photos` or `labelled_queries` of "
-        "this map; null without levels",
+        description="what determines the probabilities most: `own_photos` or `labelled_queries` of "
+        "this map, or the `prior` of generated maps, near which a map of fewer than 200 evaluated "
+        "photos stays; null without levels",
     )
 
 
@@ -366,6 +367,7 @@ class GenerationResponse(ResponseModel):
     extractor: str
     dimension: int = Field(description="of its descriptors, after PCA if there is one")
     pca_from: int | None = Field(description="dimension before PCA; null without PCA")
+    rows: RowType = Field(description="type of its stored descriptors: `float32` or `float16`")
     vocabulary_id: UUID | None
     photos: int = Field(description="live photos with a descriptor in this generation")
     spec: dict[str, Any]
@@ -381,6 +383,7 @@ class GenerationResponse(ResponseModel):
             extractor=generation.extractor,
             dimension=generation.dimension,
             pca_from=generation.pca_from,
+            rows=RowType(generation.row_type),
             vocabulary_id=generation.vocabulary_id,
             photos=photos,
             spec=generation.spec,

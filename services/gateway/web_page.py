@@ -89,10 +89,7 @@ def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
     """Yield the files below `folder` with a suffix in MEDIA_TYPES, with their relative paths."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in MEDIA_TYPES:
-            yield (
-                path.relative_to(folder).as_posix(),
-                StaticAsset(path.suffix, path.read_bytes()),
-            )
+            yield path.relative_to(folder).as_posix(), StaticAsset(path.suffix, path.read_bytes())
 
 
 def _accepts_gzip(request: Request) -> bool:
@@ -119,9 +116,7 @@ API_DOCS_CSP = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 def create_web_page_router(settings: Settings, lan_url: str | None = None) -> APIRouter:
     """Create the routes of the web page, the API documentation and the assets.
 
-    Args:
-        settings: The settings.
-        lan_url: URL of this server for other devices of the network, if it is known.
+    `lan_url` is the URL of this server for other devices of the network, if it is known.
     """
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
@@ -213,7 +208,6 @@ def _load_page_assets() -> dict[str, StaticAsset]:
     for url_folder, package, package_folder, names in VENDORED_PACKAGES:
         source = Path(str(files(package))) / package_folder
         for name in names:
-            assets[f"{url_folder}/{name}"] = StaticAsset(
-                Path(name).suffix, (source / name).read_bytes()
-            )
+            file = source / name
+            assets[f"{url_folder}/{name}"] = StaticAsset(file.suffix, file.read_bytes())
     return assets

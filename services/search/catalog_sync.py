@@ -82,16 +82,7 @@ def sync_snapshot(
 
     The catalog is read in one consistent transaction. A chunk that can't be read, or whose hash
     differs, is named in `missing` and read again once `unreadable` says so; the others are served.
-
-    Args:
-        catalog: The catalog.
-        store: The object store.
-        folder: Files are cached below this folder.
-        memory_budget: Decides which parts are held in memory.
-        generation_id: The generation.
-        old: The previous snapshot, if any.
-        unreadable: Retry times of unreadable chunks.
-        shard: The shard whose chunks are loaded.
+    Files are cached below `folder`. `memory_budget` decides which parts are held in memory.
 
     Returns:
         The new snapshot; None if the generation no longer exists.

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import UUID
 
 import numpy as np
@@ -30,7 +30,7 @@ from shared.config.private_files import create_private_file, make_private_folder
 from shared.errors import NotFound
 from shared.ids import new_id
 from shared.storage import ObjectStore
-from shared.storage.chunks import Rows, chunk_corrupt_error, codes_key, decode_rows
+from shared.storage.chunks import StoredRows, chunk_corrupt_error, codes_key, decode_rows
 from shared.storage.copying import PARTIAL_SUFFIX, download_object, remove_stale_partials
 
 if TYPE_CHECKING:
@@ -169,11 +169,11 @@ def _map_file(descriptor: int, path: Path) -> MappedFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedChunk:
-    """A chunk's rows, (n, dimension) float32, with the columns of their photos, and codes."""
+    """A chunk's rows, (n, dimension), with the columns of their photos, and codes."""
 
     chunk_id: UUID
     object_key: str
-    rows: Rows
+    rows: StoredRows
     photos: PhotoColumns
     codes: SignCodes | None = None
     """Sign codes; None while they are not in use."""
@@ -199,7 +199,7 @@ class StoredChunk:
     """A chunk's memory-mapped files."""
 
     file: MappedFile
-    rows: Rows
+    rows: StoredRows
     sha256: str
     codes: SignCodes | None = None
     int8: Int8Codes | None = None
@@ -207,7 +207,6 @@ class StoredChunk:
 
 CACHED_SUFFIXES = (".npy", ".codes", ".int8")  # of a chunk's files in the cache folder
 
-Number = TypeVar("Number", bound=np.generic)
 Codes = TypeVar("Codes")
 
 
@@ -215,12 +214,7 @@ class ChunkLoader:
     """Opens the chunks of one generation."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
-        """Create a loader.
-
-        Args:
-            store: The object store.
-            folder: Cache folder of the generation, for downloads and for computed codes.
-        """
+        """`folder` is the generation's cache, for downloads and for computed codes."""
         self._store = store
         self._files = MappedFileCache(store, folder)
 
@@ -333,7 +327,7 @@ def hold_in_memory(chunk: LoadedChunk, parts: int) -> LoadedChunk:
         loaded = (chunk.int8 or stored.int8).numbers
         int8 = replace(stored.int8, numbers=_in_memory(stored.int8.numbers, loaded, parts > part))
         part += 1
-    rows = _in_memory(stored.rows, chunk.rows, parts > part)
+    rows: StoredRows = _in_memory(stored.rows, chunk.rows, parts > part)
     return replace(chunk, rows=rows, codes=codes, int8=int8)
 
 
@@ -350,7 +344,7 @@ def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
     return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 
-def _in_memory(stored: NDArray[Number], loaded: NDArray[Number], resident: bool) -> NDArray[Number]:
+def _in_memory(stored: NDArray[Any], loaded: NDArray[Any], resident: bool) -> NDArray[Any]:
     if not resident:
         return stored
     return np.array(stored) if loaded is stored else loaded

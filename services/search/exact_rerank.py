@@ -20,6 +20,7 @@ from services.search.kernels import exact_products
 
 Addresses = NDArray[np.uint64]
 Indices = NDArray[np.int64]
+Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +31,9 @@ class RowBlocks:
     first_rows: Indices
     """(c + 1,): number of each block's first row; the last is n."""
     row_addresses: Addresses
-    """(c,): start address of each block's float32 rows."""
+    """(c,): start address of each block's rows."""
+    number_bytes: Indices
+    """(c,): bytes of a number of each block's rows: 4 for float32, 2 for float16."""
     keep_alive: object
     """Owner of the memory, which must live as long as the addresses are used."""
 
@@ -41,11 +44,22 @@ class RowBlocks:
             dimension=chunks[0].rows.shape[1],
             first_rows=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
             row_addresses=array_addresses(chunk.rows for chunk in chunks),
+            number_bytes=np.array([chunk.rows.itemsize for chunk in chunks]),
             keep_alive=chunks,
         )
 
     def __len__(self) -> int:
         return int(self.first_rows[-1])
+
+    def multiply(self, rows: Indices, query: NDArray[np.float32], out: Scores) -> None:
+        """Write the exact products of the given rows with the query to `out`, on all CPUs."""
+        parallel_for(
+            lambda i, j: exact_products(
+                self.row_addresses, self.first_rows, self.number_bytes, rows[i:j], query, out[i:j]
+            ),
+            len(rows),
+            4 * self.dimension,
+        )
 
 
 def array_addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
@@ -88,8 +102,6 @@ def _thread_pool() -> ThreadPoolExecutor:
 # at least an eighth of the rows compared before: long results occupy all threads, and at most an
 # eighth of the rows is compared in vain.
 RERANK_STEP_ROWS = 8
-
-Scores = NDArray[np.float64]
 
 
 @dataclass(slots=True)
@@ -162,20 +174,10 @@ class ExactReranker:
             step = max(RERANK_STEP_ROWS, done // 8)
             end = min(len(rows), max(self.k, done + step), budget.max_rows or len(rows))
             self.prefetch(rows[done:end])
-            self._multiply(rows[done:end], scores[done:end])
+            self.blocks.multiply(rows[done:end], self.query, scores[done:end])
             scores[done:end] /= self.norm
             done = end
             if done >= self.k:
                 kth = float(np.partition(scores[:done], done - self.k)[done - self.k])
                 floor = max(floor, kth)
         return RerankedRows(rows[:done], scores[:done], unseen_bound)
-
-    def _multiply(self, rows: Indices, out: Scores) -> None:
-        blocks = self.blocks
-        parallel_for(
-            lambda i, j: exact_products(
-                blocks.row_addresses, blocks.first_rows, rows[i:j], self.query, out[i:j]
-            ),
-            len(rows),
-            4 * blocks.dimension,
-        )

@@ -53,20 +53,14 @@ NO_SCORES = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Number of results, minimum score, strategy, and limits of a search.
-
-    Attributes:
-        k: Number of results.
-        min_score: Minimum cosine; None for no minimum.
-        mode: Search strategy.
-        most_rows: Maximum number of rows compared exactly.
-        most_seconds: Time limit in seconds.
-    """
+    """Number of results, strategy, and limits of a search."""
 
     k: int
     min_score: float | None = None
+    """Minimum cosine."""
     mode: Mode = Mode.AUTO
     most_rows: int | None = None
+    """Maximum number of rows compared exactly."""
     most_seconds: float | None = None
 
 
@@ -145,7 +139,7 @@ def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
     """
     from shared.codes.rotation import get_rotation
 
-    row_bytes = 4 * dimension
+    row_bytes = 4 * dimension  # of float32; float16 rows are half as long, but are converted
     code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
 

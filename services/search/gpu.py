@@ -2,7 +2,7 @@
 
 A generation's rows are held in the GPU's memory as float16 if they fit. One product gives every
 row's score to within a bound; rows that may be among the best are compared exactly on the CPU, by
-their float32 rows. So the results are the same as those of the CPU.
+their stored rows. So the results are the same as those of the CPU.
 
 Error bound of a float16 row: a row x is stored as the float16 numbers h nearest to it, scaled by
 256 so that none underflows; a query u of length 1 is stored as two float16 vectors whose sum v
@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.int8_search import Candidates
+from shared.storage.chunks import StoredRows
 
 PARTIAL_SUM_TERMS = 2048  # products of a row that are summed in float32
 ACCUMULATION_ERROR = 2.0**-22  # error of each addition, relative to the sum of all magnitudes
@@ -87,13 +88,7 @@ class GpuDevice:
     def __init__(
         self, torch_device: torch.device, free_bytes: Callable[[], float], headroom_bytes: int
     ) -> None:
-        """Create a device.
-
-        Args:
-            torch_device: The PyTorch device.
-            free_bytes: Returns the bytes of its memory that are free now.
-            headroom_bytes: Bytes to reserve for products.
-        """
+        """`free_bytes` returns what is free now; `headroom_bytes` are reserved for products."""
         self.torch_device = torch_device
         self._free_bytes = free_bytes
         self._headroom_bytes = headroom_bytes
@@ -153,12 +148,7 @@ class GpuDevice:
     def load(
         self, chunks: Sequence[LoadedChunk], old: GpuSnapshot | None, max_bytes: float
     ) -> GpuSnapshot | None:
-        """Load a snapshot's rows into GPU memory, reusing those of `old`.
-
-        Args:
-            chunks: The chunks of the snapshot.
-            old: Rows of the previous snapshot, if any.
-            max_bytes: Maximum number of bytes to copy.
+        """Load a snapshot's rows into GPU memory, reusing those of the previous one, if any.
 
         Returns:
             The rows; None if they don't fit, or more than `max_bytes` would have to be copied.
@@ -179,7 +169,7 @@ class GpuDevice:
             raise GpuError(str(error)) from error
         return GpuSnapshot(self.torch_device, gpu_chunks)
 
-    def _copy_as_float16(self, rows: NDArray[np.float32]) -> GpuChunk:
+    def _copy_as_float16(self, rows: StoredRows) -> GpuChunk:
         parts, part_terms = _partial_sum_layout(rows.shape[1])
         numbers = torch.zeros(
             (_round_up(len(rows), ROWS_ALIGNED), parts * part_terms),

@@ -52,6 +52,7 @@ class Int8Blocks(RowBlocks):
             dimension=rows.dimension,
             first_rows=rows.first_rows,
             row_addresses=rows.row_addresses,
+            number_bytes=rows.number_bytes,
             keep_alive=rows.keep_alive,
             code_addresses=array_addresses(code.numbers for code in codes),
             row_params=np.concatenate(

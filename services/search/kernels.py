@@ -15,6 +15,7 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -56,8 +57,19 @@ def _pointer_to(element: types.Type) -> Any:
     return pointer
 
 
+@intrinsic
+def _float16_value(_typing: Any, bits: types.Type) -> Any:
+    """Convert the bits of a float16, a uint16, to float32; numba has no float16 on CPUs."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
+
+    return types.float32(types.uint16), generate
+
+
 _words_at = _pointer_to(types.uint64)
 _floats_at = _pointer_to(types.float32)
+_float16_bits_at = _pointer_to(types.uint16)
 _bytes_at = _pointer_to(types.int8)
 
 
@@ -278,27 +290,36 @@ def weighted_bit_sums(
 def exact_products(
     block_addresses: Addresses,
     first_rows: NDArray[np.int64],
+    number_bytes: NDArray[np.int64],
     rows: NDArray[np.int64],
     query: NDArray[np.float32],
     out: NDArray[np.float64],
 ) -> None:
-    """Dot products of float32 rows with the query, summed in float64.
+    """Dot products of float32 or float16 rows with the query, summed in float64.
 
     Each product is exact in float64, and the sums of equal rows are equal.
 
     Args:
-        block_addresses: (c,) addresses of the blocks' float32 rows.
+        block_addresses: (c,) addresses of the blocks' rows.
         first_rows: (c + 1,) number of each block's first row.
+        number_bytes: (c,) bytes of a number of each block's rows: 4 for float32, 2 for float16.
         rows: (n,) row numbers.
         query: (dimension,) float32.
         out: (n,) float64.
     """
     for index in range(rows.shape[0]):
-        address = _address(block_addresses, first_rows, rows[index], 4 * query.shape[0])
-        row = nb.carray(_floats_at(address), query.shape)
+        block = np.searchsorted(first_rows, rows[index], side="right") - 1
+        row_bytes = number_bytes[block] * query.shape[0]
+        address = block_addresses[block] + np.uint64((rows[index] - first_rows[block]) * row_bytes)
         total = 0.0
-        for i in range(query.shape[0]):
-            total += np.float64(row[i]) * np.float64(query[i])
+        if number_bytes[block] == 2:
+            halves = nb.carray(_float16_bits_at(address), query.shape)
+            for i in range(query.shape[0]):
+                total += np.float64(_float16_value(halves[i])) * np.float64(query[i])
+        else:
+            row = nb.carray(_floats_at(address), query.shape)
+            for i in range(query.shape[0]):
+                total += np.float64(row[i]) * np.float64(query[i])
         out[index] = total
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -15,22 +16,10 @@ from shared.errors import PlacewiseError
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.telemetry.tracing import span
 
-# From a small map in memory to a dense scan of a full shard, and the longest wait for a version.
-LATENCY_BUCKETS = (
-    0.001,
-    0.0025,
-    0.005,
-    0.01,
-    0.025,
-    0.05,
-    0.1,
-    0.25,
-    0.5,
-    1.0,
-    2.5,
-    5.0,
-    10.0,
-)  # seconds
+METRIC_PREFIX = "placewise_search"
+# Seconds, from a small map in memory to a dense scan of a full shard, and the longest wait for a
+# version.
+LATENCY_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
 # The maximum over some dozens of rows. From 5.5 on sign codes are not trusted (`executor.py`).
 MAX_Z_BUCKETS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
@@ -46,39 +35,23 @@ class MeteredSearch:
     def __init__(self, worker: SearchWorker, registry: CollectorRegistry | None = None) -> None:
         self._worker = worker
         self._registry = registry or CollectorRegistry()
-        self._searches = Counter(
-            "placewise_search_searches",
-            "Searches by outcome: answered, or the error code.",
-            ["outcome"],
-            registry=self._registry,
+        counter = partial(Counter, namespace=METRIC_PREFIX, registry=self._registry)
+        histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=self._registry)
+        self._searches = counter(
+            "searches", "Searches by outcome: answered, or the error code.", ["outcome"]
         )
-        self._seconds = Histogram(
-            "placewise_search_seconds",
-            "Duration of successful searches in seconds.",
-            buckets=LATENCY_BUCKETS,
-            registry=self._registry,
+        self._seconds = histogram(
+            "seconds", "Duration of successful searches in seconds.", buckets=LATENCY_BUCKETS
         )
-        self._rows = Counter(
-            "placewise_search_rows_scanned",
-            "Descriptor rows compared with a query.",
-            registry=self._registry,
+        self._rows = counter("rows_scanned", "Descriptor rows compared with a query.")
+        self._reranked = counter(
+            "rows_reranked", "Descriptor rows compared exactly, by their full descriptors."
         )
-        self._reranked = Counter(
-            "placewise_search_rows_reranked",
-            "Descriptor rows compared exactly, by their full descriptors.",
-            registry=self._registry,
-        )
-        self._certificates = Counter(
-            "placewise_search_answers",
-            "Responses by certificate.",
-            ["certificate"],
-            registry=self._registry,
-        )
-        self._deviations = Histogram(
-            "placewise_search_max_z",
+        self._certificates = counter("answers", "Responses by certificate.", ["certificate"])
+        self._deviations = histogram(
+            "max_z",
             "Largest error of a response's sign-code estimates, in standard deviations.",
             buckets=MAX_Z_BUCKETS,
-            registry=self._registry,
         )
         self._registry.register(_SnapshotCollector(worker))
 
@@ -119,7 +92,7 @@ class _SnapshotCollector(Collector):
 
     def collect(self) -> Iterable[Metric]:
         status = self._worker.status()
-        prefix = "placewise_search"
+        prefix = METRIC_PREFIX
         yield GaugeMetricFamily(
             f"{prefix}_resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes
         )

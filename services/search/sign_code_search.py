@@ -76,6 +76,7 @@ class SignCodeBlocks(RowBlocks):
             dimension=rows.dimension,
             first_rows=rows.first_rows,
             row_addresses=rows.row_addresses,
+            number_bytes=rows.number_bytes,
             keep_alive=rows.keep_alive,
             level_addresses=np.stack(
                 [array_addresses(parts) for parts in zip(*(c.levels for c in codes), strict=True)]
@@ -221,6 +222,7 @@ def compile_kernels() -> None:
         dimension=len(row),
         first_rows=np.array([0, 1]),
         row_addresses=array_addresses([row]),
+        number_bytes=np.array([row.itemsize]),
         keep_alive=(codes, row),
         level_addresses=np.stack([array_addresses([level]) for level in codes.levels]),
         norms=codes.norms,
@@ -255,15 +257,7 @@ class SignCodeSearch:
         min_score: float | None,
         prefetch: Callable[[Indices], None],
     ) -> None:
-        """Create a search.
-
-        Args:
-            blocks: Codes and rows.
-            query: The query.
-            k: Number of results.
-            min_score: Minimum score; None for no minimum.
-            prefetch: Called with rows before they are compared exactly.
-        """
+        """Create a search; `prefetch` is called with rows before they are compared exactly."""
         self._blocks = blocks
         self._query = query
         self._k = k

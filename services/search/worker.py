@@ -38,7 +38,13 @@ from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
 from shared.search_api.background import subtract_background
-from shared.search_api.protocol import RowReference, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    BACKGROUND_FEATURE,
+    RowReference,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
@@ -80,7 +86,7 @@ class QueryRowReader:
             return self._read_cached(request.object_key, request.row)
         if request.row >= len(chunk.rows):
             raise reference_expired_error(f"row {request.row} of {request.object_key}")
-        row: Row = chunk.rows[request.row]
+        row: Row = chunk.rows[request.row].astype(np.float32)
         return row
 
     def read_background(self, references: Sequence[RowReference]) -> list[Row]:
@@ -159,22 +165,14 @@ class SearchWorker:
         shard: Shard = SINGLE_SHARD,
         device: GpuDevice | None = None,
     ) -> None:
-        """Create a worker without any snapshot.
-
-        Args:
-            catalog: The catalog.
-            store: The object store.
-            settings: The settings.
-            shard: The shard to hold.
-            device: GPU to search on; by default as SEARCH_DEVICE says.
-        """
+        """Create a worker without any snapshot; its GPU is by default as SEARCH_DEVICE says."""
         self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
         self._settings = settings
         self._store = store
         self._folder = settings.search_cache_folder(shard)
-        self._batcher = QueryBatcher()
+        self.query_batcher = QueryBatcher()
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
         self._snapshots: dict[UUID, Snapshot] = {}
@@ -254,12 +252,7 @@ class SearchWorker:
             most_seconds=request.most_seconds,
         )
         weighted = _weight_query(query, request.word_weights)
-        return execute_query(snapshot, query, row_mask, options, self._batcher, weighted)
-
-    @property
-    def query_batcher(self) -> QueryBatcher:
-        """The batcher of first-level scans, for its counters."""
-        return self._batcher
+        return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)
 
     def status(self) -> SearchStatus:
         """Return what is loaded, with sizes and lags."""
@@ -277,6 +270,7 @@ class SearchWorker:
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.replication_lag.current_lags(versions),
             devices=self._residency.status(snapshots.values()),
+            features=(BACKGROUND_FEATURE,),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:

@@ -104,12 +104,8 @@ RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
 class EvaluationSearch:
     """Searches one generation of a map with its stored photos.
 
-    Args:
-        catalog: The catalog.
-        search: The search tier.
-        generation: The generation to search.
-        version: The map version that search workers must have loaded.
-        photos: The geotagged photos by id, for the locations of results.
+    `version` is the map version that search workers must have loaded; `photos` are the geotagged
+    photos by id, for the locations of results.
     """
 
     def __init__(
@@ -135,11 +131,7 @@ class EvaluationSearch:
     ) -> LocatedRanking | None:
         """Return the k most similar database photos with their locations.
 
-        Args:
-            query: The query photo, which is excluded from the results.
-            k: Number of results.
-            weights: Word weights; empty for an unweighted ranking.
-            excluded_photos: More photos to exclude.
+        The query photo is excluded, too. Without word weights, the ranking is unweighted.
 
         Returns:
             The ranking, best first; None if the query was deleted since.

@@ -25,7 +25,6 @@ from services.steward.evaluation_search import (
     EvaluationSearch,
     GeotaggedPhoto,
     GeotaggedPhotos,
-    LocatedRanking,
     RankPhoto,
     read_geotagged_photos,
 )
@@ -56,11 +55,7 @@ from shared.evaluation.places.evidence import (
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.samples import (
-    SAME_SESSION_PERIOD,
-    IndexRanking,
-    OwnPhotoSampler,
-)
+from shared.evaluation.places.samples import SAME_SESSION_PERIOD, IndexRanking, OwnPhotoSampler
 from shared.search_api.protocol import SearchBackend, SearchHit
 
 RECALL_RANKS = (1, 5, 10)
@@ -176,13 +171,9 @@ class MapEvaluationResult:
 class MapEvaluation:
     """Evaluates one generation of a map.
 
-    Args:
-        catalog: The catalog.
-        search: The search tier.
-        generation: The generation to evaluate.
-        radius_m: Photos within this distance, in metres, show the same place.
-        level_radii_m: Radii of the levels of an estimate, in metres.
-        on_query: Called after every search; an exception that it raises ends the evaluation.
+    Photos within `radius_m` metres show the same place; `level_radii_m` are the radii of the levels
+    of an estimate, in metres. `on_query` is called after every search; an exception that it raises
+    ends the evaluation.
     """
 
     def __init__(
@@ -223,9 +214,7 @@ class MapEvaluation:
     ) -> MapEvaluationResult:
         """Search with every photo of the sample and every labelled query, and compute the metrics.
 
-        Args:
-            sample: Database photos for the leave-one-out evaluation.
-            weights: Word weights of the ranking; empty for an unweighted one.
+        The sample is that of the leave-one-out evaluation. Without weights, it is unweighted.
         """
         rank_photo = partial(self.search.rank_similar, weights=weights)
         own_photos = OwnPhotoSampler(
@@ -346,12 +335,12 @@ class MapEvaluation:
                 labelled.recall.add(
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
                 )
-            evidence = compute_evidence(_to_ranked(ranking), self.radius_m)
-            estimate = (
-                estimate_location(_to_ranked(ranking), self.radius_m)
-                if evidence
-                else UNKNOWN_LOCATION
-            )
+            ranked = [
+                RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
+                for hit, spot in ranking
+            ]
+            evidence = compute_evidence(ranked, self.radius_m)
+            estimate = estimate_location(ranked, self.radius_m) if evidence else UNKNOWN_LOCATION
             labelled.outcomes.append(
                 QueryOutcome(
                     in_map=in_map,
@@ -361,10 +350,7 @@ class MapEvaluation:
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     accepted=calibration.accepts(evidence) if evidence else None,
                     truth=query.spot,
-                    ranking=[
-                        RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
-                        for hit, spot in ranking
-                    ],
+                    ranking=ranked,
                     best_photo_id=ranking[0][0].photo_id if ranking else None,
                 )
             )
@@ -375,7 +361,3 @@ class MapEvaluation:
         if match is None or match.captured_at is None or query.captured_at is None:
             return False
         return abs(match.captured_at - query.captured_at) < SAME_SESSION_PERIOD
-
-
-def _to_ranked(ranking: LocatedRanking) -> list[RankedPhoto]:
-    return [RankedPhoto(hit.ranked_by, spot) for hit, spot in ranking]

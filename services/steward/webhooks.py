@@ -32,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.webhooks import SECRET_PREFIX, Delivery, DeliveryState, Webhook
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
@@ -44,26 +44,11 @@ log = logging.getLogger(__name__)
 def sign_webhook(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str:
     """Return the signature: `v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`.
 
-    Args:
-        secret: `whsec_` and the key in base64.
-        message_id: Id of the event.
-        timestamp_seconds: Unix time, so that a receiver can reject old and replayed messages.
-        body: The request body.
+    The secret is `whsec_` and the key in base64. By the time, a receiver can reject old messages.
     """
     key = base64.b64decode(secret.removeprefix(SECRET_PREFIX))
     signed = f"{message_id}.{timestamp_seconds}.{body}".encode()
     return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
-
-
-def signature_headers(
-    secret: str, message_id: str, timestamp_seconds: int, body: str
-) -> dict[str, str]:
-    """Return the headers that authenticate the body. The id is the same in every attempt."""
-    return {
-        "webhook-id": message_id,
-        "webhook-timestamp": str(timestamp_seconds),
-        "webhook-signature": sign_webhook(secret, message_id, timestamp_seconds, body),
-    }
 
 
 # Deadline of one attempt: name lookup, connection, TLS handshake, request and response head.
@@ -112,13 +97,7 @@ async def send_webhook(
     """Send the delivery once, within ATTEMPT_SECONDS.
 
     Redirects are not followed, and the proxies of the environment are not used. Network errors and
-    error responses are returned, not raised.
-
-    Args:
-        webhook: The webhook.
-        delivery: The delivery.
-        tls: Verifies the receiver's certificate.
-        allow_private: Whether private IP addresses may be called.
+    error responses are returned, not raised. `allow_private` allows private IP addresses.
     """
     try:
         async with asyncio.timeout(ATTEMPT_SECONDS):
@@ -146,11 +125,11 @@ async def _post(
     address = await in_daemon_thread(
         lambda: resolve_webhook_target(target, allow_private=allow_private)
     )
-    signed = signature_headers(
-        webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
-    )
+    message_id, timestamp = f"msg_{delivery.event_id}", int(time.time())  # an id for all attempts
     headers = [
-        *signed.items(),
+        ("webhook-id", message_id),
+        ("webhook-timestamp", str(timestamp)),
+        ("webhook-signature", sign_webhook(webhook.secret, message_id, timestamp, delivery.body)),
         ("Content-Type", "application/json"),
         ("Host", target.host_header),
         ("User-Agent", USER_AGENT),
@@ -220,13 +199,15 @@ class WebhookDispatcher:
     async def _run(self, stop: threading.Event) -> None:
         stopped = in_daemon_thread(stop.wait)
         tasks: dict[UUID, asyncio.Task[None]] = {}
+        poll = ChangePoll(self._catalog)
         while not stopped.done():
+            due: list[UUID] = []
             try:
-                due = await asyncio.to_thread(self.due_webhooks, list(tasks))
-                if not due:
-                    self._outage.record_success()
+                if tasks or poll.is_due(RETRY_DELAYS_SECONDS[0]):
+                    due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                    if not due:
+                        self._outage.record_success()
             except SQLAlchemyError as error:
-                due = []
                 self._outage.record_error(error)
             # At random, so that webhooks with a backlog don't starve the others.
             for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):

@@ -46,11 +46,6 @@ ROW_BATCH_BYTES = 64_000_000  # rows in memory: 160 photos at 98,304 dimensions
 MIN_BATCH_ROWS = 8  # at any dimension: the far pairs come from the same photos
 
 
-def photos_per_batch(dimension: int) -> int:
-    """Return the largest number of photos in a batch of pairs."""
-    return max(MIN_BATCH_ROWS, ROW_BATCH_BYTES // (dimension * np.dtype(np.float32).itemsize))
-
-
 def accumulate_pair_statistics(
     catalog: Catalog,
     store: ObjectStore,
@@ -62,15 +57,8 @@ def accumulate_pair_statistics(
 ) -> PairStatistics:
     """Accumulate the statistics of photo pairs, reading the rows of one batch at a time.
 
-    Args:
-        catalog: The catalog.
-        store: The object store with the chunks.
-        generation_id: The generation whose rows are read.
-        photo_ids: The photos that the batches index. Pairs with a photo that was deleted since are
-            left out.
-        batches: Pairs of photos.
-        words: Number of words in the vocabulary.
-        on_batch: Called before each batch; an exception that it raises ends the loop.
+    The batches index `photo_ids`. Pairs with a photo that was deleted since are left out.
+    `on_batch` is called before each batch; an exception that it raises ends the loop.
 
     Raises:
         Conflict: `map_damaged`: rows can't be read.
@@ -129,14 +117,9 @@ MAX_BURST_PHOTOS = 200
 
 
 class WordWeightsFit:
-    """Fits and validates the word weights of one generation.
+    """Fits and validates the word weights of one generation, whose vocabulary has `words` words.
 
-    Args:
-        catalog: The catalog.
-        store: The object store with the chunks.
-        generation: The generation.
-        words: Number of words in its vocabulary.
-        evaluation: The evaluation of the generation, for its photos and its search client.
+    The evaluation of the generation gives its photos and its search client.
     """
 
     def __init__(
@@ -154,12 +137,9 @@ class WordWeightsFit:
         self._evaluation = evaluation
 
     def fit(self, sample: Sequence[GeotaggedPhoto], seed: int, searchable: int) -> WordWeights:
-        """Fit the weights and validate them.
+        """Fit the weights, and validate them with the photos of the sample.
 
-        Args:
-            sample: The photos to validate with.
-            seed: Seed of the split and of the sampled pairs.
-            searchable: Number of searchable photos, stored with the record.
+        `searchable` is the number of searchable photos, stored with the record.
 
         Returns:
             The record to store, also where the weights were not kept.
@@ -169,9 +149,9 @@ class WordWeightsFit:
                 `accumulate_pair_statistics`.
         """
         photos = self._evaluation.database.photos
-        split = sample_pairs(
-            [photo.spot for photo in photos], seed, photos_per_batch(self._generation.dimension)
-        )
+        row_bytes = self._generation.dimension * np.dtype(np.float32).itemsize
+        batch_photos = max(MIN_BATCH_ROWS, ROW_BATCH_BYTES // row_bytes)
+        split = sample_pairs([photo.spot for photo in photos], seed, batch_photos)
         halves = self._fit_halves(split)
         record = WordWeights(
             outcome=Outcome.NOT_ENOUGH_PAIRS,

@@ -45,27 +45,22 @@ class PlaceBatchSampler:
     """Samples batches of P places x K photos, as the GSV-Cities code does.
 
     The last batch of an epoch may be smaller.
-
-    Attributes:
-        places: the places of the training set.
-        places_per_batch: P.
-        photos_per_place: K.
-        shuffle_all: shuffle all places. If false, cities keep their order and places are shuffled
-            within each city; a batch then (almost) always holds one city, whose places are hard
-            to distinguish.
-        random_photos: in every epoch, draw a place's photos without replacement. If false, use its
-            first K photos.
-        reshuffle_every_epochs: number of epochs between shuffles of the places; 0: shuffle once.
-        seed: seed of the order, the photos and the augmentation.
     """
 
     places: Sequence[TrainingPlace]
     places_per_batch: int
+    """P"""
     photos_per_place: int
+    """K"""
     shuffle_all: bool
+    """shuffle all places. If false, cities keep their order and places are shuffled within each
+    city; a batch then (almost) always holds one city, whose places are hard to distinguish"""
     random_photos: bool
+    """draw a place's photos without replacement in each epoch. If false, use its first K photos"""
     reshuffle_every_epochs: int
+    """number of epochs between shuffles of the places; 0: shuffle once"""
     seed: int
+    """seed of the order, the photos and the augmentation"""
 
     def __len__(self) -> int:
         return -(-len(self.places) // self.places_per_batch)
@@ -160,11 +155,9 @@ class Batch:
     """path and reason of each skipped photo"""
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
-        return Batch(
-            self.photos.to(device, non_blocking=non_blocking),
-            self.labels.to(device, non_blocking=non_blocking),
-            self.undecodable,
-        )
+        photos = self.photos.to(device, non_blocking=non_blocking)
+        labels = self.labels.to(device, non_blocking=non_blocking)
+        return Batch(photos, labels, self.undecodable)
 
     def pin_memory(self) -> Batch:
         return Batch(self.photos.pin_memory(), self.labels.pin_memory(), self.undecodable)
@@ -200,7 +193,11 @@ class PlaceDataset(Dataset[Batch]):
                 image = self._transform.load(path, sample.seed + position)
             except Unprocessable as error:
                 if self._fail_on_undecodable:
-                    raise _undecodable_photo_error(str(path), error.detail) from error
+                    raise Unprocessable(
+                        "undecodable_photo",
+                        f"{path} cannot be decoded: {error.detail}. Repair or remove it, or skip "
+                        "such photos with --on_bad_image skip.",
+                    ) from error
                 undecodable.append((str(path), error.detail))
                 continue
             photos.append(to_tensor(image))
@@ -210,15 +207,6 @@ class PlaceDataset(Dataset[Batch]):
             torch.full((len(photos),), place.place_id, dtype=torch.int64),
             tuple(undecodable),
         )
-
-
-def _undecodable_photo_error(path: str, reason: str) -> Unprocessable:
-    """Return the error for a photo that cannot be decoded."""
-    return Unprocessable(
-        "undecodable_photo",
-        f"{path} cannot be decoded: {reason}. Repair or remove it, or skip such photos with "
-        "--on_bad_image skip.",
-    )
 
 
 def _collate_batches(places: list[Batch]) -> Batch:

@@ -42,12 +42,7 @@ from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
 from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
-from services.trainer.run_folder import (
-    CHECKPOINTS_FOLDER,
-    CONFIG_FILE,
-    METRICS_FILE,
-    lock_folder,
-)
+from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE, lock_folder
 from shared.errors import Conflict, InvalidRequest, PlacewiseError
 
 RESERVED_ARGUMENTS = ("default_root_dir", "run_name")
@@ -96,9 +91,7 @@ class GridFile(BaseModel):
 def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
     """Load a grid from a YAML file and validate the arguments of all runs.
 
-    Args:
-        path: the YAML file.
-        overrides: arguments that override those of every run.
+    `overrides` are arguments that override those of every run.
 
     Raises:
         NotFound: `config_not_found`.
@@ -231,9 +224,8 @@ def load_outcome(planned: PlannedRun, out: Path) -> RunOutcome:
         report = json.loads((folder / METRICS_FILE).read_text())
         return RunOutcome(planned, RunState.FINISHED, report=report)
     if (folder / FAILED_FILE).is_file():
-        return RunOutcome(
-            planned, RunState.FAILED, error=json.loads((folder / FAILED_FILE).read_text())
-        )
+        error = json.loads((folder / FAILED_FILE).read_text())
+        return RunOutcome(planned, RunState.FAILED, error=error)
     if (folder / CHECKPOINTS_FOLDER / LAST_CHECKPOINT).is_file():
         return RunOutcome(planned, RunState.INTERRUPTED)
     return RunOutcome(planned, RunState.WAITING)
@@ -250,12 +242,7 @@ def run_grid(
 
     A failed run does not stop the others, unless none of them can start for the same reason.
 
-    Args:
-        plan: the runs.
-        out: root folder of the runs.
-        display: receives messages and progress.
-        stop: requests a graceful stop.
-        after_each: called with all outcomes after each run.
+    `out` is the root folder of the runs. `after_each` is called with all outcomes after each run.
 
     Returns:
         The outcomes in the order of the plan.
@@ -266,32 +253,24 @@ def run_grid(
     """
     out.mkdir(parents=True, exist_ok=True)
     with lock_folder(out):
-        return _run_unfinished(plan, out, display, stop, after_each)
-
-
-def _run_unfinished(
-    plan: GridPlan,
-    out: Path,
-    display: Display,
-    stop: StopRequest,
-    after_each: Callable[[list[RunOutcome]], None],
-) -> list[RunOutcome]:
-    outcomes = [load_outcome(planned, out) for planned in plan.runs]
-    for index, outcome in enumerate(outcomes):
-        planned = outcome.run
-        title = f"run {index + 1} of {len(outcomes)}, {planned.name}"
-        if outcome.state is RunState.FINISHED:
-            display.info(f"{title}: already finished")
-            continue
-        is_interrupted = outcome.state is RunState.INTERRUPTED
-        display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
-        outcomes[index] = _execute_run(planned, out / planned.name, display, stop)
-        after_each(outcomes)
-        remaining = [each for each in outcomes[index + 1 :] if each.state is not RunState.FINISHED]
-        if remaining and all(_fails_likewise(each.run, outcomes[index]) for each in remaining):
-            display.warn(f"Stopped: the other {len(remaining)} runs can't start either.")
-            break
-    return outcomes
+        outcomes = [load_outcome(planned, out) for planned in plan.runs]
+        for index, outcome in enumerate(outcomes):
+            planned = outcome.run
+            title = f"run {index + 1} of {len(outcomes)}, {planned.name}"
+            if outcome.state is RunState.FINISHED:
+                display.info(f"{title}: already finished")
+                continue
+            is_interrupted = outcome.state is RunState.INTERRUPTED
+            display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
+            outcomes[index] = _execute_run(planned, out / planned.name, display, stop)
+            after_each(outcomes)
+            remaining = [
+                each for each in outcomes[index + 1 :] if each.state is not RunState.FINISHED
+            ]
+            if remaining and all(_fails_likewise(each.run, outcomes[index]) for each in remaining):
+                display.warn(f"Stopped: the other {len(remaining)} runs can't start either.")
+                break
+        return outcomes
 
 
 def _fails_likewise(planned: PlannedRun, outcome: RunOutcome) -> bool:
@@ -331,7 +310,8 @@ def _execute_run(
         if (folder / CHECKPOINTS_FOLDER / LAST_CHECKPOINT).is_file():
             report = run.resume(folder, {}, display, stop)
         else:
-            _remove_unstarted(folder)
+            if (folder / CONFIG_FILE).is_file():  # it never completed a step
+                shutil.rmtree(folder)
             reserved = {"default_root_dir": str(folder.parent), "run_name": folder.name}
             report = run.run(build_arguments(planned.arguments, reserved), display, stop)
     except RunStopped:
@@ -348,12 +328,6 @@ def _execute_run(
         display.warn(f"{planned.name} failed: {reason['code']}: {reason['detail']}")
         return RunOutcome(planned, RunState.FAILED, error=reason)
     return RunOutcome(planned, RunState.FINISHED, report=report)
-
-
-def _remove_unstarted(folder: Path) -> None:
-    """Remove the folder of a run that never completed a step."""
-    if (folder / CONFIG_FILE).is_file():
-        shutil.rmtree(folder)
 
 
 def _check_same_arguments(planned: PlannedRun, folder: Path) -> None:

@@ -25,10 +25,8 @@ def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
 def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool) -> VprModel:
     """Create the network with pretrained weights, those of a checkpoint, or random weights.
 
-    Args:
-        arguments: the run's arguments; random weights depend on the global seed.
-        display: receives a warning if frozen layers have random weights.
-        resuming: the weights are loaded later, from the run's checkpoint.
+    Random weights depend on the global seed. With `resuming`, the weights are loaded later, from
+    the run's checkpoint.
 
     Raises:
         Conflict: `run_differs`, if the checkpoint's network differs from the arguments'. Also

@@ -34,12 +34,9 @@ from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.exact_knn import has_faiss_gpu
 
 PRECISION_ALIASES = {
-    "32": "32-true",
-    "32-true": "32-true",
-    "16": "16-mixed",
-    "16-mixed": "16-mixed",
-    "bf16": "bf16-mixed",
-    "bf16-mixed": "bf16-mixed",
+    **dict.fromkeys(("32", "32-true"), "32-true"),
+    **dict.fromkeys(("16", "16-mixed"), "16-mixed"),
+    **dict.fromkeys(("bf16", "bf16-mixed"), "bf16-mixed"),
 }
 
 
@@ -124,13 +121,8 @@ def make_loggers(
 ) -> list[Logger]:
     """Create Lightning loggers by name; that of a resumed run continues its CSV file.
 
-    Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`).
-
-    Args:
-        names: the loggers.
-        folder: the run's folder.
-        arguments: logged as hyperparameters.
-        completed_steps: steps of the checkpoint that the run resumes; later rows are dropped.
+    Only `wandb` needs an account, and it can run offline (`WANDB_MODE=offline`). `completed_steps`
+    are those of the checkpoint that the run resumes; later rows are dropped.
     """
     loggers: list[Logger] = []
     for name in names:

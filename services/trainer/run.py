@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -100,11 +101,6 @@ def _listing_all_obstacles(arguments: TrainingArguments) -> Iterator[None]:
 def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
     """Start a run and execute its phase: train, test, or all.
 
-    Args:
-        arguments: the run's arguments.
-        display: receives messages and progress.
-        stop: requests a graceful stop.
-
     Returns:
         The content of `metrics.json`; `{"fast_dev_run": True}` for a fast development run.
 
@@ -140,11 +136,8 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
     """Resume an interrupted run, or continue a finished one for more epochs.
 
-    Args:
-        path: the run's folder, or one of its checkpoints with the full state.
-        changes: arguments that override the stored ones.
-        display: receives messages and progress.
-        stop: requests a graceful stop.
+    `path` is the run's folder, or one of its checkpoints with the full state. `changes` are
+    arguments that override the stored ones.
 
     Returns:
         The content of `metrics.json`.
@@ -235,7 +228,7 @@ def _train(
             ) from None
         raise RunStopped(
             f"Stopped. {checkpoints.last_path} holds the full training state; resume with\n"
-            f"  placewise train --resume {shlex.quote(str(folder))}"
+            f"  {sys.argv[0]} train --resume {shlex.quote(str(folder))}"
         ) from None
     report = build_summary(arguments, folder, prepared.history, checkpoints, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
@@ -256,12 +249,8 @@ def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRe
         device = check_environment(arguments, display)
         checkpoint = _load_tested(arguments)
         if "image_size" not in arguments.model_fields_set:
-            arguments = arguments.model_copy(
-                update={
-                    "image_size": checkpoint.config.image_size,
-                    "interpolation": checkpoint.config.interpolation,
-                }
-            )
+            trained = checkpoint.config.model_dump(include={"image_size", "interpolation"})
+            arguments = arguments.model_copy(update=trained)
         sets = select_evaluation_sets(arguments)
     if arguments.show_data_stats:
         print_data_sets(None, sets, display)

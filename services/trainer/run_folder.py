@@ -80,13 +80,7 @@ def create_run_folder(arguments: TrainingArguments) -> Path:
 
 
 def find_run(resume: Path) -> tuple[Path, Path]:
-    """Find a run's folder and the checkpoint to resume from.
-
-    Args:
-        resume: the run's folder, or one of its checkpoints with the full state.
-
-    Returns:
-        The folder and the checkpoint.
+    """Find the folder and the checkpoint of a run, given either of them, to resume from.
 
     Raises:
         NotFound: `run_not_found`.
@@ -158,10 +152,7 @@ def check_trained_arguments(
 ) -> None:
     """Check that a checkpoint was trained with the arguments of the run that resumes from it.
 
-    Args:
-        arguments: the run's arguments.
-        trained: the arguments that the checkpoint stores. Older releases stored fewer.
-        checkpoint: named in the error.
+    `trained` are the arguments that the checkpoint stores. Older releases stored fewer.
 
     Raises:
         Conflict: `run_differs`, naming each argument that decides the training and differs.
@@ -233,10 +224,9 @@ class TrainingHistory:
 
     def save(self, folder: Path) -> None:
         """Write `history.json` atomically."""
-        path = folder / HISTORY_FILE
-        partial = path.with_name(f"{HISTORY_FILE}.partial")
+        partial = folder / f"{HISTORY_FILE}.partial"
         partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
-        partial.replace(path)
+        partial.replace(folder / HISTORY_FILE)
 
     @classmethod
     def load(cls, folder: Path) -> TrainingHistory:

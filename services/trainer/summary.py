@@ -83,38 +83,32 @@ def build_summary(
 def _training_summary(
     arguments: TrainingArguments, history: TrainingHistory, checkpoints: TopKCheckpoints
 ) -> Json:
-    best = (
-        _checkpoint_details(checkpoints.best_path, checkpoints.best[0][0])
-        if checkpoints.best_path is not None
-        else _checkpoint_details(checkpoints.last_path, None)
-    )
+    score = checkpoints.best[0][0] if checkpoints.best else None
+    speed = history.images / history.seconds if history.seconds else None
+    waited = history.seconds_waited / history.seconds if history.seconds else None
     return {
         "training_set": history.training_set,
         "epochs": [asdict(epoch) for epoch in history.epochs],
         "monitor": arguments.monitor,
-        "best": best,
+        "best": _checkpoint_details(checkpoints.best_path or checkpoints.last_path, score),
         "checkpoints": [
-            _checkpoint_entry(checkpoints.folder / name, score) for score, name in checkpoints.best
+            {"path": str(checkpoints.folder / name), "score": score}
+            for score, name in checkpoints.best
         ],
         "last": str(checkpoints.last_path),
         "bad_photos": history.bad_photos,
         "images": history.images,
-        "images_per_second": history.images / history.seconds if history.seconds else None,
+        "images_per_second": speed,
         "seconds": history.seconds,
-        "share_waiting_for_data": history.seconds_waited / history.seconds
-        if history.seconds
-        else None,
+        "share_waiting_for_data": waited,
     }
-
-
-def _checkpoint_entry(path: Path, score: float | None) -> Json:
-    return {"path": str(path), "score": score}
 
 
 def _checkpoint_details(path: Path, score: float | None) -> Json:
     loaded = load_checkpoint(path)
     return {
-        **_checkpoint_entry(path, score),
+        "path": str(path),
+        "score": score,
         "fingerprint": loaded.fingerprint,
         "dimension": loaded.model.dimension,
     }

@@ -82,11 +82,7 @@ def learning_rate(step: int, steps_per_epoch: int, arguments: TrainingArguments)
 
 @dataclass
 class TrainingRun:
-    """Inputs of a training run.
-
-    Arguments, data sets, model, device, run folder, and the history and checkpoints that a resumed
-    run continues.
-    """
+    """Inputs of a training run; a resumed one continues the history and the checkpoints."""
 
     arguments: TrainingArguments
     device: Device
@@ -101,11 +97,7 @@ class TrainingRun:
 class TrainingLoop:
     """Trains a network: photos -> descriptors -> mined pairs or triplets -> loss.
 
-    Args:
-        run: the run's data, network and folder; its history and checkpoints are updated.
-        validator: computes the recalls of the validation sets.
-        display: receives messages and progress.
-        stop: requests a graceful stop.
+    The history and the checkpoints of the run are updated.
     """
 
     def __init__(
@@ -146,20 +138,13 @@ class TrainingLoop:
         )
         self._precision = self._fabric.strategy.precision
         network: Any = torch.compile(run.model) if arguments.compile else run.model
-        self._network, self._optimizer = self._fabric.setup(
-            network,
-            make_optimizer(run.model.parameters(), arguments),
-        )
+        optimizer = make_optimizer(run.model.parameters(), arguments)
+        self._network, self._optimizer = self._fabric.setup(network, optimizer)
         last_step = arguments.max_epochs * len(self._sampler)
         self._last_step = min(last_step, arguments.max_steps or last_step)
-        self._step = 0  # number of completed steps
+        self.completed_steps = 0
         self._last_loss = float("nan")
         self._last_saved_step = -1
-
-    @property
-    def completed_steps(self) -> int:
-        """Number of completed steps."""
-        return self._step
 
     def restore(self, checkpoint: Path) -> None:
         """Restore the full training state.
@@ -191,17 +176,17 @@ class TrainingLoop:
             ) from error
         self._optimizer.load_state_dict(stored["optimizer_states"][0])
         self._precision.load_state_dict(stored.get("MixedPrecision", {}))
-        self._step = self._last_saved_step = stored["global_step"]
+        self.completed_steps = self._last_saved_step = stored["global_step"]
         self._last_loss = stored["last_loss"]
         # Runs that Lightning's Trainer began have the state of a callback.
         restore_rng_state(stored.get("rng_state") or stored["callbacks"]["TrainingCallback"])
         history = self._run.history
-        history.epochs = [each for each in history.epochs if each.step <= self._step]
+        history.epochs = [each for each in history.epochs if each.step <= self.completed_steps]
 
     def repeat_interrupted_validation(self) -> None:
         """Validate if the run was stopped between the end of an epoch and its validation."""
         recorded = {each.step for each in self._run.history.epochs}
-        if self._is_validation_due() and self._step not in recorded:
+        if self._is_validation_due() and self.completed_steps not in recorded:
             self._validate([])
 
     def fit(self, loggers: Sequence[Logger]) -> None:
@@ -212,7 +197,7 @@ class TrainingLoop:
             Unprocessable: `no_photo_decodes`, `loss_not_finite`; also raises what reading photos
                 and validation raise.
         """
-        while self._step < self._last_step:
+        while self.completed_steps < self._last_step:
             self._train_epoch(loggers)
         for logger in loggers:
             logger.finalize("success")
@@ -235,9 +220,12 @@ class TrainingLoop:
             history.images += len(batch.photos)
             self._record_undecodable(batch)
             self._show_progress(metrics)
-            if self._step % self._arguments.log_every_n_steps == 0:
+            if self.completed_steps % self._arguments.log_every_n_steps == 0:
                 self._log(loggers, metrics)
-            is_epoch_end = self._step % len(self._sampler) == 0 or self._step >= self._last_step
+            is_epoch_end = (
+                self.completed_steps % len(self._sampler) == 0
+                or self.completed_steps >= self._last_step
+            )
             if is_epoch_end:
                 # Saved before validation, which may take long and may be interrupted.
                 self._save_last()
@@ -250,7 +238,7 @@ class TrainingLoop:
                 return
 
     def _load_batches(self) -> Iterator[Batch]:
-        epoch, start = divmod(self._step, len(self._sampler))
+        epoch, start = divmod(self.completed_steps, len(self._sampler))
         return load_batches(
             self._sampler,
             self._dataset,
@@ -277,16 +265,16 @@ class TrainingLoop:
         if not torch.isfinite(loss):
             raise Unprocessable(
                 "loss_not_finite",
-                f"The loss of step {self._step} is {self._last_loss}: training has diverged. "
-                "Try a smaller --lr, more --warmpup_steps or --precision 32.",
+                f"The loss of step {self.completed_steps} is {self._last_loss}: training has "
+                "diverged. Try a smaller --lr, more --warmpup_steps or --precision 32.",
             )
-        lr = learning_rate(self._step, len(self._sampler), self._arguments)
+        lr = learning_rate(self.completed_steps, len(self._sampler), self._arguments)
         for group in self._optimizer.param_groups:
             group["lr"] = lr
         self._optimizer.zero_grad()
         self._fabric.backward(loss)
         self._optimizer.step()
-        self._step += 1
+        self.completed_steps += 1
         metrics = {"loss": self._last_loss, "lr": lr}
         accuracy = batch_accuracy(self._loss, self._miner, mined, len(rows))
         if accuracy is not None:
@@ -296,12 +284,12 @@ class TrainingLoop:
     @property
     def _epoch(self) -> int:
         """The epoch of the last completed step, from 0."""
-        return (self._step - 1) // len(self._sampler)
+        return (self.completed_steps - 1) // len(self._sampler)
 
     def _is_validation_due(self) -> bool:
         """Return whether validation follows this step: every n epochs, and after the last step."""
         every = len(self._sampler) * self._arguments.check_val_every_n_epoch
-        return self._step % every == 0 or self._step >= self._last_step
+        return self.completed_steps % every == 0 or self.completed_steps >= self._last_step
 
     def _validate(self, loggers: Sequence[Logger]) -> None:
         """Validate, and save the checkpoint if it is one of the best."""
@@ -312,8 +300,10 @@ class TrainingLoop:
             write_predictions(folder, evaluations)
         metrics = flatten_recalls(evaluations)
         self._log(loggers, metrics)
-        history.epochs.append(EpochRecord(self._epoch, self._step, self._last_loss, metrics))
-        is_best = checkpoints.save_if_best(self._save, metrics, self._epoch, self._step)
+        history.epochs.append(
+            EpochRecord(self._epoch, self.completed_steps, self._last_loss, metrics)
+        )
+        is_best = checkpoints.save_if_best(self._save, metrics, self._epoch, self.completed_steps)
         history.best = list(checkpoints.best)
         headline = "  ".join(
             f"{name} {value:.1%}"
@@ -328,20 +318,24 @@ class TrainingLoop:
 
     def _log(self, loggers: Sequence[Logger], metrics: dict[str, float]) -> None:
         for logger in loggers:
-            logger.log_metrics({**metrics, "epoch": self._epoch}, self._step)
+            logger.log_metrics({**metrics, "epoch": self._epoch}, self.completed_steps)
             logger.save()
 
     def _save_last(self) -> None:
-        if self._last_saved_step != self._step:
+        if self._last_saved_step != self.completed_steps:
             self._run.history.save(self._run.folder)
             self._run.checkpoints.save_last(self._save)
-            self._last_saved_step = self._step
+            self._last_saved_step = self.completed_steps
 
     def _save(self, path: Path, weights_only: bool) -> None:
         state: dict[str, Any] = checkpoint_state(
             self._run.model, training=portable_arguments(self._arguments)
         )
-        state |= {"epoch": self._epoch, "global_step": self._step, "last_loss": self._last_loss}
+        state |= {
+            "epoch": self._epoch,
+            "global_step": self.completed_steps,
+            "last_loss": self._last_loss,
+        }
         if not weights_only:
             state["optimizer_states"] = [self._optimizer.state_dict()]
             state["MixedPrecision"] = self._precision.state_dict()
@@ -363,7 +357,7 @@ class TrainingLoop:
         accuracy = f"  b_acc {metrics['b_acc']:.2f}" if "b_acc" in metrics else ""
         self._display.progress(
             f"epoch {self._epoch + 1}/{self._arguments.max_epochs}",
-            self._step - self._epoch * len(self._sampler),
+            self.completed_steps - self._epoch * len(self._sampler),
             len(self._sampler),
             f"loss {self._last_loss:.4f}{accuracy}",
         )

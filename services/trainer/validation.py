@@ -44,12 +44,10 @@ class Validator:
     def measure(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
     ) -> dict[str, RecallEvaluation]:
-        """Evaluate the network on each set.
+        """Evaluate the network, (B, 3, H, W) float32 -> (B, D), on each set.
 
-        Args:
-            model: (B, 3, H, W) float32 -> (B, D); its training mode is restored afterwards.
-            sets: the evaluation sets.
-            for_tests: use `test_image_size` instead of `val_image_size`.
+        Its training mode is restored afterwards. `for_tests` selects `test_image_size` instead of
+        `val_image_size`.
 
         Returns:
             Rankings and recalls by set name.

@@ -35,6 +35,13 @@ class GenerationState(StrEnum):
     ABANDONED = "abandoned"  # never became complete; deleted after a grace period
 
 
+class RowType(StrEnum):
+    """NumPy type of stored descriptor rows."""
+
+    FLOAT32 = "float32"
+    FLOAT16 = "float16"  # half of the storage, merges and backups
+
+
 class Generation(Journaled, Base):
     """A generation. `spec` has everything that determines a descriptor's value.
 
@@ -52,6 +59,10 @@ class Generation(Journaled, Base):
     spec: Mapped[dict[str, Any]] = mapped_column(JsonValue)
     spec_fingerprint: Mapped[str] = mapped_column(String(64))
     dimension: Mapped[int] = mapped_column(Integer)
+    row_type: Mapped[RowType] = mapped_column(
+        String(20), default=RowType.FLOAT32, server_default=RowType.FLOAT32
+    )
+    """Type of its rows in new chunks; scores are exact for the rows as stored."""
     model_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("models.id"), index=True)
     vocabulary_id: Mapped[UUID | None] = mapped_column(
         Uuid, ForeignKey("vocabularies.id"), index=True

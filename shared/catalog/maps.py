@@ -33,7 +33,12 @@ from shared.catalog.database.base import (
     get_or_insert,
     page_newest_first,
 )
-from shared.catalog.generations import Generation, GenerationState, active_generation
+from shared.catalog.generations import (
+    Generation,
+    GenerationState,
+    RowType,
+    active_generation,
+)
 from shared.catalog.jobs import Job, WaitingFor
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.errors import Conflict, NotFound
@@ -57,12 +62,21 @@ class Map(Journaled, Base):
         sa.Boolean, default=False, server_default=sa.false()
     )
     """Whether `/` separates the levels of the place labels."""
+    row_type: Mapped[RowType] = mapped_column(
+        sa.String(20), default=RowType.FLOAT32, server_default=RowType.FLOAT32
+    )
+    """Type of the descriptor rows of its new generations."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
 def create_map(
-    session: Session, name: str, extractor: str, *, place_labels_are_paths: bool = False
+    session: Session,
+    name: str,
+    extractor: str,
+    *,
+    place_labels_are_paths: bool = False,
+    row_type: RowType = RowType.FLOAT32,
 ) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken."""
     map_ = Map(
@@ -70,6 +84,7 @@ def create_map(
         name=name,
         extractor=extractor,
         place_labels_are_paths=place_labels_are_paths,
+        row_type=row_type,
     )
     try:
         with session.begin_nested():
@@ -115,10 +130,13 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
     session.flush()
 
 
-def get_or_create_default_map(session: Session, extractor: str) -> Map:
+def get_or_create_default_map(
+    session: Session, extractor: str, row_type: RowType = RowType.FLOAT32
+) -> Map:
     """Return the map named `default`, created on first use."""
     named_default = sa.select(Map).where(Map.name == DEFAULT_MAP)
-    return get_or_insert(session, named_default, Map(name=DEFAULT_MAP, extractor=extractor))
+    new = Map(name=DEFAULT_MAP, extractor=extractor, row_type=row_type)
+    return get_or_insert(session, named_default, new)
 
 
 def get_map(session: Session, name: str) -> Map:

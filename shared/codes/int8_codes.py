@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.codes.jit import REORDERED_FASTMATH, numba_jit
-from shared.codes.rotation import Floats, get_rotation
+from shared.codes.rotation import Floats, StoredFloats, get_rotation
 from shared.codes.sign_codes import ROWS_PER_BLOCK
 
 INT8_MAX = 127
@@ -92,15 +92,16 @@ class Int8Query:
         return cls(numbers[0], scale, error)
 
 
-def int8_codes(rows: Floats) -> Int8Codes:
-    """Compute the codes of (n, dimension) float32 rows; rows of zeros have codes of zeros."""
+def int8_codes(rows: StoredFloats) -> Int8Codes:
+    """Compute the codes of (n, dimension) float32 or float16 rows; zeros have codes of zeros."""
     rotation = get_rotation(rows.shape[1])
     numbers = np.empty((len(rows), rotation.padded), np.int8)
     measures = np.empty((len(rows), 4))
     batch_rows = max(ROWS_PER_BLOCK, (1 << 22) // rotation.padded)
     for begin in range(0, len(rows), batch_rows):
         batch = slice(begin, begin + batch_rows)
-        _quantize(rotation.rotate(rows[batch]), INT8_MAX, numbers[batch], measures[batch])
+        rotated = rotation.rotate(rows[batch].astype(np.float32, copy=False))
+        _quantize(rotated, INT8_MAX, numbers[batch], measures[batch])
     scales, residuals, lengths, norms = measures.T
     errors = residuals + rotation.error * norms / (1 - rotation.error)
     return Int8Codes(numbers, scales.astype(np.float32), _round_up(errors), _round_up(lengths))

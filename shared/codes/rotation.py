@@ -119,6 +119,7 @@ SIGN_RUN = 16
 COLUMNS = 1024  # columns reflected at once: those of all blocks fit into the L1 cache
 
 Floats = NDArray[np.float32]
+StoredFloats = NDArray[np.float32] | NDArray[np.float16]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

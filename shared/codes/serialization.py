@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.codes.int8_codes import Int8Codes, int8_codes
-from shared.codes.rotation import ROUNDS, SEED, Floats, get_rotation
+from shared.codes.rotation import ROUNDS, SEED, StoredFloats, get_rotation
 from shared.codes.sign_codes import SignCodes, encode_signs, level_words
 
 SIGN_CODES_FORMAT = 1
@@ -37,7 +37,7 @@ Layout = tuple[str, tuple[int, ...]]
 """Dtype of an array, and the shape of its entry for one row."""
 
 
-def encode_sign_codes(rows: Floats, chunk_sha256: str) -> bytes:
+def encode_sign_codes(rows: StoredFloats, chunk_sha256: str) -> bytes:
     """Encode the sign codes of (n, dimension) rows of the chunk with this hash."""
     codes = encode_signs(rows)
     return _encode(_sign_codes_spec(rows.shape[1]), [codes.norms, *codes.levels], chunk_sha256)
@@ -61,7 +61,7 @@ def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str
     return SignCodes(tuple(levels), norms)
 
 
-def encode_int8_codes(rows: Floats, chunk_sha256: str) -> bytes:
+def encode_int8_codes(rows: StoredFloats, chunk_sha256: str) -> bytes:
     """Encode the int8 codes of (n, dimension) rows of the chunk with this hash."""
     codes = int8_codes(rows)
     arrays: list[NDArray[Any]] = [codes.scales, codes.errors, codes.lengths, codes.numbers]

@@ -25,7 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.rotation import Floats, get_rotation
+from shared.codes.rotation import Floats, StoredFloats, get_rotation
 
 WORD_BITS = 64
 FIRST_LEVEL_BITS = 4096
@@ -65,14 +65,14 @@ def level_ends(padded: int) -> NDArray[np.int64]:
     return ends
 
 
-def encode_signs(rows: Floats) -> SignCodes:
-    """Compute the codes of (n, dimension) float32 rows of length 1 or 0."""
+def encode_signs(rows: StoredFloats) -> SignCodes:
+    """Compute the codes of (n, dimension) float32 or float16 rows of length 1 or 0."""
     rotation = get_rotation(rows.shape[1])
     words = np.empty((len(rows), rotation.padded // WORD_BITS), np.uint64)
     norms = np.empty(len(rows), np.float32)
     for begin in range(0, len(rows), ROWS_PER_BLOCK):
         block = slice(begin, begin + ROWS_PER_BLOCK)
-        rotated = rotation.rotate(rows[block])
+        rotated = rotation.rotate(rows[block].astype(np.float32, copy=False))
         words[block] = pack_signs(rotated)
         norms[block] = np.abs(rotated).sum(axis=1, dtype=np.float64)
     level_parts = np.split(words, level_ends(rotation.padded)[:-1], axis=1)

@@ -7,19 +7,21 @@ exists, or that loses a race for the same bytes, deletes its own object.
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, cast
 from uuid import UUID
 
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Executable, Table, and_, bindparam, insert, select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from shared.catalog.api_keys import count_photos_of_key
 from shared.catalog.database.session import Catalog
-from shared.catalog.maps import get_map
+from shared.catalog.maps import Map, get_map
 from shared.catalog.photos import Photo, PhotoRole, find_photo_by_sha256
 from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
@@ -30,12 +32,10 @@ from shared.jobs.transitions import requeue_job
 
 COORDINATE_TOLERANCE_DEGREES = 1e-7  # about a centimetre
 
-Result = TypeVar("Result")
-
 
 @dataclass(frozen=True, slots=True)
 class StoreResult:
-    """The stored photo and its job."""
+    """The stored photo and its job; new ones are not attached to the session."""
 
     photo: Photo
     job: Job | None
@@ -67,72 +67,107 @@ def store_photo(
         NotFound: `map_not_found`.
         Conflict: `photo_differs` when the same image exists with different metadata.
     """
-    stored = retry_on_conflict(lambda: _store(catalog, map_name, incoming, before_commit))
+    with catalog.write() as session:
+        stored = before_commit(session, insert_photo(session, map_name, incoming))
     if stored.queued:
         wakeups.send()
     return stored
 
 
-def retry_on_conflict(store: Callable[[], Result]) -> Result:
-    """Run a transaction with `insert_photo`; retry once when it lost a race for the same bytes."""
-    try:
-        return store()
-    except IntegrityError:
-        # The same bytes were committed between the lookup and the insert.
-        return store()
-
-
 def insert_photo(
-    session: Session, map_id: UUID, incoming: ValidatedPhoto, priority: Priority = Priority.UPLOAD
+    session: Session,
+    map_: UUID | str,
+    incoming: ValidatedPhoto,
+    priority: Priority = Priority.UPLOAD,
 ) -> StoreResult:
     """Insert the rows of a photo and its job in the caller's transaction.
 
+    Args:
+        session: a session that writes.
+        map_: id of the map, or the name of a live one.
+        incoming: the validated photo.
+        priority: priority of the job.
+
     Raises:
+        NotFound: `map_not_found`.
         Conflict: `photo_differs`.
-        IntegrityError: the same bytes were committed after the lookup in this transaction.
     """
+    values = _photo_values(incoming)
+    dialect = session.get_bind().dialect.name
+    statement = _insert_statement(dialect, tuple(values), isinstance(map_, str))
+    while (row := session.execute(statement, {**values, "map_": map_}).one_or_none()) is None:
+        map_id = get_map(session, map_).id if isinstance(map_, str) else map_
+        existing = find_photo_by_sha256(session, map_id, incoming.received.sha256)
+        if existing is not None:
+            return _match_existing_photo(session, existing, incoming.fields)
+        # PostgreSQL: the photo with the same bytes was deleted after the INSERT had seen it.
+    photo = Photo(**values, map_id=row.map_id, uploaded_at=row.uploaded_at)
+    job_values = {
+        "id": photo.job_id,
+        "map_id": photo.map_id,
+        "kind": JobKind.INDEX,
+        "state": JobState.QUEUED,
+        "priority": priority,
+        "photo_id": photo.id,
+    }
+    session.execute(_INSERT_JOB, job_values)
+    return StoreResult(photo, Job(**job_values), queued=True)
+
+
+def _photo_values(incoming: ValidatedPhoto) -> dict[str, Any]:
     received, header, fields = incoming.received, incoming.header, incoming.fields
-    existing = find_photo_by_sha256(session, map_id, received.sha256)
-    if existing is not None:
-        return _match_existing_photo(session, existing, fields)
-    photo_id, job_id = new_id(), new_id()
     has_coordinates = fields.latitude is not None
-    photo = Photo(
-        id=photo_id,
-        map_id=map_id,
-        job_id=job_id,
-        sha256=received.sha256,
-        object_key=received.key,
-        filename=received.filename,
-        relative_path=fields.relative_path,
-        media_type=incoming.media_type,
-        size_bytes=received.size_bytes,
-        width=header.width,
-        height=header.height,
-        latitude=fields.latitude if has_coordinates else header.latitude,
-        longitude=fields.longitude if has_coordinates else header.longitude,
-        heading=fields.heading if fields.heading is not None else header.heading,
-        captured_at=fields.captured_at or header.captured_at,
-        place=fields.place,
-        tags=fields.tags or [],
-        attributes=fields.metadata or {},
-        role=fields.role or PhotoRole.DATABASE,
-        key_id=incoming.key_id,
+    return {
+        "id": new_id(),
+        "job_id": new_id(),
+        "sha256": received.sha256,
+        "object_key": received.key,
+        "filename": received.filename,
+        "relative_path": fields.relative_path,
+        "media_type": incoming.media_type,
+        "size_bytes": received.size_bytes,
+        "width": header.width,
+        "height": header.height,
+        "latitude": fields.latitude if has_coordinates else header.latitude,
+        "longitude": fields.longitude if has_coordinates else header.longitude,
+        "heading": fields.heading if fields.heading is not None else header.heading,
+        "captured_at": fields.captured_at or header.captured_at,
+        "place": fields.place,
+        "tags": fields.tags or [],
+        "attributes": fields.metadata or {},
+        "role": fields.role or PhotoRole.DATABASE,
+        "key_id": incoming.key_id,
+    }
+
+
+# Core instead of `session.add`: the unit of work takes more time than both statements.
+_INSERT_JOB = insert(cast(Table, Job.__table__))
+
+
+@functools.cache
+def _insert_statement(dialect: str, names: tuple[str, ...], by_name: bool) -> Executable:
+    """Return the statement that inserts a photo into the map `map_`, unless it has the same bytes.
+
+    Args:
+        dialect: `postgresql` or `sqlite`.
+        names: attributes of the photo, which are the statement's parameters.
+        by_name: whether `map_` is a name instead of an id.
+    """
+    columns = {name: Photo.__mapper__.columns[name] for name in names}
+    values = [bindparam(name, type_=column.type) for name, column in columns.items()]
+    is_map = Map.id == bindparam("map_")
+    if by_name:
+        is_map = and_(Map.name == bindparam("map_"), Map.deleted_at.is_(None))
+    table = cast(Table, Photo.__table__)
+    insert_into = sqlite.insert if dialect == "sqlite" else postgresql.insert
+    return (
+        insert_into(table)
+        .from_select([*columns.values(), table.c.map_id], select(*values, Map.id).where(is_map))
+        .on_conflict_do_nothing(
+            index_elements=[table.c.map_id, table.c.sha256], index_where=Photo.deleted_at.is_(None)
+        )
+        .returning(table.c.map_id, table.c.uploaded_at)
     )
-    session.add(photo)
-    session.flush()
-    job = Job(id=job_id, map_id=map_id, kind=JobKind.INDEX, priority=priority, photo_id=photo_id)
-    session.add(job)
-    session.flush()
-    return StoreResult(photo, job, queued=True)
-
-
-def _store(
-    catalog: Catalog, map_name: str, incoming: ValidatedPhoto, before_commit: BeforeCommit
-) -> StoreResult:
-    with catalog.write() as session:
-        stored = insert_photo(session, get_map(session, map_name).id, incoming)
-        return before_commit(session, stored)
 
 
 def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -> StoreResult:

@@ -1,6 +1,7 @@
 """Chunk files: descriptor rows as an immutable `.npy` file, with a manifest and sign codes.
 
-`<chunk>.npy` is a C-contiguous (rows, dimension) array, float32, each row L2-normalised.
+`<chunk>.npy` is a C-contiguous (rows, dimension) array, float32 or float16, each row L2-normalised
+before it was rounded to that type.
 `<chunk>.json`, the manifest, describes the rows (extractor spec, photo ids in row order, hash), so
 that a lost catalog can be rebuilt from the object store.
 `<chunk>.codes` has the sign codes that search scans first (`shared.codes`), for chunks that are
@@ -26,6 +27,9 @@ from shared.storage import ObjectStore
 
 Rows = NDArray[np.float32]
 Row = NDArray[np.float32]
+StoredRows = NDArray[np.float32] | NDArray[np.float16]
+
+ROW_DTYPES = (np.dtype(np.float32), np.dtype(np.float16))
 
 # Sign codes are stored with a chunk of at least this dimension and size. For smaller ones, search
 # compares the rows as fast, or computes the codes quickly.
@@ -64,23 +68,23 @@ def codes_key(object_key: str) -> str:
     return object_key.removesuffix(".npy") + ".codes"
 
 
-def encode_rows(rows: Rows) -> bytes:
-    """Encode (n, dimension) float32 rows as the bytes of a `.npy` file."""
-    if rows.dtype != np.float32 or rows.ndim != 2:
-        raise ValueError(f"a chunk must be 2-D float32, not {rows.ndim}-D {rows.dtype}")
+def encode_rows(rows: StoredRows) -> bytes:
+    """Encode (n, dimension) float32 or float16 rows as the bytes of a `.npy` file."""
+    if rows.dtype not in ROW_DTYPES or rows.ndim != 2:
+        raise ValueError(f"a chunk must be 2-D float32 or float16, not {rows.ndim}-D {rows.dtype}")
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(rows), allow_pickle=False)
     return buffer.getvalue()
 
 
-def decode_rows(data: bytes | mmap.mmap) -> Rows:
-    """Decode the (rows, dimension) float32 array of a `.npy` file, without copying `data`."""
-    shape, offset = _read_header(bytes(memoryview(data)[:HEADER_READ_BYTES]))
-    return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)
+def decode_rows(data: bytes | mmap.mmap) -> StoredRows:
+    """Decode the (rows, dimension) array of a `.npy` file as stored, without copying `data`."""
+    shape, dtype, offset = _read_header(bytes(memoryview(data)[:HEADER_READ_BYTES]))
+    return np.frombuffer(data, dtype=dtype, offset=offset).reshape(shape)
 
 
-def _read_header(data: bytes) -> tuple[tuple[int, int], int]:
-    """Return (rows, dimension) and the offset of the rows; ValueError for another file."""
+def _read_header(data: bytes) -> tuple[tuple[int, int], np.dtype[Any], int]:
+    """Return (rows, dimension), dtype and offset of the rows; ValueError for another file."""
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)
     read_header = {
@@ -88,9 +92,9 @@ def _read_header(data: bytes) -> tuple[tuple[int, int], int]:
         2: np.lib.format.read_array_header_2_0,
     }[major]
     shape, fortran_order, dtype = read_header(buffer)
-    if dtype != np.float32 or fortran_order or len(shape) != 2:
+    if dtype not in ROW_DTYPES or fortran_order or len(shape) != 2:
         raise ValueError(f"not a chunk: {dtype}, shape {shape}, fortran_order={fortran_order}")
-    return shape, buffer.tell()
+    return shape, dtype, buffer.tell()
 
 
 def write_chunk(
@@ -98,7 +102,7 @@ def write_chunk(
     *,
     generation_id: UUID,
     chunk_id: UUID,
-    rows: Rows,
+    rows: StoredRows,
     photo_ids: list[UUID],
     spec: dict[str, Any],
 ) -> WrittenChunk:
@@ -108,7 +112,7 @@ def write_chunk(
     catalog is up to the caller.
 
     Args:
-        rows: (n, dimension) float32, L2-normalised.
+        rows: (n, dimension) float32 or float16, L2-normalised.
         photo_ids: the photo of each row.
         spec: the extractor spec, part of the manifest.
     """
@@ -136,8 +140,8 @@ def write_chunk(
     return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
 
 
-def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
-    """Read a chunk and verify its SHA-256; Unavailable (`chunk_corrupt`) when it differs."""
+def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> StoredRows:
+    """Read a chunk as stored, and verify its hash; Unavailable (`chunk_corrupt`) if it differs."""
     data = store.get(object_key)
     if hashlib.sha256(data).hexdigest() != sha256:
         raise chunk_corrupt_error(object_key)
@@ -167,7 +171,7 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
     The hash is not verified, since it covers the whole chunk.
 
     Returns:
-        (n, dimension) float32, in the order of `rows`.
+        (n, dimension) float32, in the order of `rows`; float16 rows are converted.
 
     Raises:
         IndexError: the chunk has no such row.
@@ -175,8 +179,8 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
         NotFound: the object is missing.
     """
     with store.open(object_key) as file:
-        (row_count, dimension), offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
-        size = dimension * np.dtype(np.float32).itemsize
+        (row_count, dimension), dtype, offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
+        size = dimension * dtype.itemsize
         vectors = np.empty((len(rows), dimension), dtype=np.float32)
         for position, row in enumerate(rows):
             if row >= row_count:
@@ -185,13 +189,13 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
             data = _read_up_to(file, size)
             if len(data) < size:
                 raise ValueError(f"the object is {size - len(data)} bytes too short")
-            vectors[position] = np.frombuffer(data, dtype=np.float32)
+            vectors[position] = np.frombuffer(data, dtype=dtype)
     return vectors
 
 
-def rows_are_valid(rows: Rows) -> NDArray[np.bool_]:
+def rows_are_valid(rows: StoredRows) -> NDArray[np.bool_]:
     """Return an (n,) mask of the (n, dimension) rows that are unit vectors or zero."""
-    norms = np.linalg.norm(rows, axis=1)
+    norms = np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float32))
     return np.asarray((norms == 0) | (np.abs(norms - 1) < NORM_TOLERANCE))
 
 

@@ -26,9 +26,9 @@ from shared.synthetic_city.textures import (
     TILE_HEIGHT,
     TILE_WIDTH,
     Colour,
-    darken,
     draw_shop_glass,
-    metres_to_pixels,
+    painted,
+    to_pixels,
 )
 
 HEADROOM = 3.6
@@ -79,7 +79,7 @@ class House:
     @property
     def pixels(self) -> int:
         """Number of pixels of the texture."""
-        return metres_to_pixels(self.width) * metres_to_pixels(self.top)
+        return to_pixels(self.width) * to_pixels(self.top)
 
 
 def arrange_house(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
@@ -131,29 +131,27 @@ def _draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: 
     width = picture.width
     colour = catalogue.roofs[house.roof_colour]
     tiles = (*colour, CODE_FLAT)
-    ridge = {"mansard": eaves - metres_to_pixels(2.3), "gable": eaves - metres_to_pixels(2.6)}.get(
-        house.roof, eaves - metres_to_pixels(0.7)
+    ridge = {"mansard": eaves - to_pixels(2.3), "gable": eaves - to_pixels(2.6)}.get(
+        house.roof, eaves - to_pixels(0.7)
     )
     for share in house.chimneys:
         x = int(share * (width - 16))
+        draw.rectangle((x, ridge - to_pixels(0.7), x + 13, eaves), fill=(134, 92, 76, CODE_SOLID))
         draw.rectangle(
-            (x, ridge - metres_to_pixels(0.7), x + 13, eaves), fill=(134, 92, 76, CODE_SOLID)
-        )
-        draw.rectangle(
-            (x - 1, ridge - metres_to_pixels(0.7), x + 14, ridge - metres_to_pixels(0.7) + 3),
+            (x - 1, ridge - to_pixels(0.7), x + 14, ridge - to_pixels(0.7) + 3),
             fill=(96, 88, 84, CODE_FLAT),
         )
     if house.roof == "mansard":
-        slope = metres_to_pixels(0.5)
+        slope = to_pixels(0.5)
         draw.polygon(
             [(0, eaves), (slope, ridge), (width - slope, ridge), (width, eaves)], fill=tiles
         )
         for y in range(ridge + 3, eaves, 4):
-            draw.line((slope, y, width - slope, y), fill=(*darken(colour, 0.86), CODE_FLAT))
+            draw.line((slope, y, width - slope, y), fill=painted(colour, 0.86, CODE_FLAT))
         for bay in range(house.bays):
             x = _bay_centre_column(house, bay)
             draw.rectangle(
-                (x - 12, ridge + 10, x + 12, eaves), fill=(*catalogue.trims[house.trim], CODE_SOLID)
+                (x - 12, ridge + 10, x + 12, eaves), fill=painted(catalogue.trims[house.trim])
             )
             draw.rectangle(
                 (x - 8, ridge + 15, x + 8, eaves - 3), fill=(66, 80, 92, 1 + bay % PANE_CODES)
@@ -162,7 +160,7 @@ def _draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: 
     elif house.roof == "gable":
         draw.polygon(
             [(0, eaves), (width // 2, ridge), (width, eaves)],
-            fill=(*catalogue.wall_colours[house.wall], CODE_SOLID),
+            fill=painted(catalogue.wall_colours[house.wall]),
         )
         draw.line((0, eaves, width // 2, ridge), fill=tiles, width=7)
         draw.line((width // 2, ridge, width, eaves), fill=tiles, width=7)
@@ -179,23 +177,21 @@ def _draw_eaves(
     if house.roof == "gable":
         return
     if house.roof == "parapet":
-        draw.rectangle(
-            (0, eaves - metres_to_pixels(0.8), width, eaves), fill=(*darken(trim, 0.94), CODE_SOLID)
-        )
+        draw.rectangle((0, eaves - to_pixels(0.8), width, eaves), fill=painted(trim, 0.94))
         for x in range(4, width - 6, 14):
             draw.rectangle(
-                (x, eaves - metres_to_pixels(0.6), x + 7, eaves - 5),
-                fill=(*darken(trim, 0.7), CODE_SOLID),
+                (x, eaves - to_pixels(0.6), x + 7, eaves - 5),
+                fill=painted(trim, 0.7),
             )
         draw.rectangle(
-            (0, eaves - metres_to_pixels(0.85), width, eaves - metres_to_pixels(0.8) + 3),
+            (0, eaves - to_pixels(0.85), width, eaves - to_pixels(0.8) + 3),
             fill=(*trim, CODE_FLAT),
         )
         return
-    draw.rectangle((0, eaves - 4, width, eaves + 5), fill=(*trim, CODE_SOLID))
-    draw.rectangle((0, eaves + 6, width, eaves + 9), fill=(*darken(trim, 0.5), CODE_SOLID))
+    draw.rectangle((0, eaves - 4, width, eaves + 5), fill=painted(trim))
+    draw.rectangle((0, eaves + 6, width, eaves + 9), fill=painted(trim, 0.5))
     for x in range(3, width, 12):  # brackets
-        draw.rectangle((x, eaves + 6, x + 4, eaves + 11), fill=(*darken(trim, 0.85), CODE_SOLID))
+        draw.rectangle((x, eaves + 6, x + 4, eaves + 11), fill=painted(trim, 0.85))
 
 
 ANY_CODE = [0] + [255] * 255
@@ -205,13 +201,13 @@ ANY_CODE = [0] + [255] * 255
 def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
     """Draw the facade from `top` to the pavement, RGBA with material codes."""
     rng = np.random.default_rng(house.detail_seed)
-    width, height = metres_to_pixels(house.width), metres_to_pixels(house.top)
-    eaves = height - metres_to_pixels(house.eaves)
+    width, height = to_pixels(house.width), to_pixels(house.top)
+    eaves = height - to_pixels(house.eaves)
     picture = Image.new("RGBA", (width, height), (0, 0, 0, 0))
     trim = catalogue.trims[house.trim]
     _draw_roof(picture, house, catalogue, eaves)
     _wall(picture, catalogue.walls[house.wall], (0, eaves, width, height), rng)
-    ground = height - metres_to_pixels(house.ground_floor)
+    ground = height - to_pixels(house.ground_floor)
     if house.base_wall >= 0:
         _wall(picture, catalogue.walls[house.base_wall], (0, ground, width, height), rng)
     draw = ImageDraw.Draw(picture)
@@ -219,12 +215,10 @@ def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
         _quoins(draw, width, eaves, height, trim)
     _floors(picture, draw, house, catalogue, rng, trim)
     _street_level(picture, draw, house, catalogue, rng)
-    draw.rectangle(
-        (0, height - metres_to_pixels(0.35), width, height), fill=(*darken(trim, 0.62), CODE_SOLID)
-    )
+    draw.rectangle((0, height - to_pixels(0.35), width, height), fill=painted(trim, 0.62))
     _door(picture, house, catalogue)
     _draw_eaves(draw, house, width, eaves, trim)
-    draw.line((0, eaves, 0, height), fill=(*darken(trim, 0.5), CODE_SOLID))
+    draw.line((0, eaves, 0, height), fill=painted(trim, 0.5))
     if house.drainpipe >= 0:
         x = int(house.drainpipe * (width - 3))
         draw.line((x, eaves, x, height), fill=(86, 88, 90, CODE_SOLID), width=2)
@@ -254,10 +248,10 @@ def _floors(
 ) -> None:
     for floor in range(1, house.floors):
         base = house.ground_floor + (floor - 1) * house.storey
-        y = picture.height - metres_to_pixels(base)
+        y = picture.height - to_pixels(base)
         if house.string_courses or floor == 1:
-            draw.rectangle((0, y - 4, picture.width, y), fill=(*trim, CODE_SOLID))
-            draw.line((0, y + 1, picture.width, y + 1), fill=(*darken(trim, 0.55), CODE_SOLID))
+            draw.rectangle((0, y - 4, picture.width, y), fill=painted(trim))
+            draw.line((0, y + 1, picture.width, y + 1), fill=painted(trim, 0.55))
         index = house.window if floor < house.floors - 1 else house.upper_window
         for bay in range(house.bays):
             if bay in house.blank_bays:
@@ -266,9 +260,7 @@ def _floors(
             kind = catalogue.window_types[index]
             x = _bay_centre_column(house, bay) - sprite.width // 2
             foot = 0.15 if kind.balcony else 0.85
-            picture.paste(
-                sprite, (x, y - metres_to_pixels(foot) - sprite.height + 4), _solid(sprite)
-            )
+            picture.paste(sprite, (x, y - to_pixels(foot) - sprite.height + 4), _solid(sprite))
 
 
 def _street_level(
@@ -286,9 +278,9 @@ def _street_level(
             continue
         shop = house.shops[bay]
         if shop >= 0:
-            wide, high = metres_to_pixels(pitch * 0.86), metres_to_pixels(2.25)
+            wide, high = to_pixels(pitch * 0.86), to_pixels(2.25)
             glass = draw_shop_glass(wide, high, rng)
-            left, top = middle - wide // 2, height - metres_to_pixels(0.4) - high
+            left, top = middle - wide // 2, height - to_pixels(0.4) - high
             picture.paste(glass, (left, top))
             draw.rectangle(
                 (left, top, left + wide, top + high), outline=(40, 40, 42, CODE_SOLID), width=2
@@ -298,18 +290,18 @@ def _street_level(
                 sign = sign.resize((wide, sign.height), Image.Resampling.NEAREST)
             draw.rectangle(
                 (left, top - 24, left + wide, top - 2),
-                fill=(*darken(catalogue.trims[2], 0.6), CODE_SOLID),
+                fill=painted(catalogue.trims[2], 0.6),
             )
             picture.paste(sign, (middle - sign.width // 2, top - 23))
             if house.awning >= 0:
                 _awning(
                     draw,
-                    (left - 3, top - 3, left + wide + 3, top + metres_to_pixels(0.62)),
+                    (left - 3, top - 3, left + wide + 3, top + to_pixels(0.62)),
                     catalogue.awnings[house.awning],
                 )
         elif bay not in house.blank_bays:
             sprite = catalogue.windows[house.window][int(rng.integers(PANE_CODES))]
-            y = height - metres_to_pixels(0.95) - sprite.height
+            y = height - to_pixels(0.95) - sprite.height
             picture.paste(sprite, (middle - sprite.width // 2, y), _solid(sprite))
 
 
@@ -328,7 +320,7 @@ def _awning(
         fill = (*colours[i % 2], CODE_FLAT)
         draw.rectangle((x, top, min(right, x + 6), bottom - 3), fill=fill)
         draw.pieslice((x, bottom - 7, min(right, x + 6), bottom), 0, 180, fill=fill)
-    draw.line((left, top, right, top), fill=(*darken(colours[0], 1.3), CODE_FLAT))
+    draw.line((left, top, right, top), fill=painted(colours[0], 1.3, CODE_FLAT))
     draw.line((left, bottom + 1, right, bottom + 1), fill=(30, 30, 32, CODE_SHOP), width=2)
 
 
@@ -336,7 +328,7 @@ def _quoins(draw: ImageDraw.ImageDraw, width: int, top: int, bottom: int, trim: 
     for i, y in enumerate(range(top, bottom, 11)):
         long = 15 if i % 2 else 9
         for x0, x1 in ((0, long), (width - 1 - long, width - 1)):
-            draw.rectangle((x0, y, x1, y + 9), fill=(*trim, CODE_SOLID))
+            draw.rectangle((x0, y, x1, y + 9), fill=painted(trim))
 
 
 def _solid(sprite: Image.Image) -> Image.Image:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from shared.synthetic_city.camera import SUPERSAMPLING, Camera, Floats, cast_ray
 from shared.synthetic_city.catalogue import VEHICLE_PAINTS, Catalogue
 from shared.synthetic_city.sessions import CaptureSession
 from shared.synthetic_city.street_objects import VEHICLE_SHARES, Sprite
-from shared.synthetic_city.streets import PAVEMENT_M, Metres, Quarter, Street
+from shared.synthetic_city.streets import PAVEMENT_M, Metres, Quarter
 from shared.synthetic_city.textures import random_stream
 
 KERB_CLEARANCE_M = 1.05
@@ -58,10 +59,11 @@ class VehiclePanel:
 
 
 def _place_street_objects(
-    quarter: Quarter, street: Street, catalogue: Catalogue
+    quarter: Quarter, catalogue: Catalogue, number: int
 ) -> list[StreetObject]:
     """Place the permanent objects on the pavements of a street."""
-    rng = random_stream(quarter.seed, quarter.name, "standing", street.number)
+    street = quarter.streets[number]
+    rng = random_stream(quarter.seed, quarter.name, "standing", number)
     objects = []
     kerb = street.half_width - PAVEMENT_M
     for side in (-1.0, 1.0):
@@ -89,9 +91,10 @@ def _place_street_objects(
     return objects
 
 
-def _place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
-    """Place the vehicles of one day: parked at both kerbs, and a few driving."""
-    rng = random_stream(quarter.seed, quarter.name, "vehicles", street.number, day)
+def _place_vehicles(quarter: Quarter, number: int, day: str) -> list[Vehicle]:
+    """Place the vehicles of one day in a street: parked at both kerbs, and a few driving."""
+    street = quarter.streets[number]
+    rng = random_stream(quarter.seed, quarter.name, "vehicles", number, day)
     vehicles = []
     lane = street.half_width - PAVEMENT_M - KERB_CLEARANCE_M
     for side in (-1.0, 1.0):
@@ -157,7 +160,7 @@ def _vehicle_panels(
 
 
 def _shop_blades(
-    quarter: Quarter, side: int, catalogue: Catalogue
+    quarter: Quarter, catalogue: Catalogue, side: int
 ) -> list[tuple[Metres, Metres, int]]:
     """Return the projecting shop signs of a facade row: foot, outward direction, index."""
     row = quarter.sides[side]
@@ -202,9 +205,9 @@ class VisibleObjects:
     def __init__(self, quarter: Quarter, catalogue: Catalogue) -> None:
         self.quarter = quarter
         self.catalogue = catalogue
-        self._objects: dict[int, list[StreetObject]] = {}
-        self._vehicles: dict[tuple[int, str], list[Vehicle]] = {}
-        self._blades: dict[int, list[tuple[Metres, Metres, int]]] = {}
+        self._objects_at = cache(partial(_place_street_objects, quarter, catalogue))
+        self._vehicles_at = cache(partial(_place_vehicles, quarter))
+        self._blades_at = cache(partial(_shop_blades, quarter, catalogue))
         self._middles = np.stack(
             [street.start + street.direction * street.length / 2 for street in quarter.streets]
         )
@@ -244,24 +247,6 @@ class VisibleObjects:
                 item = _panel_item(camera, panel, slopes)
                 if item:
                     yield item
-
-    def _objects_at(self, number: int) -> list[StreetObject]:
-        if number not in self._objects:
-            street = self.quarter.streets[number]
-            self._objects[number] = _place_street_objects(self.quarter, street, self.catalogue)
-        return self._objects[number]
-
-    def _vehicles_at(self, number: int, day: str) -> list[Vehicle]:
-        key = (number, day)
-        if key not in self._vehicles:
-            street = self.quarter.streets[number]
-            self._vehicles[key] = _place_vehicles(self.quarter, street, day)
-        return self._vehicles[key]
-
-    def _blades_at(self, side: int) -> list[tuple[Metres, Metres, int]]:
-        if side not in self._blades:
-            self._blades[side] = _shop_blades(self.quarter, side, self.catalogue)
-        return self._blades[side]
 
     def _billboard(
         self, camera: Camera, session: CaptureSession, street_object: StreetObject

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
-from shared.synthetic_city.textures import CODE_FLAT, CODE_LAMP, CODE_SOLID, Colour, darken
+from shared.synthetic_city.textures import CODE_FLAT, CODE_LAMP, CODE_SOLID, Colour, darken, painted
 
 OBJECT_PIXELS_PER_METRE = 40
 """Finer than facades, because these come closer to the camera"""
@@ -53,7 +53,7 @@ def draw_tree(
             (middle + thick // 2, fork - 10),
             (middle - thick // 2, fork - 10),
         ],
-        fill=(*bark, CODE_SOLID),
+        fill=painted(bark),
     )
     crown_height = (height - trunk) * scale
     for _ in range(26):  # branches
@@ -61,12 +61,10 @@ def draw_tree(
         long = crown_height * rng.uniform(0.40, 0.85)
         start = fork - int(rng.uniform(0, 0.35) * crown_height)
         end = (middle + np.sin(angle) * long * 0.62, start - np.cos(angle) * long * 0.75)
-        draw.line(
-            (middle, start, *end), fill=(*darken(bark, rng.uniform(0.8, 1.2)), CODE_SOLID), width=2
-        )
+        draw.line((middle, start, *end), fill=painted(bark, rng.uniform(0.8, 1.2)), width=2)
         for _ in range(3):
             twig = (end[0] + rng.normal(0, 0.10) * width, end[1] - rng.uniform(0, 0.14) * tall)
-            draw.line((*end, *twig), fill=(*darken(bark, 1.1), CODE_SOLID), width=1)
+            draw.line((*end, *twig), fill=painted(bark, 1.1), width=1)
     if foliage == "bare":
         return Sprite(picture, crown, height)
     tones = {
@@ -87,7 +85,7 @@ def draw_tree(
         size = rng.uniform(0.08, 0.18) * scale
         lit = 0.70 + 0.45 * (fork - y) / max(1.0, crown_height) + rng.normal(0, 0.13)
         tone = darken(tones[foliage], float(np.clip(lit, 0.42, 1.4)))
-        draw.ellipse((x - size, y - size * 0.8, x + size, y + size * 0.8), fill=(*tone, CODE_SOLID))
+        draw.ellipse((x - size, y - size * 0.8, x + size, y + size * 0.8), fill=painted(tone))
     return Sprite(picture, crown, height)
 
 
@@ -97,13 +95,11 @@ def draw_lamp(colour: Colour, height: float) -> Sprite:
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     middle = width // 2
-    draw.rectangle((middle - 2, 8, middle + 2, tall - 1), fill=(*colour, CODE_SOLID))
-    draw.rectangle(
-        (middle - 5, tall - 30, middle + 5, tall - 1), fill=(*darken(colour, 0.8), CODE_SOLID)
-    )
-    draw.line((8, 9, width - 9, 9), fill=(*colour, CODE_SOLID), width=3)
+    draw.rectangle((middle - 2, 8, middle + 2, tall - 1), fill=painted(colour))
+    draw.rectangle((middle - 5, tall - 30, middle + 5, tall - 1), fill=painted(colour, 0.8))
+    draw.line((8, 9, width - 9, 9), fill=painted(colour), width=3)
     for x in (8, width - 9):
-        draw.rectangle((x - 7, 6, x + 7, 9), fill=(*darken(colour, 0.8), CODE_SOLID))
+        draw.rectangle((x - 7, 6, x + 7, 9), fill=painted(colour, 0.8))
         draw.rectangle((x - 6, 10, x + 6, 14), fill=(248, 236, 200, CODE_LAMP))
     return Sprite(picture, 1.6, height)
 
@@ -137,12 +133,10 @@ def draw_post_sign(kind: int, rng: np.random.Generator) -> Sprite:
 
 def draw_box(colour: Colour, width: float, height: float) -> Sprite:
     """Draw a bin, a cabinet or a letter box."""
-    picture = Image.new(
-        "RGBA", (_object_pixels(width), _object_pixels(height)), (*colour, CODE_SOLID)
-    )
+    picture = Image.new("RGBA", (_object_pixels(width), _object_pixels(height)), painted(colour))
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((0, 0, picture.width - 1, 3), fill=(*darken(colour, 1.25), CODE_FLAT))
-    draw.rectangle((3, 9, picture.width - 4, 14), fill=(*darken(colour, 0.5), CODE_SOLID))
+    draw.rectangle((0, 0, picture.width - 1, 3), fill=painted(colour, 1.25, CODE_FLAT))
+    draw.rectangle((3, 9, picture.width - 4, 14), fill=painted(colour, 0.5))
     draw.rectangle(
         (0, picture.height - 4, picture.width - 1, picture.height - 1),
         fill=(30, 30, 32, CODE_SOLID),
@@ -182,7 +176,7 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     low, bonnet = _object_pixels(0.28), _object_pixels(shape.bonnet)
-    body, shade = (*paint, CODE_SOLID), (*darken(paint, 0.72), CODE_SOLID)
+    body, shade = painted(paint), painted(paint, 0.72)
     front, back = (int(width * share) for share in shape.cabin)
     lean = int(width * shape.slope)
     draw.rectangle((2, tall - 4, width - 3, tall + 1), fill=(28, 28, 30, CODE_SOLID))  # its shadow
@@ -196,7 +190,7 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
         ],
         fill=body,
     )
-    draw.line((front + lean, 1, back - lean, 1), fill=(*darken(paint, 1.2), CODE_FLAT), width=3)
+    draw.line((front + lean, 1, back - lean, 1), fill=painted(paint, 1.2, CODE_FLAT), width=3)
     draw.rectangle((1, tall - low - _object_pixels(0.22), width - 2, tall - low), fill=shade)
     sill = tall - bonnet + 1 if shape.bonnet < 2 else tall - _object_pixels(1.35)
     head = _object_pixels(0.12)
@@ -231,7 +225,7 @@ def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
         (0.2, (60, 60, 62)),
     ):
         r = int(radius * share)
-        draw.ellipse((x - r, y - r, x + r, y + r), fill=(*colour, CODE_SOLID))
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=painted(colour))
 
 
 def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
@@ -240,11 +234,11 @@ def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     draw.rectangle((4, tall - 12, width - 5, tall + 1), fill=(24, 24, 26, CODE_SOLID))
-    draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=(*paint, CODE_SOLID))
-    draw.line((4, 0, width - 5, 0), fill=(*darken(paint, 1.2), CODE_FLAT), width=2)
+    draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=painted(paint))
+    draw.line((4, 0, width - 5, 0), fill=painted(paint, 1.2, CODE_FLAT), width=2)
     draw.rectangle(
         (1, tall - _object_pixels(0.5), width - 2, tall - 9),
-        fill=(*darken(paint, 0.72), CODE_SOLID),
+        fill=painted(paint, 0.72),
     )
     top = 6 if shape.bonnet < 2 else tall - _object_pixels(0.9)
     lamp = (170, 30, 28, CODE_LAMP) if rear else (238, 234, 212, CODE_LAMP)
@@ -252,7 +246,7 @@ def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
         draw.rectangle((x, top, x + 11, top + 7), fill=lamp)
     if not rear:
         grille = (18, top + 1, width - 19, top + 7)
-        draw.rectangle(grille, fill=(*darken(paint, 0.45), CODE_SOLID))
+        draw.rectangle(grille, fill=painted(paint, 0.45))
     plate = (
         width // 2 - 10,
         tall - _object_pixels(0.45),
@@ -271,7 +265,7 @@ def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Sprite:
     draw = ImageDraw.Draw(picture)
     lean, hem = width // 11, _object_pixels(overlap)
     outline = [(1, tall - 1), (lean, 0), (width - 1 - lean, 0), (width - 2, tall - 1)]
-    draw.polygon(outline, fill=(*paint, CODE_SOLID))
+    draw.polygon(outline, fill=painted(paint))
     if tall > 3 * hem:
         glass = [(7, tall - hem), (lean + 4, 5), (width - 5 - lean, 5), (width - 8, tall - hem)]
         draw.polygon(glass, fill=(58, 68, 78, CODE_SOLID))

@@ -163,13 +163,12 @@ class Quarter:
 
     def house(self, side: int, plot: int) -> House:
         """Return the house on a plot; created on first access, independently of the order."""
-        key = (side, plot)
-        if key not in self._houses:
+        if (side, plot) not in self._houses:
             row = self.sides[side]
             width = float(row.cuts[plot + 1] - row.cuts[plot])
             rng = random_stream(self.seed, self.name, "house", side, plot)
-            self._houses[key] = arrange_house(rng, width, row.shopping, row.floors)
-        return self._houses[key]
+            self._houses[side, plot] = arrange_house(rng, width, row.shopping, row.floors)
+        return self._houses[side, plot]
 
 
 def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:

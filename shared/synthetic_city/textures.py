@@ -143,7 +143,7 @@ class WindowType:
     balcony: bool
 
 
-def metres_to_pixels(metres: float) -> int:
+def to_pixels(metres: float) -> int:
     """Convert metres to pixels of a facade's texture."""
     return round(metres * PIXELS_PER_METRE)
 
@@ -154,23 +154,28 @@ def darken(colour: Colour, factor: float) -> Colour:
     return red, green, blue
 
 
+def painted(
+    colour: Colour, factor: float = 1.0, code: int = CODE_SOLID
+) -> tuple[int, int, int, int]:
+    """Return the pixel of a colour, multiplied by a factor, with a material code."""
+    return (*darken(colour, factor), code)
+
+
 def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Image.Image:
     """Draw a window as RGBA with material codes; `variant` is below PANE_CODES."""
     width, height, edge = (
-        metres_to_pixels(kind.width),
-        metres_to_pixels(kind.height),
-        max(1, metres_to_pixels(kind.surround_width)),
+        to_pixels(kind.width),
+        to_pixels(kind.height),
+        max(1, to_pixels(kind.surround_width)),
     )
-    wing = metres_to_pixels(kind.width * 0.48) if kind.shutters else 0
-    top = (
-        edge + (metres_to_pixels(0.28) if kind.pediment else 0) + (width // 3 if kind.arched else 0)
-    )
-    rail = metres_to_pixels(0.95) if kind.balcony else 0
-    side = max(wing, metres_to_pixels(0.35) if kind.balcony else 0) + edge
+    wing = to_pixels(kind.width * 0.48) if kind.shutters else 0
+    top = edge + (to_pixels(0.28) if kind.pediment else 0) + (width // 3 if kind.arched else 0)
+    rail = to_pixels(0.95) if kind.balcony else 0
+    side = max(wing, to_pixels(0.35) if kind.balcony else 0) + edge
     picture = Image.new("RGBA", (width + 2 * side, top + height + edge + 3), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     left, right, bottom = side, side + width - 1, top + height - 1
-    trim = (*kind.surround, CODE_SOLID)
+    trim = painted(kind.surround)
     glass = (*GLASS[int(rng.integers(len(GLASS)))], CODE_FIRST_PANE + variant % PANE_CODES)
     if kind.arched:
         draw.ellipse(
@@ -186,7 +191,7 @@ def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Ima
         mirrored = darken(glass[:3], 1.32 - 0.32 * (row - top) / max(1, height // 2))
         draw.line((left, row, right, row), fill=(*mirrored, glass[3]))
     _curtain(draw, (left, top, right, bottom), variant, glass[3], rng)
-    frame = (*kind.frame, CODE_SOLID)
+    frame = painted(kind.frame)
     draw.rectangle((left, top, right, bottom), outline=frame, width=2)
     for bar in range(1, kind.mullions + 1):
         x = left + bar * width // (kind.mullions + 1)
@@ -194,14 +199,10 @@ def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Ima
     for bar in range(1, kind.transoms + 1):
         y = top + bar * height // (kind.transoms + 1)
         draw.line((left, y, right, y), fill=frame, width=1)
-    draw.line((left, top, right, top), fill=(*darken(kind.surround, 0.45), CODE_SOLID), width=2)
+    draw.line((left, top, right, top), fill=painted(kind.surround, 0.45), width=2)
     sill = darken(kind.surround, 1.06)
-    draw.rectangle(
-        (left - edge - 2, bottom + 1, right + edge + 2, bottom + 3), fill=(*sill, CODE_SOLID)
-    )
-    draw.line(
-        (left - edge, bottom + 4, right + edge, bottom + 4), fill=(*darken(sill, 0.5), CODE_SOLID)
-    )
+    draw.rectangle((left - edge - 2, bottom + 1, right + edge + 2, bottom + 3), fill=painted(sill))
+    draw.line((left - edge, bottom + 4, right + edge, bottom + 4), fill=painted(sill, 0.5))
     if kind.pediment:
         _pediment(draw, left - edge - 2, right + edge + 2, top - edge, kind.surround)
     if kind.shutters:
@@ -238,18 +239,18 @@ def _curtain(
 def _pediment(
     draw: ImageDraw.ImageDraw, left: int, right: int, bottom: int, colour: Colour
 ) -> None:
-    draw.rectangle((left, bottom - 3, right, bottom - 1), fill=(*darken(colour, 1.05), CODE_SOLID))
+    draw.rectangle((left, bottom - 3, right, bottom - 1), fill=painted(colour, 1.05))
     draw.polygon(
         [(left, bottom - 4), (right, bottom - 4), ((left + right) // 2, bottom - 9)],
-        fill=(*colour, CODE_SOLID),
+        fill=painted(colour),
     )
-    draw.line((left, bottom, right, bottom), fill=(*darken(colour, 0.55), CODE_SOLID))
+    draw.line((left, bottom, right, bottom), fill=painted(colour, 0.55))
 
 
 def _shutter(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], colour: Colour) -> None:
-    draw.rectangle(box, fill=(*colour, CODE_SOLID), outline=(*darken(colour, 0.7), CODE_SOLID))
+    draw.rectangle(box, fill=painted(colour), outline=painted(colour, 0.7))
     for y in range(box[1] + 3, box[3] - 1, 3):
-        draw.line((box[0] + 2, y, box[2] - 2, y), fill=(*darken(colour, 0.82), CODE_SOLID))
+        draw.line((box[0] + 2, y, box[2] - 2, y), fill=painted(colour, 0.82))
 
 
 def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
@@ -263,10 +264,10 @@ def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
 
 def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generator) -> Image.Image:
     """Draw a door of about 1.3 x 2.6 m with frame and steps, RGBA with material codes."""
-    width, height = metres_to_pixels(1.3), metres_to_pixels(2.6)
+    width, height = to_pixels(1.3), to_pixels(2.6)
     picture = Image.new("RGBA", (width + 8, height + 4), (168, 162, 150, CODE_SOLID))
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((4, 4, width + 3, height + 3), fill=(*colour, CODE_SOLID))
+    draw.rectangle((4, 4, width + 3, height + 3), fill=painted(colour))
     light = height // 5
     draw.rectangle(
         (6, 6, width + 1, light), fill=(*GLASS[0], CODE_FIRST_PANE + int(rng.integers(PANE_CODES)))
@@ -279,18 +280,16 @@ def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generato
             if glazed and row == 0:
                 draw.rectangle((x0, y0, x1, y1), fill=(*GLASS[1], CODE_FIRST_PANE + 3))
             else:
-                draw.rectangle((x0, y0, x1, y1), outline=(*darken(colour, 0.62), CODE_SOLID))
-                draw.line((x0, y0, x1, y0), fill=(*darken(colour, 1.3), CODE_SOLID))
-    draw.line(
-        (width // 2 + 3, light, width // 2 + 3, height), fill=(*darken(colour, 0.5), CODE_SOLID)
-    )
+                draw.rectangle((x0, y0, x1, y1), outline=painted(colour, 0.62))
+                draw.line((x0, y0, x1, y0), fill=painted(colour, 1.3))
+    draw.line((width // 2 + 3, light, width // 2 + 3, height), fill=painted(colour, 0.5))
     draw.rectangle((0, height + 1, width + 7, height + 3), fill=(140, 136, 128, CODE_SOLID))
     return picture
 
 
 def draw_shop_glass(width: int, height: int, rng: np.random.Generator) -> Image.Image:
     """Draw a shop window of `width` x `height` pixels with goods on display."""
-    picture = Image.new("RGBA", (width, height), (*darken(GLASS[2], 0.9), CODE_SHOP))
+    picture = Image.new("RGBA", (width, height), painted(GLASS[2], 0.9, CODE_SHOP))
     draw = ImageDraw.Draw(picture)
     for row in range(height // 2):
         shade = darken(GLASS[1], 1.15 - 0.4 * row / max(1, height // 2))

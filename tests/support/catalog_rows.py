@@ -11,7 +11,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import select, update
+from sqlalchemy import select, text, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
@@ -26,7 +26,7 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, claim_jobs
 from shared.jobs.transitions import cancel_job
 from shared.storage import ObjectStore
-from shared.storage.chunks import Rows, read_chunk, write_chunk
+from shared.storage.chunks import Rows, StoredRows, read_chunk, write_chunk
 from shared.storage.keys import new_original_key, query_key
 
 NUMBERS = itertools.count(1)
@@ -153,7 +153,7 @@ def add_chunk(
     generation_id: UUID,
     photo_ids: list[UUID],
     slot_rows: int = 1000,
-    rows: Rows | None = None,
+    rows: StoredRows | None = None,
     slot: int | None = None,
     dead: int = 0,
 ) -> UUID:
@@ -206,7 +206,7 @@ def row_of(photo_id: UUID) -> Rows:
 
 def stored_rows(catalog: Catalog, store: ObjectStore, generation_id: UUID) -> dict[UUID, Rows]:
     """The descriptor that the generation holds of each photo, read from its chunk."""
-    found: dict[UUID, Rows] = {}
+    found: dict[UUID, Any] = {}  # as stored: float16 rows, too
     with catalog.read() as session:
         pairs = session.execute(
             select(Descriptor, Chunk)
@@ -245,6 +245,12 @@ def expire_lease(catalog: Catalog, *job_ids: UUID) -> None:
     """The worker that has the jobs was last heard of too long ago."""
     for job_id in job_ids:
         set_columns(catalog, job_id, lease_until=db_now_plus(-1.0))
+
+
+def is_lock_awaited(catalog: Catalog) -> bool:
+    """Whether a transaction waits for a lock of another one; PostgreSQL only."""
+    with catalog.read() as session:
+        return bool(session.scalar(text("SELECT count(*) FROM pg_locks WHERE NOT granted")))
 
 
 def end_pauses(catalog: Catalog) -> None:

@@ -14,6 +14,7 @@ from sqlalchemy import select
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.database.session import Catalog
+from shared.catalog.generations import RowType
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo
 from shared.ids import new_id
@@ -43,13 +44,18 @@ class SmallMap:
     `rows` holds the expected state: every live photo with its descriptor.
     """
 
-    def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
+    def __init__(
+        self, catalog: Catalog, store: ObjectStore, row_type: RowType = RowType.FLOAT32
+    ) -> None:
         self.catalog = catalog
         self.store = store
+        self.row_type = row_type
         self.rows: dict[UUID, Rows] = {}
         with catalog.write() as session:
             self.map_id = add_map(session, f"map-{new_id()}").id
-            self.generation_id = add_generation(session, self.map_id, dimension=DIMENSION).id
+            self.generation_id = add_generation(
+                session, self.map_id, dimension=DIMENSION, row_type=row_type
+            ).id
 
     @property
     def version(self) -> int:
@@ -71,10 +77,14 @@ class SmallMap:
             photos = [Photo(**made_up_photo(self.map_id, **about(n))) for n in range(len(rows))]
             session.add_all(photos)
             photo_ids = [photo.id for photo in photos]
+        stored = rows.astype(self.row_type)
         add_chunk(
-            self.catalog, self.store, self.generation_id, photo_ids, rows=rows, slot=slot, dead=dead
+            *(self.catalog, self.store, self.generation_id, photo_ids),
+            rows=stored,
+            slot=slot,
+            dead=dead,
         )
-        self.rows |= dict(list(zip(photo_ids, rows, strict=True))[dead:])
+        self.rows |= dict(list(zip(photo_ids, stored.astype(np.float32), strict=True))[dead:])
         return photo_ids
 
     def patch(self, photo_id: UUID, **columns: Any) -> None:

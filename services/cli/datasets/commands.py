@@ -22,16 +22,18 @@ from rich.table import Column
 
 from services.cli.datasets.synth import synth
 from services.cli.output import (
+    Json,
     JsonOption,
     Table,
-    console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_result,
     print_table,
     printable_path,
     progress_bar,
-    report_errors,
+    refuse_unwritable,
 )
 from shared.datasets.check import (
     MAX_RULE_MULTIPLE,
@@ -47,9 +49,7 @@ from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rul
 from shared.datasets.ground_truth_files import sidecar_path, write_ground_truth
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
-from shared.errors import InvalidRequest, Misconfigured
-
-Json = dict[str, Any]
+from shared.errors import InvalidRequest
 
 
 def check(
@@ -73,7 +73,7 @@ def check(
 
     The exit code is 1 if there are problems.
     """
-    with report_errors(as_json), progress_bar() as progress:
+    with progress_bar() as progress:
         bar = progress.add_task("scanning the folder", total=None)
         report = inspect_dataset(folder, protocol=protocol, rule=rule, min_photos=min_photos)
         progress.remove_task(bar)
@@ -139,37 +139,32 @@ def _evaluation_summary(set_: EvaluationSet) -> Json:
 
 
 def _print_check(report: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> None:
-    console.print(
-        f"{printable_path(report.root)}: {', '.join(dict.fromkeys(report.layouts))}.",
-        soft_wrap=True,
-    )
+    print_message(f"{printable_path(report.root)}: {', '.join(dict.fromkeys(report.layouts))}.")
     if report.training is not None:
         _print_training(_training_summary(report.training))
     for set_ in report.evaluation:
         _print_evaluation(_evaluation_summary(set_))
     if not problems:
-        console.print(
+        print_message(
             "All photos can be decoded."
             if decoded
-            else "All photos exist. Pass --decode to decode them.",
-            soft_wrap=True,
+            else "All photos exist. Pass --decode to decode them."
         )
     for problem in problems:
         err_console.print(f"[red]{problem.code}[/red] {escape(problem.detail)}", soft_wrap=True)
         for example in problem.examples:
-            err_console.print(f"  {escape(example)}", soft_wrap=True)
+            print_note(f"  {example}")
         if problem.examples and problem.count > len(problem.examples):
-            err_console.print(f"  and {problem.count - len(problem.examples)} more")
+            print_note(f"  and {problem.count - len(problem.examples)} more")
 
 
 def _print_training(figures: Json) -> None:
     sizes = figures["photos_per_place"]
-    console.print(
+    print_message(
         f"Training set: {figures['photos']} photos of {figures['places']} places in "
         f"{len(figures['cities'])} cities ({figures['layout']}), {sizes['least']} to "
         f"{sizes['most']} photos per place (median {sizes['median']:g}); fingerprint "
-        f"{figures['fingerprint'][:12]}.",
-        soft_wrap=True,
+        f"{figures['fingerprint'][:12]}."
     )
     table = Table("city", Column("places", justify="right"), Column("photos", justify="right"))
     for city, counts in figures["cities"].items():
@@ -179,13 +174,12 @@ def _print_training(figures: Json) -> None:
 
 def _print_evaluation(summary: Json) -> None:
     # Not a table: it would truncate long names and fingerprints.
-    console.print(
-        f"{escape(summary['name'])}: {summary['database']} database photos, "
+    print_message(
+        f"{summary['name']}: {summary['database']} database photos, "
         f"{summary['queries']} queries ({summary['queries_without_positives']} without positives); "
         f"{summary['positives_per_query']['mean']:.1f} positives per query "
-        f"({escape(summary['rule'])}), protocol {summary['protocol']}, fingerprint "
-        f"{summary['fingerprint'][:12]}.",
-        soft_wrap=True,
+        f"({summary['rule']}), protocol {summary['protocol']}, fingerprint "
+        f"{summary['fingerprint'][:12]}."
     )
 
 
@@ -224,23 +218,20 @@ def ground_truth(
     Rows and indices follow the order of the lists. OUT.json records the fingerprints of both lists
     to detect a mismatch when the file is used.
     """
-    with report_errors(as_json):
-        criterion = _resolve_rule(radius, rule)
-        if out.suffix != ".npy":
-            raise InvalidRequest("bad_out", f"--out {out}: the file name must end in .npy.")
-        database_photos = read_photo_list(database, folder)
-        query_photos = read_photo_list(queries, folder)
-        positives = find_positives(criterion, query_photos, database_photos)
-        try:
-            write_ground_truth(
-                out,
-                positives,
-                database=[photo.name for photo in database_photos],
-                queries=[photo.name for photo in query_photos],
-                rule=str(criterion),
-            )
-        except OSError as error:
-            raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
+    criterion = _resolve_rule(radius, rule)
+    if out.suffix != ".npy":
+        raise InvalidRequest("bad_out", f"--out {out}: the file name must end in .npy.")
+    database_photos = read_photo_list(database, folder)
+    query_photos = read_photo_list(queries, folder)
+    positives = find_positives(criterion, query_photos, database_photos)
+    with refuse_unwritable(out):
+        write_ground_truth(
+            out,
+            positives,
+            database=[photo.name for photo in database_photos],
+            queries=[photo.name for photo in query_photos],
+            rule=str(criterion),
+        )
     counts = [len(indices) for indices in positives]
     figures = {
         "out": printable_path(out),
@@ -301,18 +292,17 @@ def audit(
     Near means within 4 times the criterion's metres or frames, regardless of heading. Review these
     pairs: if both photos show the same place, the ground truth is wrong, not the descriptor.
     """
-    with report_errors(as_json):
-        evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
-        ranked = _load_array(predictions, "iu").astype(np.int64)
-        outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
-        if outside:
-            raise InvalidRequest(
-                "predictions_out_of_range",
-                f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
-                f"database of {evaluation.name} has {len(evaluation.database)} photos.",
-            )
-        score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
-        suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
+    evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
+    ranked = _load_array(predictions, "iu").astype(np.int64)
+    outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
+    if outside:
+        raise InvalidRequest(
+            "predictions_out_of_range",
+            f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
+            f"database of {evaluation.name} has {len(evaluation.database)} photos.",
+        )
+    score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
+    suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
     if as_json:
         print_json(
             {
@@ -325,11 +315,10 @@ def audit(
             }
         )
         return
-    console.print(
-        f"{len(suspects)} of {len(evaluation.queries)} queries of {escape(evaluation.name)} have a "
-        f"confident first match within {MAX_RULE_MULTIPLE:g} times {escape(evaluation.rule)} that "
-        "counts as wrong.",
-        soft_wrap=True,
+    print_message(
+        f"{len(suspects)} of {len(evaluation.queries)} queries of {evaluation.name} have a "
+        f"confident first match within {MAX_RULE_MULTIPLE:g} times {evaluation.rule} that "
+        "counts as wrong."
     )
     if suspects:
         _print_suspects(suspects)
@@ -351,7 +340,7 @@ def _print_suspects(suspects: list[SuspectLabel]) -> None:
         )
     print_table(table)
     if len(suspects) > MAX_SUSPECTS_SHOWN:
-        console.print(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
+        print_message(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
 
 
 def _load_array(path: Path, kinds: str) -> NDArray[Any]:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Column
 
 from services.cli.datasets.baselines import BASELINE_KS, evaluate_baselines
 from services.cli.output import (
+    Json,
     JsonOption,
     Table,
-    console,
     print_json,
+    print_message,
     print_table,
     progress_bar,
-    report_errors,
 )
 from shared.synthetic_city.plan import CityOptions, CityPlan, make_plan
 from shared.synthetic_city.write import (
@@ -29,8 +29,6 @@ from shared.synthetic_city.write import (
     with_training_layout,
     write_city,
 )
-
-Json = dict[str, Any]
 
 RECALL_COLUMNS = ("R@1 in map", "R@1 other way")
 SIZE_PATTERN = re.compile(r"(\d{2,4})x(\d{2,4})")
@@ -97,20 +95,19 @@ def synth(
     options = CityOptions(
         places, views, query_count, seed, catalogue_seed, out_of_map, width, height, train, rides
     )
-    with report_errors(as_json):
-        check_output_empty(out)
-        started = time.perf_counter()
-        plan = with_training_layout(make_plan(options), layout)
-        with progress_bar() as progress:
-            bar = progress.add_task("rendering", total=len(plan.photos))
-            write_city(plan, out, lambda count: progress.advance(bar, count))
-            seconds = time.perf_counter() - started
-            baselines = evaluate_baselines(plan, out, progress) if ladder else []
-        figures = {
-            **_city_summary(plan, out, seconds),
-            "ladder": baselines,
-            "seconds": time.perf_counter() - started,
-        }
+    check_output_empty(out)
+    started = time.perf_counter()
+    plan = with_training_layout(make_plan(options), layout)
+    with progress_bar() as progress:
+        bar = progress.add_task("rendering", total=len(plan.photos))
+        write_city(plan, out, lambda count: progress.advance(bar, count))
+        seconds = time.perf_counter() - started
+        baselines = evaluate_baselines(plan, out, progress) if ladder else []
+    figures = {
+        **_city_summary(plan, out, seconds),
+        "ladder": baselines,
+        "seconds": time.perf_counter() - started,
+    }
     if as_json:
         print_json(figures)
         return
@@ -119,11 +116,10 @@ def synth(
 
 def _print_figures(figures: Json) -> None:
     counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
-    console.print(
+    print_message(
         f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
         f"{counts.get('train', 0)} training photos; rendered at "
-        f"{drawing['photos_per_second']:.0f} photos/s, {figures['seconds']:.0f} s in total.",
-        soft_wrap=True,
+        f"{drawing['photos_per_second']:.0f} photos/s, {figures['seconds']:.0f} s in total."
     )
     if not figures["ladder"]:
         return
@@ -142,12 +138,11 @@ def _print_figures(figures: Json) -> None:
             ),
         )
     print_table(table)
-    console.print(
+    print_message(
         f"Recall over {kinds.get('in_map', 0)} queries in the map and "
-        f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m.",
-        soft_wrap=True,
+        f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m."
     )
-    console.print(NOT_COMPARABLE, soft_wrap=True)
+    print_message(NOT_COMPARABLE)
 
 
 def _format_percent(share: float) -> str:

@@ -104,11 +104,7 @@ def decode_batches(
 ) -> Iterator[list[tuple[Path, DecodeOutcome]]]:
     """Decode photos in batches; the next batch is prefetched in the background.
 
-    Args:
-        photos: Photo files.
-        preprocessing: Applied to each photo.
-        settings: Batch size and decoder limits.
-        seconds: The decoding time is added to `seconds["decode"]`.
+    The decoding time is added to `seconds["decode"]`.
 
     Yields:
         Batches in the order of `photos`: each photo with its pixels, or the error of a photo that
@@ -120,11 +116,8 @@ def decode_batches(
         started = time.perf_counter()
         chunk = photos[begin : begin + settings.batch_photos]
         contents = [_read_photo(photo) for photo in chunk]
-        outcomes = iter(
-            decoders.decode(
-                [content for content in contents if isinstance(content, bytes)], preprocessing
-            )
-        )
+        readable = [content for content in contents if isinstance(content, bytes)]
+        outcomes = iter(decoders.decode(readable, preprocessing))
         batch: list[tuple[Path, DecodeOutcome]] = [
             (photo, next(outcomes) if isinstance(content, bytes) else content)
             for photo, content in zip(chunk, contents, strict=True)
@@ -141,24 +134,28 @@ def decode_batches(
         yield prefetched.result()
 
 
+def split_outcomes(
+    batch: Sequence[tuple[Path, DecodeOutcome]], refused: list[tuple[Path, PlacewiseError]]
+) -> list[Pixels]:
+    """Return the (height, width, 3) pixels of a batch; its other photos are added to `refused`."""
+    pixels = []
+    for photo, outcome in batch:
+        if isinstance(outcome, PlacewiseError):
+            refused.append((photo, outcome))
+        else:
+            pixels.append(outcome.pixels)
+    return pixels
+
+
 def decode_pixels(
     photos: Sequence[Path],
     preprocessing: Preprocessing,
     settings: Settings,
-    refused: list[dict[str, str]],
+    refused: list[tuple[Path, PlacewiseError]],
 ) -> Iterator[list[Pixels]]:
-    """Decode photos to batches of (height, width, 3) pixels, in the order of the photos.
-
-    Path and reason of each photo that can't be decoded are appended to `refused`.
-    """
+    """Decode photos to batches of pixels as `split_outcomes` does, in the order of the photos."""
     for batch in decode_batches(photos, preprocessing, settings, defaultdict(float)):
-        pixels = []
-        for path, outcome in batch:
-            if isinstance(outcome, PlacewiseError):
-                refused.append({"path": printable_path(path), "reason": outcome.detail})
-            else:
-                pixels.append(outcome.pixels)
-        if pixels:
+        if pixels := split_outcomes(batch, refused):
             yield pixels
 
 
@@ -175,7 +172,7 @@ HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
 @contextlib.contextmanager
 def open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
-) -> Iterator[Callable[[Any], None]]:
+) -> Iterator[Callable[[Any], object]]:
     """Open a writer for descriptors; call it with successive (b, D) float32 batches.
 
     Args:
@@ -189,7 +186,7 @@ def open_descriptor_writer(
         np.lib.format.write_array_header_1_0(
             file, {"descr": "<f4", "fortran_order": False, "shape": shape}
         )
-        yield lambda rows: _append_rows(file, rows)
+        yield lambda rows: file.write(np.ascontiguousarray(rows, "<f4").tobytes())
         return
     import h5py  # part of the extra `trainer`
 
@@ -202,10 +199,6 @@ def open_descriptor_writer(
                 group.create_dataset(HLOC_DATASET, data=np.asarray(row, np.float32))
 
         yield write
-
-
-def _append_rows(file: BinaryIO, rows: Any) -> None:
-    file.write(np.ascontiguousarray(rows, "<f4").tobytes())
 
 
 @dataclass(slots=True)
@@ -271,12 +264,7 @@ def describe_files(
     refused: list[tuple[Path, PlacewiseError]] = []
     with atomic_write(out) as file, open_descriptor_writer(file, shape, names) as write:
         for batch in decode_batches(photos, extractor.preprocessing, settings, result.seconds):
-            pixels = []
-            for photo, outcome in batch:
-                if isinstance(outcome, PlacewiseError):
-                    refused.append((photo, outcome))
-                else:
-                    pixels.append(outcome.pixels)
+            pixels = split_outcomes(batch, refused)
             if not refused:  # after a failure, the rest is only decoded, to report all failures
                 batch_started = time.perf_counter()
                 try:

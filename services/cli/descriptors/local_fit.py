@@ -21,14 +21,14 @@ from services.cli.descriptors.local_extractor import (
 )
 from services.cli.environment import read_settings
 from services.cli.ingest.geotags import list_photos
-from services.cli.output import atomic_write, check_output_path, printable_path
+from services.cli.output import atomic_write, check_output_path, printable_path, stage_bars
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaWhiteningFile, Rows
 from shared.descriptors.vocabulary import ClusterCentres
-from shared.errors import InvalidRequest, Unprocessable
+from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.extractor_config.configs import get_extractor_config
 
 DEFAULT_SAMPLE_PHOTOS = 1000  # same default as for fits on a map
@@ -82,17 +82,14 @@ def fit_vocabulary_on_folder(
         len(all_photos), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
     )
     photos = [all_photos[number] for number in numbers]
-    refused: list[dict[str, str]] = []
-    bars = {name: progress.add_task(name, total=None) for name in ("describing", "clustering")}
+    refused: list[tuple[Path, PlacewiseError]] = []
     fitted = fit_vocabulary(
         loaded,
         decode_pixels(photos, loaded.preprocessing, settings, refused),
         len(photos),
         clusters=clusters or config.clusters,
         seed=seed,
-        on_progress=lambda stage, done, total: progress.update(
-            bars[stage], completed=done, total=total
-        ),
+        on_progress=stage_bars(progress),
     )
     with atomic_write(out) as file:
         file.write(fitted.encode())
@@ -101,7 +98,7 @@ def fit_vocabulary_on_folder(
         "clusters": fitted.centres.clusters,
         "dimension": fitted.centres.dimension,
         "provenance": fitted.provenance,
-        "refused": refused,
+        "refused": _refusals(refused),
     }
 
 
@@ -140,12 +137,7 @@ def fit_pca_locally(
             vocabulary.
     """
     check_output_path(out, ".safetensors", "a whitening")
-    bars = {name: progress.add_task(name, total=None) for name in ("gathering", "reducing")}
-
-    def on_progress(stage: str, done: int, total: int) -> None:
-        progress.update(bars[stage], completed=done, total=total)
-
-    refused: list[dict[str, str]] = []
+    refused: list[tuple[Path, PlacewiseError]] = []
     spec = None
     batches: Iterator[Rows]
     if source.is_dir():
@@ -171,7 +163,7 @@ def fit_pca_locally(
         sampled = sample_rows(len(rows), sample_size(dimension, components), SEED)
         batches = _read_rows(rows, sampled)
     fitted = PcaWhiteningFile(
-        fit_pca_stream(batches, len(sampled), dimension, components, on_progress), spec
+        fit_pca_stream(batches, len(sampled), dimension, components, stage_bars(progress)), spec
     )
     with atomic_write(out) as file:
         file.write(fitted.encode())
@@ -182,7 +174,7 @@ def fit_pca_locally(
         "rows": fitted.whitening.rows,
         "explained": fitted.whitening.explained,
         "sha256": fitted.whitening.sha256,
-        "refused": refused,
+        "refused": _refusals(refused),
     }
 
 
@@ -196,6 +188,10 @@ def _load_extractor(
     own = load_own_vocabulary(config, vocabulary)
     loaded = load_extractor(config, settings)
     return loaded, resolve_centres(loaded, own)
+
+
+def _refusals(refused: list[tuple[Path, PlacewiseError]]) -> list[dict[str, str]]:
+    return [{"path": printable_path(path), "reason": error.detail} for path, error in refused]
 
 
 def _open_row_file(file: Path) -> Rows:

@@ -19,6 +19,8 @@ from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig, get_extractor_config
 from shared.extractor_config.names import TorchHubEntry
 
+NEVER_LOADED = "its code is here, but its weights were never loaded: run `placewise models fetch`"
+
 
 @dataclass(frozen=True, slots=True)
 class WeightsRecord:
@@ -46,12 +48,6 @@ def save_record(key: str, record: WeightsRecord) -> None:
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
         json.dump(records, file, indent=1)
     Path(file.name).replace(path)
-
-
-def _file_key(extractor: str, path: Path) -> str:
-    """Cache key of a weights file; it changes with the file's size and modification time."""
-    stat = path.stat()
-    return f"{extractor} {path} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def _load_cache() -> dict[str, Any]:
@@ -104,11 +100,8 @@ def inspect_weights(
 ) -> LocalWeights:
     """Inspect the local weights of an extractor, without network access or loading the model.
 
-    Args:
-        config: The configuration of the extractor.
-        settings: Location of DINOv2 weights.
-        on_reading: Called with the path before a file is read to compute its fingerprint, which
-            happens if the fingerprint is not cached.
+    If the fingerprint of a file is not cached, `on_reading` is called with its path before it is
+    read to compute the fingerprint.
     """
     if config.hub is not None:
         return _torchhub_weights(config.hub)
@@ -171,22 +164,12 @@ def _packaged_weights(
     )
     from shared.descriptors.weight_files import file_sha256
 
-    source, licence = f"the package {PACKAGE}", EfficientNetLite0.licence
+    facts = (config.name, f"the package {PACKAGE}", EfficientNetLite0.licence)
     try:
         path = weights_path()
     except Misconfigured as error:
-        return LocalWeights(config.name, source, False, error.detail, None, None, licence, None)
-    known = _cached_record(config.backbone, path, file_sha256, on_reading)
-    return LocalWeights(
-        config.name,
-        source,
-        True,
-        None,
-        str(path),
-        known.size_bytes,
-        licence,
-        known.fingerprint,
-    )
+        return _missing_weights(*facts, error)
+    return _weights_file(*facts, path, config.backbone, file_sha256, on_reading)
 
 
 def _dinov2_weights(
@@ -200,27 +183,45 @@ def _dinov2_weights(
     assert facet is not None
     size = config.backbone.removeprefix("dinov2-")
     source = f"Hugging Face: {hub_repository(size)}" if weights_file is None else "DINO_WEIGHTS"
+    facts = (config.name, source, Dinov2.licence)
     try:
         path = find_dinov2_weights(config, weights_file)
     except Misconfigured as error:
-        return LocalWeights(
-            config.name, source, False, error.detail, None, None, Dinov2.licence, None
-        )
+        return _missing_weights(*facts, error)
 
     def fingerprint(file: Path) -> str:
         return dinov2_fingerprint(size, layer, facet, open_weights(file, size))
 
     # The fingerprint covers only the tensors that this layer and facet use.
-    known = _cached_record(f"{config.backbone} {layer} {facet}", path, fingerprint, on_reading)
+    name = f"{config.backbone} {layer} {facet}"
+    return _weights_file(*facts, path, name, fingerprint, on_reading)
+
+
+def _missing_weights(
+    extractor: str, source: str, licence: str, error: Misconfigured
+) -> LocalWeights:
+    return LocalWeights(extractor, source, False, error.detail, None, None, licence, None)
+
+
+def _weights_file(
+    extractor: str,
+    source: str,
+    licence: str,
+    path: Path,
+    name: str,
+    fingerprint: Callable[[Path], str],
+    on_reading: Callable[[Path], object],
+) -> LocalWeights:
+    """Describe the weights in a file; their record is cached under `name`."""
+    stat = path.stat()
+    key = f"{name} {path} {stat.st_size} {stat.st_mtime_ns}"
+    known = _load_record(key)
+    if known is None:
+        on_reading(path)
+        known = WeightsRecord(fingerprint(path), stat.st_size)
+        save_record(key, known)
     return LocalWeights(
-        config.name,
-        source,
-        True,
-        None,
-        str(path),
-        known.size_bytes,
-        Dinov2.licence,
-        known.fingerprint,
+        extractor, source, True, None, str(path), known.size_bytes, licence, known.fingerprint
     )
 
 
@@ -249,29 +250,15 @@ def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
     try:
         folder = find_local_code(hub)
     except Misconfigured as error:
-        return LocalWeights(hub.name, source, False, error.detail, None, None, "unknown", None)
+        return _missing_weights(hub.name, source, "unknown", error)
     known = _load_record(torchhub_key(hub, code_fingerprint(folder)))
     return LocalWeights(
         hub.name,
         source,
         known is not None,
-        None
-        if known
-        else "its code is here, but its weights were never loaded: run `placewise models fetch`",
+        None if known else NEVER_LOADED,
         str(folder),
         known.size_bytes if known else None,
         find_licence(folder),
         known.fingerprint if known else None,
     )
-
-
-def _cached_record(
-    name: str, path: Path, fingerprint: Callable[[Path], str], on_reading: Callable[[Path], object]
-) -> WeightsRecord:
-    key = _file_key(name, path)
-    known = _load_record(key)
-    if known is None:
-        on_reading(path)
-        known = WeightsRecord(fingerprint(path), path.stat().st_size)
-        save_record(key, known)
-    return known

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,22 +19,23 @@ from rich.progress import Progress
 from rich.table import Column
 
 from services.cli.environment import read_settings
-from services.cli.evaluation.data_sets import progress_bars
 from services.cli.evaluation.describers import checkpoint_describer, extractor_describer
 from services.cli.output import (
     Table,
-    console,
     print_json,
+    print_message,
     print_table,
     printable_path,
     progress_bar,
+    refuse_unwritable,
+    stage_bars,
 )
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import choose_device
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 from shared.evaluation.bootstrap import PairedDifference, cluster_queries, paired_differences
 from shared.evaluation.exact_knn import exact_knn
 from shared.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
@@ -60,9 +61,6 @@ def whiten_set(
     Args:
         database: (m, D) rows.
         queries: (n, D) rows.
-        components: Number of dimensions to keep.
-        device: Device of the projection.
-        on_progress: Called with stage, done and total.
 
     Returns:
         (m, components) and (n, components) rows, and the milliseconds to project one row.
@@ -78,22 +76,17 @@ def whiten_set(
     whitening = fit_pca_stream(batches, len(sampled), dimension, components, on_progress)
     projection = PcaProjection(whitening, device)
     started = time.perf_counter()
-    reduced = [_project(rows, projection, block_rows, device) for rows in (database, queries)]
+    reduced = [_project(rows, projection, block_rows) for rows in (database, queries)]
     seconds = time.perf_counter() - started
     return reduced[0], reduced[1], 1000 * seconds / max(1, len(database) + len(queries))
 
 
-def _project(rows: Rows, projection: PcaProjection, block_rows: int, device: torch.device) -> Rows:
+def _project(rows: Rows, projection: PcaProjection, block_rows: int) -> Rows:
     reduced = np.empty((len(rows), projection.kept), np.float32)
-    for begin, block in _blocks(rows, block_rows):
-        projected = projection(torch.from_numpy(block).to(device)).cpu().numpy()
-        reduced[begin : begin + len(block)] = projected
-    return reduced
-
-
-def _blocks(rows: Rows, block_rows: int) -> Iterator[tuple[int, Rows]]:
     for begin in range(0, len(rows), block_rows):
-        yield begin, np.array(rows[begin : begin + block_rows])
+        block = slice(begin, begin + block_rows)
+        reduced[block] = projection.project(np.array(rows[block]))
+    return reduced
 
 
 FLOAT32_BYTES = 4
@@ -187,13 +180,17 @@ def compare_extractors(
             compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
     report = _comparison_as_json(evaluation_set, compared)
     if out is not None:
-        _write_report(out, report, render_comparison(evaluation_set, compared))
+        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        with refuse_unwritable(out):
+            (out / "comparison.json").write_text(text, encoding="utf-8")
+            page = render_comparison(evaluation_set, compared)
+            (out / "report.html").write_text(page, encoding="utf-8")
     if as_json:
         print_json(report)
         return
     _print_comparison(evaluation_set, compared)
     if out is not None:
-        console.print(printable_path(out / "report.html"), soft_wrap=True, markup=False)
+        print_message(printable_path(out / "report.html"))
 
 
 def _validate_entries(
@@ -217,12 +214,8 @@ def _validate_entries(
                 "bad_extractors", f"{entry.spec_text}: {config.name} uses no vocabulary."
             )
     if out is not None:
-        try:
+        with refuse_unwritable(out):
             out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Misconfigured(
-                "out_unwritable", f"Can't write to {out}: {error.strerror}."
-            ) from error
 
 
 def _evaluate_entry(
@@ -239,7 +232,7 @@ def _evaluate_entry(
             entry.name, None, evaluation_set, settings, progress, fit=entry.fit
         )
     )
-    on_progress = progress_bars(progress, entry.spec_text)
+    on_progress = stage_bars(progress, f"{entry.spec_text}: ")
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
     )
@@ -296,15 +289,6 @@ def _comparison_as_json(
     }
 
 
-def _write_report(out: Path, report: dict[str, Any], page: str) -> None:
-    try:
-        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        (out / "comparison.json").write_text(text, encoding="utf-8")
-        (out / "report.html").write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise Misconfigured("out_unwritable", f"Can't write to {out}: {error.strerror}.") from error
-
-
 def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:
     ks = list(compared[0].measured.recalls.recall_all)
     columns = (*(f"R@{k}" for k in ks), "R@1 95 % CI", "ms", "bytes", "vs. first")
@@ -323,11 +307,9 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         )
     print_table(table)
     clusters = compared[0].measured.clusters
-    console.print(
+    print_message(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; confidence intervals over "
         f"{clusters.count} {clusters.kind}. ms: inference and aggregation per photo, measured when "
-        "its descriptor was computed. bytes: float32 descriptor size.",
-        soft_wrap=True,
-        markup=False,
+        "its descriptor was computed. bytes: float32 descriptor size."
     )

@@ -30,7 +30,7 @@ from services.cli.ingest.upload import (
     UPLOAD_CONCURRENCY,
     fit_vocabulary_if_needed,
 )
-from services.cli.output import progress_bar
+from services.cli.output import progress_bar, stage_bars
 from shared.config.settings import Settings
 from shared.datasets.ground_truth_files import read_ground_truth
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
@@ -39,37 +39,22 @@ from shared.evaluation.exact_knn import Rankings, exact_knn
 from shared.evaluation.places.data_set import measure_places
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.ranking import (
-    ProgressCallback,
-    describe_evaluation_set,
-    refused_photos_error,
-)
+from shared.evaluation.ranking import describe_evaluation_set, refused_photos_error
 from shared.evaluation.results import EvaluationResult, EvaluationRun
 
 Result = TypeVar("Result")
 
 
 def evaluate_server(
-    evaluation_set: EvaluationSet,
-    server: str | None,
-    map_name: str | None,
-    key: str | None,
-    depth: int,
-    progress: Progress,
+    evaluation_set: EvaluationSet, target: EvaluationTarget, depth: int, progress: Progress
 ) -> tuple[Rankings, EvaluationRun, dict[str, Any]]:
     """Rank the database photos for each query through a server's HTTP API.
 
     Uploads are idempotent: a repeated evaluation describes no photo twice. No positions are sent,
     so that results depend on image content only.
 
-    Args:
-        evaluation_set: The data set.
-        server: URL of the server; None for the server on PLACEWISE_HOME or an embedded one.
-        map_name: Map for the database photos; None for one named after the set. It is created if
-            it does not exist and must not contain other photos.
-        key: API key.
-        depth: Number of database photos ranked per query.
-        progress: Shows uploads and queries.
+    The map, by default one named after the set, is created if it does not exist. It must not
+    contain other photos.
 
     Returns:
         The rankings, the description of the run, and the descriptor dimension with the median
@@ -79,13 +64,12 @@ def evaluate_server(
         Conflict: `map_holds_others`.
         Unavailable: `answer_short` if the server returns fewer results than requested.
     """
-    name = (
-        map_name or f"evaluate-{re.sub(r'[^a-z0-9]+', '-', evaluation_set.name.lower()).strip('-')}"
-    )
-    with connect(server, None, key) as client:
+    set_name = re.sub(r"[^a-z0-9]+", "-", evaluation_set.name.lower()).strip("-")
+    name = target.map_name or f"evaluate-{set_name}"
+    with connect(target.server, None, target.key) as client:
         if name not in {map_.name for map_ in client.maps()}:
             client.create_map(name)
-    with connect(server, name, key) as client:
+    with connect(target.server, name, target.key) as client:
         retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
         indices_by_file = _upload_database(retrying_client, evaluation_set, name, progress)
         bar = progress.add_task(
@@ -117,14 +101,8 @@ def evaluate_server(
         },
     )
     seconds = [duration for _, duration in responses]
-    return (
-        ranked,
-        run,
-        {
-            "dimension": generation.get("dimension"),
-            "answer_ms_median": 1000 * float(np.median(seconds)),
-        },
-    )
+    median_ms = 1000 * float(np.median(seconds))
+    return ranked, run, {"dimension": generation.get("dimension"), "answer_ms_median": median_ms}
 
 
 def _upload_database(
@@ -280,12 +258,7 @@ def evaluate_sets(
         for evaluation_set in evaluation_sets:
             if target.checkpoint is None and target.extractor is None:
                 ranked, run, figures = evaluate_server(
-                    evaluation_set,
-                    target.server,
-                    target.map_name,
-                    target.key,
-                    options.depth,
-                    progress,
+                    evaluation_set, target, options.depth, progress
                 )
                 result = evaluate_rankings(
                     evaluation_set, ranked, options, has_scores=True, about=figures
@@ -332,7 +305,7 @@ def _evaluate_describer(
     settings: Settings,
     progress: Progress,
 ) -> EvaluationResult:
-    on_progress = progress_bars(progress, evaluation_set.name)
+    on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
     )
@@ -364,15 +337,3 @@ def _evaluate_describer(
     return evaluate_rankings(
         evaluation_set, shown, options, has_scores=True, about=figures, places=places
     )
-
-
-def progress_bars(progress: Progress, name: str) -> ProgressCallback:
-    """Create a progress callback that shows one bar per stage."""
-    bars: dict[str, Any] = {}
-
-    def on_progress(stage: str, done: int, total: int) -> None:
-        if stage not in bars:
-            bars[stage] = progress.add_task(f"{name}: {stage}", total=total)
-        progress.update(bars[stage], completed=done, total=total)
-
-    return on_progress

@@ -17,7 +17,9 @@ from services.cli.descriptors.local_extractor import (
     load_extractor,
     load_own_vocabulary,
     resolve_centres,
+    split_outcomes,
 )
+from services.cli.output import stage_bars
 from services.trainer.model_describer import ModelDescriber
 from shared.config.settings import Settings
 from shared.datasets.dataset import EvaluationSet
@@ -76,12 +78,7 @@ class ExtractorDescriber:
             photos, self._extractor.preprocessing, self._settings, defaultdict(float)
         )
         for batch in batches:
-            pixels = []
-            for photo, outcome in batch:
-                if isinstance(outcome, PlacewiseError):
-                    refused.append((photo, outcome))
-                else:
-                    pixels.append(outcome.pixels)
+            pixels = split_outcomes(batch, refused)
             if refused or not pixels:  # after a failure, only collect further failures
                 continue
             started = time.perf_counter()
@@ -102,10 +99,7 @@ def checkpoint_describer(
 ) -> Describer:
     """Create a describer from a checkpoint.
 
-    Args:
-        checkpoint: Checkpoint of `placewise train`.
-        image_size: `same` (the model's own), `native`, or (height, width) in pixels.
-        settings: Device, batch size, pixel limit and cache.
+    `image_size` is `same` (the model's own), `native`, or (height, width) in pixels.
     """
     loaded = load_checkpoint(checkpoint)
     size = None if image_size == "native" else loaded.config.image_size
@@ -146,14 +140,8 @@ def extractor_describer(
 ) -> Describer:
     """Create a describer from an extractor.
 
-    Args:
-        name: The extractor's name, with options.
-        vocabulary: VLAD vocabulary file, or None.
-        evaluation_set: The set whose photos are described.
-        settings: Device, batch size and cache.
-        progress: Shows a vocabulary fit.
-        fit: Fit the vocabulary on the database photos, never on queries. This is also done if no
-            vocabulary is given or shipped.
+    With `fit`, and if no vocabulary is given or shipped, the vocabulary is fitted on the database
+    photos of the set, never on its queries.
     """
     about: dict[str, Any] = {}
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
@@ -177,18 +165,13 @@ def _fit_vocabulary(
 ) -> ClusterCentres:
     sampled = sample_photos(len(database), FIT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
     photos = [database[index] for index in sampled]
-    bars = {name: progress.add_task(name, total=None) for name in ("vocabulary", "clustering")}
-    names = {"describing": "vocabulary", "clustering": "clustering"}
-    refused: list[dict[str, str]] = []
     fitted = fit_vocabulary(
         extractor,
-        decode_pixels(photos, extractor.preprocessing, settings, refused),
+        decode_pixels(photos, extractor.preprocessing, settings, []),
         len(photos),
         clusters=extractor.config.clusters,
         seed=SEED,
-        on_progress=lambda stage, done, total: progress.update(
-            bars[names[stage]], completed=done, total=total
-        ),
+        on_progress=stage_bars(progress, "vocabulary: "),
     )
     return fitted.centres
 

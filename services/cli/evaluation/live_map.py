@@ -11,7 +11,7 @@ from rich.table import Column
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import Json, Table, console, print_json, print_table, progress_bar
+from services.cli.output import Json, Table, print_json, print_message, print_table, progress_bar
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
@@ -44,11 +44,7 @@ def evaluate_map(
         return
     _print_evaluations(shown, vocabularies)
     if fitted_weights:
-        console.print(
-            f"Word weights: {fitted_weights['outcome']}. {fitted_weights['reason']}",
-            soft_wrap=True,
-            markup=False,
-        )
+        print_message(f"Word weights: {fitted_weights['outcome']}. {fitted_weights['reason']}")
 
 
 def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
@@ -97,7 +93,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
     if places := (figures.get("with_word_weights") or figures).get("places"):
         print_table(answers_table(places))
     for line in _estimate_lines(figures.get("with_word_weights") or figures):
-        console.print(line, soft_wrap=True)
+        print_message(line)
 
 
 def answers_table(places: Json) -> Table:

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import statistics
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
-from rich.table import Column, Table
+from rich.table import Column
 
 from services.cli.environment import read_settings
-from services.cli.evaluation.data_sets import EvaluationTarget, make_describer, progress_bars
-from services.cli.output import console, print_json, progress_bar
+from services.cli.evaluation.data_sets import EvaluationTarget, make_describer
+from services.cli.output import (
+    Json,
+    Table,
+    print_json,
+    print_message,
+    print_table,
+    progress_bar,
+    stage_bars,
+)
 from shared.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
 from shared.evaluation.ranking import describe_evaluation_set
@@ -26,8 +33,6 @@ from shared.evaluation.sequences import (
     split_sequences,
 )
 from shared.tracks.motion import MotionModel, motion_model
-
-Json = dict[str, Any]
 
 METHODS = {
     "single": "single frames",
@@ -101,7 +106,7 @@ def _evaluate_set(
     progress: Progress,
 ) -> Json:
     describer = make_describer(evaluation_set, target, read_settings(), progress)
-    on_progress = progress_bars(progress, evaluation_set.name)
+    on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
     with describe_evaluation_set(
         describer.describe, evaluation_set, on_progress=on_progress
     ) as matrices:
@@ -140,12 +145,10 @@ def _normalise(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _print_figures(name: str, figures: Json) -> None:
-    console.print(
+    print_message(
         f"{name}: {figures['frames']} frames ({figures['frames_outside']} outside the map) against "
         f"{figures['database']} photos; {figures['rule']}; "
-        f"{figures['filter_ms_a_frame']:.1f} ms of CPU time a frame.",
-        soft_wrap=True,
-        markup=False,
+        f"{figures['filter_ms_a_frame']:.1f} ms of CPU time a frame."
     )
     table = Table(
         "method", Column("recall", justify="right"), Column("at 99 % precision", justify="right")
@@ -153,24 +156,20 @@ def _print_figures(name: str, figures: Json) -> None:
     for key, title in METHODS.items():
         precise = figures["recall_at_99_precision"].get(key)
         table.add_row(title, _percent(figures["recall"][key]), _percent(precise))
-    console.print(table)
-    console.print(
+    print_table(table)
+    print_message(
         f"Tracking {_percent(figures['tracking'])} of the frames in the map, of which "
         f"{_percent(figures['tracking_precision'])} are right; calibration error (ECE) "
         f"{figures['calibration_error']:.3f}. Frames to localise: "
         f"{_frame_counts(figures['frames_to_localise'])}; to notice that the map was left: "
         f"{_frame_counts(figures['frames_to_notice_lost'])}; claimed to be tracked outside: "
-        f"{_percent(figures['claimed_outside'])}.",
-        soft_wrap=True,
-        markup=False,
+        f"{_percent(figures['claimed_outside'])}."
     )
     if "kidnapped" in figures:
-        console.print(
+        print_message(
             f"Carried away {figures['kidnapped']} times: "
             f"{_percent(figures['found_within_40_frames'])} are found again within 40 frames; "
-            f"frames: {_frame_counts(figures['frames_until_found'])}.",
-            soft_wrap=True,
-            markup=False,
+            f"frames: {_frame_counts(figures['frames_until_found'])}."
         )
 
 

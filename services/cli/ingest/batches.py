@@ -10,7 +10,7 @@ from rich.progress import Progress, TaskID
 from placewise.answers import BatchItem, BatchStarted, Job
 from placewise.client import Client
 from services.cli.ingest.upload import POLL_SECONDS, fit_vocabulary_if_needed
-from services.cli.output import Json, err_console
+from services.cli.output import Json, print_note
 from shared.errors import InvalidRequest
 from shared.imaging.file_formats import (
     ACCEPTED_ARCHIVES,
@@ -113,7 +113,7 @@ def _wait_until_finished(
             break
         if job.waiting_for and not reported:
             reason = job.waiting_for.replace("_", " ")
-            err_console.print(
+            print_note(
                 f"The batch is waiting for {reason} on the server; it continues automatically."
             )
             reported = True

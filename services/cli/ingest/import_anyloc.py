@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from services.cli.client import connect
 from services.cli.ingest.anyloc_reader import AnylocFolder, read_anyloc_folder
@@ -18,11 +17,10 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    err_console,
     print_failures,
     print_json,
+    print_note,
     progress_bar,
-    report_errors,
 )
 
 DESCRIPTORS_NOTE = (
@@ -64,35 +62,28 @@ def import_anyloc(
 
     DIR is only read. The command is idempotent: run it again after an interruption.
     """
-    with report_errors(as_json):
-        source = read_anyloc_folder(folder, database, uploads)
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            report = _build_report(
-                source, upload_photos(client, source.photos, fit, progress, update=update)
-            )
-        if as_json:
-            print_json(report)
-        else:
-            _print_report(report)
-        if report["refused"] or report["failed"] or report["missing"]:
-            raise typer.Exit(1)
+    source = read_anyloc_folder(folder, database, uploads)
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        report = _build_report(
+            source, upload_photos(client, source.photos, fit, progress, update=update)
+        )
+    if as_json:
+        print_json(report)
+    else:
+        _print_report(report)
+    if report["refused"] or report["failed"] or report["missing"]:
+        raise typer.Exit(1)
 
 
 def _build_report(source: AnylocFolder, uploaded: Json) -> Json:
     return {
         "database": str(source.database),
         "rows": source.rows,
-        "photos": uploaded["photos"],
         "unlisted": source.unlisted,
-        "imported": uploaded["uploaded"],
-        "already_there": uploaded["already_there"],
+        "imported": uploaded.pop("uploaded"),
         "missing": source.missing,
         "duplicates": source.duplicates,
-        "refused": uploaded["refused"],
-        "failed": uploaded["failed"],
-        "searchable": uploaded["searchable"],
-        "vocabulary": uploaded["vocabulary"],
-        "fitted": uploaded["fitted"],
+        **uploaded,
         "notes": [DESCRIPTORS_NOTE, *_vocabulary_note(source)],
     }
 
@@ -112,17 +103,16 @@ def _vocabulary_note(source: AnylocFolder) -> list[str]:
 
 def _print_report(report: Json) -> None:
     for note in report["notes"]:
-        err_console.print(escape(note), soft_wrap=True)
-    err_console.print(
+        print_note(note)
+    print_note(
         f"{report['rows']} database rows: {report['imported']} photos imported, "
         f"{report['already_there']} already stored, {len(report['duplicates'])} duplicates, "
         f"{len(report['missing'])} missing, {len(report['refused'])} refused. "
-        f"{report['unlisted']} photos had no database row.",
-        soft_wrap=True,
+        f"{report['unlisted']} photos had no database row."
     )
-    err_console.print(
+    print_note(
         f"The map now has {report['searchable']} searchable photos "
         f"(vocabulary: {report['vocabulary']})."
     )
     print_failures(report, "missing", "duplicates", "refused", "failed")
-    err_console.print(f"Next: {sys.argv[0]} query PHOTO")
+    print_note(f"Next: {sys.argv[0]} query PHOTO")

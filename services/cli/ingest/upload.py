@@ -6,10 +6,10 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from placewise.answers import FINISHED, Job, Stats, Uploaded
@@ -17,7 +17,7 @@ from placewise.client import Client
 from services.cli.descriptors.vocabulary import fit_and_wait
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
-from services.cli.output import Json, err_console, printable_path
+from services.cli.output import Json, print_note, printable_path
 from shared.errors import Conflict, NotFound, PlacewiseError
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 
@@ -56,13 +56,8 @@ def upload_photos(
 
     The operation is idempotent: a photo that is already stored is not described again.
 
-    Args:
-        client: Client of the map.
-        photos: Photos to upload.
-        fit: Fit a vocabulary if the map has none of its own and enough photos.
-        progress: Shows uploads and jobs.
-        update: Change the metadata of stored photos that differ; otherwise such photos are refused.
-        journal: Skips the uploads recorded in it and records new ones.
+    With `update`, the metadata of stored photos that differ is changed; otherwise such photos are
+    refused. Uploads that the journal records are skipped, and new ones are recorded.
 
     Returns:
         Counts (`photos`, `uploaded`, `already_there`, and `searchable` in the whole map), the
@@ -82,7 +77,7 @@ def upload_photos(
         )
         if error.code not in reported_codes:
             reported_codes.add(error.code)
-            err_console.print(f"Retrying: {escape(error.detail)}", soft_wrap=True)
+            print_note(f"Retrying: {error.detail}")
 
     reported_codes: set[str] = set()
     retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, show_wait)
@@ -142,11 +137,6 @@ def fit_vocabulary_if_needed(
 ) -> tuple[Stats, Job | None]:
     """Fit a vocabulary if the map has none of its own and enough photos.
 
-    Args:
-        client: Client of the map.
-        stats: The map's current statistics.
-        progress: Shows the job.
-
     Returns:
         The map's statistics afterwards, and the job of the fit or None.
     """
@@ -161,10 +151,7 @@ def _upload_concurrently(
 ) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
     def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
         fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
-
-        def send() -> Uploaded:
-            return client.upload(photo.path, filename=photo.name, **fields)
-
+        send = partial(client.upload, photo.path, filename=photo.name, **fields)
         try:
             try:
                 return send()

@@ -8,7 +8,7 @@ when a command runs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,12 +19,13 @@ from rich.markup import escape
 from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
-    console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_result,
     progress_bar,
-    report_errors,
+    stage_bars,
 )
 
 if TYPE_CHECKING:
@@ -45,28 +46,25 @@ def backup(
     The exit code is 1 if an object that the catalog refers to is missing or damaged. The backup
     then contains everything else.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import back_up
 
         manifest = back_up(read_settings(), out, progress)
     if as_json:
         print_json(asdict(manifest))
     else:
-        console.print(
+        print_message(
             f"Backed up {sum(manifest.rows.values())} rows and {manifest.objects} objects "
-            f"({manifest.object_bytes / 1e6:.1f} MB) to {escape(str(out))} as of "
-            f"{manifest.made_at}",
-            soft_wrap=True,
+            f"({manifest.object_bytes / 1e6:.1f} MB) to {out!s} as of "
+            f"{manifest.made_at}"
         )
         for state, keys in (("missing", manifest.missing), ("damaged", manifest.damaged)):
             for key in keys[:MAX_KEYS_SHOWN]:
                 err_console.print(f"[red]{state}[/red] {escape(key)}", soft_wrap=True)
             if len(keys) > MAX_KEYS_SHOWN:
-                err_console.print(
-                    f"{len(keys)} objects are {state}. backup.json lists all of them."
-                )
+                print_note(f"{len(keys)} objects are {state}. backup.json lists all of them.")
     if manifest.missing or manifest.damaged:
-        err_console.print("Run `placewise verify` for details and remedies.")
+        print_note("Run `placewise verify` for details and remedies.")
         raise typer.Exit(1)
 
 
@@ -78,7 +76,7 @@ def restore(
 
     An interrupted restore resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations import maintenance
 
         manifest, restored = maintenance.restore(read_settings(), source, progress)
@@ -94,20 +92,7 @@ def restore(
 def progress_reporter() -> Iterator[BackupProgress]:
     """Show a progress bar per stage."""
     with progress_bar() as bars:
-        yield _make_reporter(bars.add_task, bars.update)
-
-
-def _make_reporter(
-    add_task: Callable[..., object], update: Callable[..., object]
-) -> BackupProgress:
-    tasks: dict[str, object] = {}
-
-    def report(stage: str, done: int, total: int) -> None:
-        if stage not in tasks:
-            tasks[stage] = add_task(stage, total=total)
-        update(tasks[stage], completed=done, total=total)
-
-    return report
+        yield stage_bars(bars)
 
 
 NOT_RECOVERED_NOTE = (
@@ -122,7 +107,7 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     Recovers photos with their metadata, maps, generations and vocabularies. An interrupted rebuild
     resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import rebuild
 
         taken = rebuild(read_settings(), progress)
@@ -130,49 +115,43 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
         print_json(asdict(taken))
         return
     print_taken_in(taken)
-    err_console.print(NOT_RECOVERED_NOTE, soft_wrap=True)
+    print_note(NOT_RECOVERED_NOTE)
 
 
 def print_taken_in(taken: RecoveryReport) -> None:
     """Print what was recovered into the catalog and what was not."""
-    console.print(
+    print_message(
         f"Recovered {taken.photos + taken.unnamed_photos} photos in {taken.maps} new maps, with "
         f"{taken.descriptors} descriptors in {taken.chunks} chunks, {taken.generations} "
         f"generations and {taken.vocabularies} vocabularies. {taken.queued_photos} photos are "
-        "queued for description.",
-        soft_wrap=True,
+        "queued for description."
     )
     if taken.changed_photos or taken.deleted_photos:
-        console.print(
+        print_message(
             f"The journal's changes were applied: {taken.changed_photos} photos updated, "
             f"{taken.deleted_photos} deleted."
         )
     for old, new in taken.renamed_maps.items():
-        err_console.print(
-            f"Another map is named {escape(old)}. The journal's map was renamed to {new}."
-        )
+        print_note(f"Another map is named {old}. The journal's map was renamed to {new}.")
     if taken.unnamed_photos:
-        err_console.print(
+        print_note(
             f"{taken.unnamed_photos} photos are not in the journal. They were added to the map "
             "default with coordinates, heading and time from EXIF. Their file names, place labels, "
-            "tags, metadata, roles and maps, and values that overrode EXIF, are lost.",
-            soft_wrap=True,
+            "tags, metadata, roles and maps, and values that overrode EXIF, are lost."
         )
     if taken.unnamed_descriptors:
-        err_console.print(
+        print_note(
             f"{taken.unnamed_descriptors} descriptors belong to generations that are not in the "
-            "journal and can't be assigned to photos.",
-            soft_wrap=True,
+            "journal and can't be assigned to photos."
         )
     if taken.lost_originals:
-        err_console.print(
+        print_note(
             f"{taken.lost_originals} photos of the journal have no original in the store and were "
             "not recovered: they were deleted just before the catalog was lost, or their files are "
-            "missing.",
-            soft_wrap=True,
+            "missing."
         )
     if taken.doubled_photos:
-        err_console.print(f"{taken.doubled_photos} photos are already stored under another ID.")
+        print_note(f"{taken.doubled_photos} photos are already stored under another ID.")
     for problem, keys in (
         ("journal segments can't be read. Restore them from a backup", taken.damaged_segments),
         ("chunks are damaged. Their photos will be described again", taken.damaged_chunks),
@@ -181,4 +160,4 @@ def print_taken_in(taken: RecoveryReport) -> None:
         if keys:
             listed = ", ".join(keys[:MAX_KEYS_SHOWN])
             listed += " ..." if len(keys) > MAX_KEYS_SHOWN else ""
-            err_console.print(f"{len(keys)} {problem}: {escape(listed)}", soft_wrap=True)
+            print_note(f"{len(keys)} {problem}: {listed}")

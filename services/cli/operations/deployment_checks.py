@@ -7,8 +7,10 @@ and raises a PlacewiseError whose `detail` says what to do.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import defaultdict
+from collections.abc import Iterator
 from datetime import UTC, datetime
 
 import httpx2
@@ -33,6 +35,25 @@ OVERDUE_LEASE_SECONDS = 30.0
 SEARCH_TIMEOUT_SECONDS = 5.0
 MAX_LAG_SECONDS = 30.0
 MAX_NAMED_CHUNKS = 10
+SEE_POSTGRES = "See the check postgresql."
+
+
+@contextlib.contextmanager
+def open_for_check(settings: Settings, advice: str) -> Iterator[Catalog]:
+    """Open the catalog of the settings.
+
+    Raises:
+        Unavailable: The database can't be reached.
+        Misconfigured: `catalog_unreadable` with `advice`, for its other errors.
+    """
+    with contextlib.closing(open_catalog(settings, "doctor")) as catalog:
+        try:
+            yield catalog
+        except SQLAlchemyError as error:
+            raise explain_outage(error) or Misconfigured(
+                "catalog_unreadable",
+                f"The catalog can't be read ({type(error).__name__}). {advice}",
+            ) from error
 
 
 def check_search(settings: Settings) -> str:
@@ -99,14 +120,8 @@ def check_processes(settings: Settings, role: str) -> str:
     Raises:
         Unavailable: `nobody_there`.
     """
-    catalog = open_catalog(settings, "doctor")
-    try:
-        with catalog.read() as session:
-            processes = [p for p in list_processes(session) if p.role == role]
-    except SQLAlchemyError as error:
-        raise _catalog_error(error) from error
-    finally:
-        catalog.close()
+    with open_for_check(settings, SEE_POSTGRES) as catalog, catalog.read() as session:
+        processes = [p for p in list_processes(session) if p.role == role]
     live = [process for process in processes if process.is_live]
     if live:
         return _names_by_release(live)
@@ -127,13 +142,10 @@ def check_steward(settings: Settings) -> str:
         Unavailable: `nobody_there`, `leases_overdue`.
     """
     summary = check_processes(settings, "steward")
-    catalog = open_catalog(settings, "doctor")
-    try:
-        overdue = _count_overdue_leases(catalog)
-    except SQLAlchemyError as error:
-        raise _catalog_error(error) from error
-    finally:
-        catalog.close()
+    is_overdue = Job.lease_until < db_now_plus(-OVERDUE_LEASE_SECONDS)
+    count = select(func.count()).where(Job.state.in_(UNFINISHED_STATES), is_overdue)
+    with open_for_check(settings, SEE_POSTGRES) as catalog, catalog.read() as session:
+        overdue = session.scalar(count)
     if overdue:
         raise Unavailable(
             "leases_overdue",
@@ -177,21 +189,6 @@ def check_gateway(server: str, key: str | None) -> str:
     )
 
 
-def _count_overdue_leases(catalog: Catalog) -> int:
-    with catalog.read() as session:
-        return (
-            session.scalar(
-                select(func.count())
-                .select_from(Job)
-                .where(
-                    Job.state.in_(UNFINISHED_STATES),
-                    Job.lease_until < db_now_plus(-OVERDUE_LEASE_SECONDS),
-                )
-            )
-            or 0
-        )
-
-
 def _names_by_release(processes: list[ProcessStatus]) -> str:
     by_release: dict[str, list[str]] = defaultdict(list)
     for process in processes:
@@ -199,13 +196,6 @@ def _names_by_release(processes: list[ProcessStatus]) -> str:
     return "; ".join(
         f"{len(names)} of release {release}: {', '.join(names)}"
         for release, names in sorted(by_release.items())
-    )
-
-
-def _catalog_error(error: SQLAlchemyError) -> PlacewiseError:
-    return explain_outage(error) or Misconfigured(
-        "catalog_unreadable",
-        f"The catalog can't be queried ({type(error).__name__}). See the check postgresql.",
     )
 
 
@@ -224,8 +214,8 @@ def check_postgres(settings: Settings) -> str:
             `check_schema`.
         Unavailable: The database can't be reached.
     """
-    catalog = open_catalog(settings, "doctor")
-    try:
+    advice = "Check DATABASE_URL and the privileges of its user."
+    with open_for_check(settings, advice) as catalog:
         with catalog.read() as session:
             number = int(session.scalar(text("SHOW server_version_num")) or 0)
             now = session.execute(select(db_now())).scalar_one()
@@ -235,14 +225,6 @@ def check_postgres(settings: Settings) -> str:
                 f"PostgreSQL {number // 10000} is too old. Upgrade to 14 or newer.",
             )
         check_schema(catalog)
-    except SQLAlchemyError as error:
-        raise explain_outage(error) or Misconfigured(
-            "catalog_unreadable",
-            f"PostgreSQL rejected the query ({type(error).__name__}). Check DATABASE_URL and the "
-            "privileges of its user.",
-        ) from error
-    finally:
-        catalog.close()
     skew = (datetime.now(UTC) - now).total_seconds()
     _check_clock_skew("PostgreSQL", skew)
     return (

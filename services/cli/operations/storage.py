@@ -19,8 +19,9 @@ from services.cli.output import (
     console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_result,
-    report_errors,
 )
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def verify(
     The exit code is 1 if a fault is found, even if it is repaired. If the catalog is older than the
     object store, --repair also recovers the missing records from the store's journal.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import verify_storage
 
         result = verify_storage(read_settings(), progress, originals=originals, repair=repair)
@@ -93,23 +94,20 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
     checked = ", ".join(f"{count} {kind}s" for kind, count in sorted(report.checked.items()))
-    console.print(
+    print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
-        f"{len(report.faults)} faults",
-        soft_wrap=True,
+        f"{len(report.faults)} faults"
     )
     if report.orphans:
-        console.print(
+        print_message(
             f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are not in the "
             "catalog: uploads in progress or left by a crash. The steward moves old ones to the "
-            "trash.",
-            soft_wrap=True,
+            "trash."
         )
     if report.trash_objects:
-        console.print(
+        print_message(
             f"{report.trash_objects} objects ({report.trash_bytes / 1e6:.1f} MB) are in the trash. "
-            "`placewise storage restore-trash` restores them.",
-            soft_wrap=True,
+            "`placewise storage restore-trash` restores them."
         )
     for fault in report.faults[:MAX_FAULTS_SHOWN]:
         console.print(
@@ -117,17 +115,17 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
             soft_wrap=True,
         )
     if len(report.faults) > MAX_FAULTS_SHOWN:
-        console.print(
+        print_message(
             f"and {len(report.faults) - MAX_FAULTS_SHOWN} more. --json lists all of them."
         )
     repaired = {"chunk", "manifest", "photo"} if queued is not None else set()
     for kind in dict.fromkeys(fault.what for fault in report.faults):
         if kind not in repaired:
-            err_console.print(f"{kind}s: {REMEDIES[kind]}", soft_wrap=True)
+            print_note(f"{kind}s: {REMEDIES[kind]}")
     if queued is not None:
-        console.print(f"Queued {queued} photos for description.")
+        print_message(f"Queued {queued} photos for description.")
     if any(f.wrong == "missing" and f.what == "original" for f in report.faults):
-        err_console.print("Photos without their originals can't be described again.")
+        print_note("Photos without their originals can't be described again.")
 
 
 app = typer.Typer(
@@ -145,11 +143,10 @@ def create_bucket_command(as_json: JsonOption = False) -> None:
 
     S3_ACCESS_KEY must be allowed to create buckets. Placewise itself does not need this permission.
     """
-    with report_errors(as_json):
-        from shared.storage.s3 import Bucket, create_bucket  # importing minio is slow
+    from shared.storage.s3 import Bucket, create_bucket  # importing minio is slow
 
-        bucket = Bucket.from_settings(read_settings())
-        created = create_bucket(bucket)
+    bucket = Bucket.from_settings(read_settings())
+    created = create_bucket(bucket)
     state = "was created" if created else "already exists"
     print_result(
         {"bucket": bucket.name, "endpoint": bucket.endpoint, "made": created},
@@ -166,23 +163,21 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     services with the previous catalog refuse to start afterwards. Objects that are not in this
     catalog are kept until you run `placewise storage collect --confirm`.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import adopt_storage
+    from services.cli.operations.maintenance import adopt_storage
 
-        count = adopt_storage(read_settings(), confirm=confirm)
+    count = adopt_storage(read_settings(), confirm=confirm)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
+    print_message(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
     _print_orphans(count)
     if confirm:
-        console.print("This catalog is now the owner of the store.")
+        print_message("This catalog is now the owner of the store.")
     else:
-        console.print(
+        print_message(
             "Nothing was changed. Pass --confirm to make this catalog the owner. Services with "
             "another catalog then refuse to start with this store. Objects that are not in the "
-            "catalog are kept but not searchable, until `placewise storage collect --confirm`.",
-            soft_wrap=True,
+            "catalog are kept but not searchable, until `placewise storage collect --confirm`."
         )
 
 
@@ -193,26 +188,25 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
     overrides a hold on garbage collection. Services can keep running.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import collect_storage
+    from services.cli.operations.maintenance import collect_storage
 
-        settings = read_settings()
-        count, moved, hold = collect_storage(settings, confirm=confirm)
+    settings = read_settings()
+    count, moved, hold = collect_storage(settings, confirm=confirm)
     if as_json:
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
         return
-    console.print(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
+    print_message(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
     _print_orphans(count)
     if confirm:
-        console.print(
+        print_message(
             f"Moved {moved} objects to the trash. They are deleted after "
             f"{settings.trash_days:g} days (TRASH_DAYS)."
         )
         return
     if hold is not None:
-        console.print(f"Garbage collection is on hold: {escape(hold.describe())}", soft_wrap=True)
-    console.print("Nothing was changed. Pass --confirm to move them to the trash.")
+        print_message(f"Garbage collection is on hold: {hold.describe()}")
+    print_message("Nothing was changed. Pass --confirm to move them to the trash.")
 
 
 @app.command("restore-trash")
@@ -231,17 +225,16 @@ def restore(
     ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise rebuild-catalog`
     rebuilds a catalog from all objects.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import restore_from_trash
+    from services.cli.operations.maintenance import restore_from_trash
 
-        counts = restore_from_trash(read_settings(), prefix)
+    counts = restore_from_trash(read_settings(), prefix)
     restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})
         return
-    console.print(f"Restored {restored} objects to their keys.")
+    print_message(f"Restored {restored} objects to their keys.")
     if skipped:
-        console.print(f"{skipped} objects stay in the trash: their keys are in use again.")
+        print_message(f"{skipped} objects stay in the trash: their keys are in use again.")
 
 
 def _as_dict(count: StoreCount) -> dict[str, Any]:
@@ -254,4 +247,4 @@ def _as_dict(count: StoreCount) -> dict[str, Any]:
 
 def _print_orphans(count: StoreCount) -> None:
     for prefix, number in sorted(count.orphans.items()):
-        console.print(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")
+        print_message(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")

@@ -26,19 +26,19 @@ from rich.table import Column
 
 from services.cli.environment import require_packages
 from services.cli.output import (
+    Json,
     JsonOption,
     Table,
     console,
     err_console,
     print_json,
+    print_message,
+    print_note,
     print_table,
-    report_errors,
 )
 from services.cli.training.options import given_options, with_training_options
 from services.trainer.arguments import build_arguments, load_yaml
 from shared.errors import InvalidRequest
-
-Json = dict[str, Any]
 
 LOG_INTERVAL_SECONDS = 60.0
 """Interval of progress lines if stderr is not a terminal, where bars would not be visible."""
@@ -75,7 +75,7 @@ class TerminalDisplay:
         self._bars.stop()
 
     def info(self, text: str) -> None:
-        err_console.print(escape(text), soft_wrap=True)
+        print_note(text)
 
     def warn(self, text: str) -> None:
         err_console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True)
@@ -116,17 +116,14 @@ def print_summary(report: Json) -> None:
             )
         print_table(table)
     best = report["best"]
-    console.print(
-        f"Checkpoint: {best['path']} ({best['dimension']} dimensions, {best['fingerprint'][:12]})",
-        soft_wrap=True,
-        markup=False,
+    print_message(
+        f"Checkpoint: {best['path']} ({best['dimension']} dimensions, {best['fingerprint'][:12]})"
     )
     if "images" in report and report["images_per_second"]:
-        console.print(
+        print_message(
             f"Trained on {report['images']} photos ({report['images_per_second']:.1f}/s; "
             f"{report['share_waiting_for_data']:.1%} of the time waiting for data). "
-            f"{len(report['bad_photos'])} photos could not be decoded.",
-            soft_wrap=True,
+            f"{len(report['bad_photos'])} photos could not be decoded."
         )
     console.print("Next:", *(f"  {line}" for line in report["next"]), sep="\n", markup=False,
                   soft_wrap=True)  # fmt: skip
@@ -168,9 +165,8 @@ def train(
     False. Option names may contain hyphens or underscores. A run stopped with Ctrl-C can be
     continued with --resume.
     """
-    with report_errors(as_json):
-        require_packages(*TRAINING_PACKAGES)
-        report = _run_training(config, resume, given_options(arguments))
+    require_packages(*TRAINING_PACKAGES)
+    report = _run_training(config, resume, given_options(arguments))
     if as_json:
         print_json(report)
     else:
@@ -192,7 +188,7 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
             layers = [load_yaml(config)] if config is not None else []
             return run.run(build_arguments(*layers, overrides), display, stop)
         except RunStopped as stopped:
-            err_console.print(str(stopped), markup=False, soft_wrap=True)
+            print_note(str(stopped))
             raise typer.Exit(EXIT_INTERRUPTED) from stopped
 
 
@@ -219,9 +215,8 @@ def grid(
     grid continues, unless no other run can start for the same reason. Options of `placewise train`
     override those of every run.
     """
-    with report_errors(as_json):
-        require_packages(*TRAINING_PACKAGES)
-        failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
+    require_packages(*TRAINING_PACKAGES)
+    failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
     if failed:
         raise typer.Exit(1)
 
@@ -248,7 +243,7 @@ def _run_grid_command(
         obstacles = find_grid_obstacles(plan)
         for obstacle, blocked in obstacles.items():
             names = ", ".join(blocked) if len(blocked) < len(plan.runs) else "every run"
-            err_console.print(f"{names} can't start: {obstacle}", markup=False, soft_wrap=True)
+            print_note(f"{names} can't start: {obstacle}")
         return len(obstacles)
 
     def write(outcomes: list[RunOutcome]) -> None:
@@ -259,16 +254,14 @@ def _run_grid_command(
         try:
             outcomes = run_grid(plan, out, display, stop, write)
         except RunStopped as stopped:
-            err_console.print(
-                "Stopped. Run the same command again to continue the grid.", soft_wrap=True
-            )
+            print_note("Stopped. Run the same command again to continue the grid.")
             raise typer.Exit(EXIT_INTERRUPTED) from stopped
     write(outcomes)
     if as_json:
         print_json([asdict(outcome) for outcome in outcomes])
     else:
         _print_rows(leaderboard(plan, outcomes), False)
-        console.print(f"Wrote {out}/leaderboard.csv and {out}/leaderboard.md", markup=False)
+        print_message(f"Wrote {out}/leaderboard.csv and {out}/leaderboard.md")
     return sum(outcome.state is not RunState.FINISHED for outcome in outcomes)
 
 

@@ -13,6 +13,7 @@ import tarfile
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from typing import IO, Any
 
 import numpy as np
@@ -34,18 +35,17 @@ router = APIRouter(tags=["models"])
 
 SPOOL_BYTES = 8 * 1024 * 1024  # larger tables are spooled to a temporary file
 STREAM_READ_BYTES = 256 * 1024
-CSV_COLUMNS = (
-    "row",
-    "image_id",
-    "filename",
-    "latitude",
-    "longitude",
-    "heading",
-    "captured_at",
-    "place",
-    "role",
-    "relative_path",
+PHOTO_COLUMNS = (
+    Photo.filename,
+    Photo.latitude,
+    Photo.longitude,
+    Photo.heading,
+    Photo.captured_at,
+    Photo.place,
+    Photo.role,
+    Photo.relative_path,
 )
+CSV_HEADER = ("row", "image_id", *(column.key for column in PHOTO_COLUMNS))
 TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
@@ -91,15 +91,12 @@ def export_descriptors(
 
     def stream() -> Iterator[bytes]:
         with files:
-            for (name, size_bytes), content in zip(
-                members,
-                (
-                    _read_blocks(table),
-                    _read_blocks(names),
-                    _stream_rows(gateway.store, header, chunks),
-                ),
-                strict=True,
-            ):
+            contents = (
+                _read_blocks(table),
+                _read_blocks(names),
+                _stream_rows(gateway.store, header, chunks),
+            )
+            for (name, size_bytes), content in zip(members, contents, strict=True):
                 entry = tarfile.TarInfo(name)
                 entry.size, entry.mtime = size_bytes, int(generation.created_at.timestamp())
                 yield entry.tobuf(tarfile.GNU_FORMAT)
@@ -127,18 +124,7 @@ def _write_tables(
     number = 0
     for chunk in list_live_chunks(session, generation.id):
         photo_rows = session.execute(
-            select(
-                Descriptor.row,
-                Photo.id,
-                Photo.filename,
-                Photo.latitude,
-                Photo.longitude,
-                Photo.heading,
-                Photo.captured_at,
-                Photo.place,
-                Photo.role,
-                Photo.relative_path,
-            )
+            select(Descriptor.row, Photo.id, *PHOTO_COLUMNS)
             .join(Photo, Photo.id == Descriptor.photo_id)
             .where(Descriptor.chunk_id == chunk.id, Photo.deleted_at.is_(None))
             .order_by(Descriptor.row)
@@ -146,22 +132,17 @@ def _write_tables(
         lines = io.StringIO(newline="")
         writer = csv.writer(lines)
         if not chunks:
-            writer.writerow(CSV_COLUMNS)
+            writer.writerow(CSV_HEADER)
         for photo in photo_rows:
-            captured = photo.captured_at.isoformat() if photo.captured_at else None
-            writer.writerow(
-                [
-                    *(number, photo.id, photo.filename, photo.latitude, photo.longitude),
-                    *(photo.heading, captured, photo.place, str(photo.role), photo.relative_path),
-                ]
-            )
+            values = (v.isoformat() if isinstance(v, datetime) else v for v in photo[1:])
+            writer.writerow([number, *values])
             # A file name may contain line breaks.
             names.write(" ".join(photo.filename.splitlines()).encode() + b"\n")
             number += 1
         table.write(lines.getvalue().encode())
         chunks.append(_ChunkRows(chunk.object_key, chunk.sha256, [row[0] for row in photo_rows]))
     if not chunks:
-        table.write(",".join(CSV_COLUMNS).encode() + b"\r\n")
+        table.write(",".join(CSV_HEADER).encode() + b"\r\n")
     return chunks
 
 
@@ -178,7 +159,7 @@ def _stream_rows(store: ObjectStore, header: bytes, chunks: list[_ChunkRows]) ->
         if chunk.rows:
             rows = read_chunk(store, chunk.object_key, chunk.sha256)
             for row in chunk.rows:
-                yield rows[row].tobytes()
+                yield rows[row].astype(np.float32).tobytes()
 
 
 def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:

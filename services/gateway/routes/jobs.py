@@ -23,6 +23,7 @@ from services.gateway.dependencies import (
     MapPageParams,
     MapParams,
     MapQuery,
+    load_job_of_map,
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentDep
@@ -30,7 +31,7 @@ from services.gateway.schemas import JobResponse, JobsResponse
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
-from shared.jobs import Job, JobKind, JobState
+from shared.jobs import JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry_job
 from shared.jobs.wakeups import queue_for_priority
@@ -70,7 +71,7 @@ async def read_job_status(
     gateway: GatewayDep, job_id: JobId, query: Annotated[JobStatusParams, Query()]
 ) -> JobResponse:
     """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
-    job = await run_in_threadpool(_load_job_of_map, gateway, query.map, job_id)
+    job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
     if query.wait and job.state in UNFINISHED_STATES:
         seconds = min(query.wait, gateway.settings.max_wait_seconds)
         job = await wait_for_job(gateway, job_id, seconds) or job
@@ -97,7 +98,7 @@ async def stream_job_events(
 
     If too many streams are open (429, `too_many_event_streams`), poll the job instead.
     """
-    job = await run_in_threadpool(_load_job_of_map, gateway, query.map, job_id)
+    job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
     return StreamingResponse(
         _events(gateway, job_id, JobResponse.of(job, query.map), query.map),
         media_type="text/event-stream",
@@ -145,11 +146,6 @@ def retry_job_by_id(
         idempotent.store_response(session, 200, response)
     gateway.wakeups.send(queue_for_priority(job.priority))
     return response
-
-
-def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job:
-    with gateway.catalog.read() as session:
-        return get_job(session, get_map(session, map_name).id, job_id)
 
 
 async def _events(

@@ -15,7 +15,7 @@ from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import RequestModel, ResponseModel
-from shared.catalog.generations import active_generation
+from shared.catalog.generations import RowType, active_generation
 from shared.catalog.maps import (
     DEFAULT_MAP,
     MAP_NAME_PATTERN,
@@ -61,6 +61,11 @@ class CreateMapRequest(RequestModel):
         description="whether `/` separates the levels of place labels, as in "
         "`tower/floor 7/elevator`",
     )
+    rows: RowType | None = Field(
+        None,
+        description="type of the stored descriptors: float32, or float16 in half the space; "
+        "omitted: the default of the server",
+    )
 
     @field_validator("name")
     @classmethod
@@ -74,7 +79,12 @@ class CreateMapRequest(RequestModel):
 
 
 class UpdateMapRequest(RequestModel):
-    place_labels_are_paths: bool
+    place_labels_are_paths: bool | None = Field(None, description="omitted: unchanged")
+    rows: RowType | None = Field(
+        None,
+        description="type of the stored descriptors of generations that are created from now on; "
+        "omitted: unchanged",
+    )
 
 
 class MapResponse(ResponseModel):
@@ -96,6 +106,10 @@ class MapResponse(ResponseModel):
     pca_from: int | None = Field(description="dimension before PCA; null without PCA")
     place_labels_are_paths: bool = Field(
         description="whether `/` separates the levels of place labels"
+    )
+    rows: RowType = Field(
+        description="type of the stored descriptors, `float32` or `float16`, of new generations; "
+        "GET /generations has the one of each generation"
     )
     created_at: datetime
 
@@ -135,6 +149,7 @@ def create_new_map(
             body.name,
             config.name,
             place_labels_are_paths=body.place_labels_are_paths,
+            row_type=body.rows or RowType(settings.descriptor_rows),
         )
         response = _map_response(session, map_)
         idempotent.store_response(session, 201, response)
@@ -150,14 +165,19 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
 
 @router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
-    """Change whether the map's place labels are paths.
+    """Change whether the map's place labels are paths, and the type of its stored descriptors.
 
-    The probabilities of its estimates are those of the prior until the next evaluation.
+    After a change of the labels, the probabilities of its estimates are those of the prior until
+    the next evaluation. A change of `rows` applies to generations that are created from now on:
+    POST /generations creates one.
     """
 
     def update(session: Session) -> MapResponse:
         map_ = lock_map(session, get_map(session, name).id)
-        map_.place_labels_are_paths = body.place_labels_are_paths
+        if body.place_labels_are_paths is not None:
+            map_.place_labels_are_paths = body.place_labels_are_paths
+        if body.rows is not None:
+            map_.row_type = body.rows
         session.flush()
         return _map_response(session, map_)
 
@@ -176,7 +196,10 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
         cancel_jobs(session, Job.map_id == map_.id)
         mark_map_deleted(session, map_)
         if name == DEFAULT_MAP:
-            get_or_create_default_map(session, gateway.settings.new_map_extractor)
+            settings = gateway.settings
+            get_or_create_default_map(
+                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
+            )
 
     gateway.catalog.run(remove)
     return DeletedMapResponse(success=True, message=f"The map {name} is deleted.", deleted_map=name)
@@ -198,5 +221,6 @@ def _map_response(session: Session, map_: Map) -> MapResponse:
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
         place_labels_are_paths=map_.place_labels_are_paths,
+        rows=RowType(map_.row_type),
         created_at=map_.created_at,
     )

@@ -29,7 +29,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
 from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import multipart_schema, use_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
@@ -89,32 +89,34 @@ async def upload_photo(
     with `Prefer: wait=N`, 201 once the photo is searchable. If the map already has the same bytes,
     the existing photo is returned (200), or queued again after a failed job (202).
     """
+    key_id = get_caller(request).key_id
+    quota = reserve_photo_quota(request, gateway.settings)
+
+    def store_row(received: StoredUpload) -> tuple[StoreResult, str]:
+        def store_response(session: Session, stored: StoreResult) -> StoreResult:
+            outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
+            idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
+            return stored
+
+        idempotent.claim_received(gateway.store, received)
+        stored = _store_upload(gateway, query.map, received, key_id, quota, store_response)
+        return stored, received.key
+
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        received = await store_form_file(
+        stored, key = await use_form_file(
             request,
             gateway.store,
             lambda filename: new_original_key(photo_suffix(filename)),
             gateway.settings.max_file_size,
+            store_row,
             check_photo_signature,
         )
-    await idempotent.claim_form(gateway.store, received)
-
-    def store_response(session: Session, stored: StoreResult) -> StoreResult:
-        outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
-        idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-        return stored
-
-    key_id = get_caller(request).key_id
-    quota = reserve_photo_quota(request, gateway.settings)
-    stored = await run_in_threadpool(
-        _store_upload, gateway, query.map, received, key_id, quota, store_response
-    )
 
     def replace_response(outcome: UploadOutcome) -> None:
         idempotent.replace_response(outcome.status, outcome.body, outcome.headers)
 
     return await respond_to_upload(
-        request, response, gateway, query.map, stored, received.key, replace_response
+        request, response, gateway, query.map, stored, key, replace_response
     )
 
 
@@ -128,13 +130,9 @@ class UploadOutcome:
 
     @classmethod
     def of(cls, stored: StoreResult, job: Job | None, key: str, map_name: str) -> UploadOutcome:
-        """Build the response.
+        """Build the response from the photo's job in its current state, if any.
 
-        Args:
-            stored: The stored or existing photo.
-            job: Its job in the current state, if any.
-            key: Object key of the received bytes.
-            map_name: Map of the photo.
+        `key` is the object key of the received bytes.
         """
         status_url = url_in_map(
             f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
@@ -168,15 +166,8 @@ async def respond_to_upload(
 ) -> UploadResponse:
     """Build the response to an upload, after waiting for its job if the request prefers it.
 
-    Args:
-        request: Its `Prefer: wait=N` sets how long to wait.
-        response: Gets the status and the headers.
-        gateway: The gateway context.
-        map_name: Map of the photo.
-        stored: The stored or existing photo.
-        key: Object key of the received bytes.
-        on_described: Called in a worker thread with the 201 response if the photo was described
-            within the wait, to store it for repetitions of the request.
+    `on_described` is called in a worker thread with the 201 response if the photo was described
+    within the wait, to store it for repetitions of the request.
     """
     job = stored.job
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)

@@ -34,12 +34,9 @@ def estimate_place(
 ) -> EstimateResponse:
     """Estimate the place that a ranking points to.
 
-    Args:
-        calibration: Calibration of this kind of ranking (plain, or by word weights), if any.
-        ranking: The hits of the search, best first.
-        unfiltered_ranking: The hits without the filter. The evidence for the place is computed
-            from them, because the calibration was learnt without filters.
-        radius_m: Photos within this radius in metres show the same place.
+    The calibration is that of this kind of ranking (plain, or by word weights). The evidence is
+    computed from the hits without the filter, because the calibration was learnt without filters.
+    Photos within `radius_m` metres show the same place.
     """
     state = calibration.state if calibration else "uncalibrated"
     evidence = (
@@ -96,7 +93,7 @@ def add_levels(
             "not_in_map_probability": estimate.not_in_map,
             "radius_68_m": estimate.radius_68_m,
             "radius_95_m": estimate.radius_95_m,
-            "calibration_source": model.source,
+            "calibration_source": model.calibration_source,
         }
     )
 

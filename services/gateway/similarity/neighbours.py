@@ -30,11 +30,9 @@ class NeighbourCache:
     def get_or_search(
         self, key: Hashable, search: Callable[[], tuple[Neighbours, bool]]
     ) -> Neighbours:
-        """Return a cached ranking, or search for it.
+        """Return the cached ranking of a key, which holds everything that it depends on.
 
-        Args:
-            key: Everything that the ranking depends on.
-            search: Returns the ranking, and whether it is complete; others are not cached.
+        If there is none, `search` returns it, and whether it is complete; others are not cached.
         """
         with self._lock:
             cached = self._cache.get(key)

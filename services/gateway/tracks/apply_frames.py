@@ -219,10 +219,7 @@ def smooth_states(
 ) -> dict[UUID, TrackStateResponse]:
     """Compute the states of the applied frames given all of them, earlier and later.
 
-    Args:
-        gateway: The gateway.
-        track: The track.
-        frames: Its frames with their evidence, in the order of their times.
+    `frames` have their evidence, and are in the order of their times.
     """
     applied = [frame for frame in frames if frame.state is not None]
     if not applied:

@@ -51,7 +51,7 @@ from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
 from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES, photo_suffix
 from shared.ingest.photo_metadata import parse_relative_path
-from shared.ingest.store_photo import PhotoQuota, StoreResult, insert_photo, retry_on_conflict
+from shared.ingest.store_photo import PhotoQuota, StoreResult, insert_photo
 from shared.ingest.validation import (
     StoredUpload,
     StreamValidator,
@@ -119,7 +119,7 @@ class BatchItemImporter:
                 path = parse_relative_path(item.name.removeprefix(self._settings.import_prefix))
                 photo = replace(photo, fields=replace(photo.fields, relative_path=path))
             with self._reserve_quota(job, key_id):
-                result = retry_on_conflict(lambda: self._commit(job, item, photo))
+                result = self._commit(job, item, photo)
         except Unavailable:
             raise
         except JobInterrupted:

@@ -6,7 +6,6 @@ weights are fitted afterwards, for maps with a vocabulary of their own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
@@ -26,21 +25,15 @@ AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold at a false-accept rate of 5 %
 REEVALUATE_SHARE = 0.2  # change of the photo count after which a map is evaluated again
 
 
-@dataclass(frozen=True, slots=True)
-class DueJob:
-    """An evaluation or word-weight job that a map needs now."""
-
-    kind: JobKind
-    params: dict[str, Any]
+DueJob = tuple[JobKind, dict[str, Any]]
+"""Kind and params of an evaluation or word-weight job that a map needs now."""
 
 
 def evaluate_changed_maps(catalog: Catalog, min_photos: int, word_weights: bool) -> None:
     """Queue an evaluation for each idle map that has changed enough since its last one.
 
-    Args:
-        catalog: The catalog.
-        min_photos: Maps with fewer geotagged photos are skipped; 0 turns automatic evaluation off.
-        word_weights: Whether to fit word weights, too, once the evaluation is up to date.
+    Maps with fewer geotagged photos than `min_photos` are skipped; 0 turns automatic evaluation
+    off. With `word_weights`, these are fitted, too, once the evaluation is up to date.
     """
     if not min_photos:
         return
@@ -56,15 +49,10 @@ def evaluate_changed_maps(catalog: Catalog, min_photos: int, word_weights: bool)
             due_job = _due_job(session, map_id, min_photos, word_weights)
             if due_job is None:
                 continue  # another steward has queued it
-            session.add(
-                Job(
-                    id=new_id(),
-                    map_id=map_id,
-                    kind=due_job.kind,
-                    priority=Priority.EVALUATION,
-                    params=due_job.params,
-                )
-            )
+            kind, params = due_job
+            priority = Priority.EVALUATION
+            job = Job(id=new_id(), map_id=map_id, kind=kind, priority=priority, params=params)
+            session.add(job)
 
 
 def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool) -> DueJob | None:
@@ -90,12 +78,12 @@ def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool
         or _changed_enough(searchable, evaluated[0])
         or _changed_enough(queries, evaluated[1])
     ):
-        return DueJob(JobKind.EVALUATE, params)
+        return JobKind.EVALUATE, params
     if not word_weights or not _has_own_vocabulary(session, generation):
         return None
     weighted_count = _last_weighted_count(session, generation)
     if weighted_count is None or _changed_enough(searchable, weighted_count):
-        return DueJob(JobKind.WORD_WEIGHTS, params)
+        return JobKind.WORD_WEIGHTS, params
     return None
 
 

@@ -96,7 +96,7 @@ def merge_slot(
             store,
             generation_id=generation_id,
             chunk_id=chunk_id,
-            rows=matrix,
+            rows=matrix.astype(generation.row_type, copy=False),
             photo_ids=photo_ids,
             spec=generation.spec,
         )

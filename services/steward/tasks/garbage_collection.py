@@ -14,21 +14,12 @@ from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from services.steward.tasks.model_changes import (
-    adopt_failed_reindex_jobs,
-    delete_done_reindex_jobs,
-)
-from shared.catalog.chunks import Chunk, Descriptor
+from services.steward.tasks.model_changes import adopt_failed_reindex_jobs, delete_done_reindex_jobs
+from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import (
-    MODEL_CHANGE_JOBS,
-    QUERY_JOBS,
-    UNFINISHED_STATES,
-    Job,
-    JobKind,
-)
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending
@@ -100,11 +91,8 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
             store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
-    if ended:
-        chunk_ids = [chunk.id for chunk in ended]
         with catalog.write() as session:
-            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(chunk_ids)))
-            session.execute(delete(Chunk).where(Chunk.id.in_(chunk_ids)))
+            delete_chunk_rows(session, chunk.id)
 
 
 def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:

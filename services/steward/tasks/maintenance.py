@@ -6,8 +6,11 @@ Retention covers finished jobs, the search history, tracks, webhook deliveries a
 from __future__ import annotations
 
 import logging
+from datetime import datetime
+from typing import Any
 
-from sqlalchemy import delete, exists, or_, select
+from sqlalchemy import ColumnElement, delete, exists, or_, select
+from sqlalchemy.orm import InstrumentedAttribute
 
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
@@ -70,35 +73,20 @@ def delete_old_jobs(catalog: Catalog, retention_days: float) -> None:
     not described, and a retry or another upload of the same bytes queues it again.
     """
     is_current_of_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
-    old = (
-        select(Job.id)
-        .where(
-            Job.finished_at < db_now_plus(-retention_days * DAY_SECONDS),
-            or_(Job.state == JobState.SUCCEEDED, ~is_current_of_photo),
-        )
-        .limit(RETENTION_ROWS_PER_TRANSACTION)
-        .with_for_update(skip_locked=True)
-    )
-    with catalog.write() as session:
-        session.execute(delete(Job).where(Job.id.in_(session.scalars(old).all())))
+    is_over = or_(Job.state == JobState.SUCCEEDED, ~is_current_of_photo)
+    _delete_rows(catalog, Job.id, Job.finished_at < _days_ago(retention_days), is_over)
 
 
 def delete_old_searches(catalog: Catalog, history_days: float) -> None:
     """Delete searches from the history that are older than `history_days`."""
-    old = (
-        select(Search.id)
-        .where(Search.searched_at < db_now_plus(-history_days * DAY_SECONDS))
-        .limit(RETENTION_ROWS_PER_TRANSACTION)
-    )
-    with catalog.write() as session:
-        session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))
+    _delete_rows(catalog, Search.id, Search.searched_at < _days_ago(history_days))
 
 
 def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
     """Delete tracks without a new frame for `retention_days`."""
     old = (
         select(Track.id)
-        .where(Track.updated_at < db_now_plus(-retention_days * DAY_SECONDS))
+        .where(Track.updated_at < _days_ago(retention_days))
         .limit(TRACKS_PER_TRANSACTION)
         .with_for_update(skip_locked=True)
     )
@@ -108,27 +96,26 @@ def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
 
 def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:
     """Delete webhook deliveries older than `retention_days`: retries end long before that."""
-    old = (
-        select(Delivery.id)
-        .where(Delivery.created_at < db_now_plus(-retention_days * DAY_SECONDS))
-        .limit(RETENTION_ROWS_PER_TRANSACTION)
-    )
-    with catalog.write() as session:
-        session.execute(delete(Delivery).where(Delivery.id.in_(session.scalars(old).all())))
+    _delete_rows(catalog, Delivery.id, Delivery.created_at < _days_ago(retention_days))
 
 
 def delete_expired_idempotency_keys(catalog: Catalog) -> None:
     """Delete expired idempotency keys."""
-    old = (
-        select(IdempotencyRecord.id)
-        .where(IdempotencyRecord.expires_at <= db_now())
-        .limit(RETENTION_ROWS_PER_TRANSACTION)
-        .with_for_update(skip_locked=True)
-    )
+    _delete_rows(catalog, IdempotencyRecord.id, IdempotencyRecord.expires_at <= db_now())
+
+
+def _days_ago(days: float) -> ColumnElement[datetime]:
+    return db_now_plus(-days * DAY_SECONDS)
+
+
+def _delete_rows(
+    catalog: Catalog, ids: InstrumentedAttribute[Any], *conditions: ColumnElement[bool]
+) -> None:
+    """Delete up to RETENTION_ROWS_PER_TRANSACTION rows; locked ones are left to the next run."""
+    chosen = select(ids).where(*conditions).limit(RETENTION_ROWS_PER_TRANSACTION)
     with catalog.write() as session:
-        session.execute(
-            delete(IdempotencyRecord).where(IdempotencyRecord.id.in_(session.scalars(old).all()))
-        )
+        found = session.scalars(chosen.with_for_update(skip_locked=True)).all()
+        session.execute(delete(ids.class_).where(ids.in_(found)))
 
 
 def update_statistics_of_large_maps(catalog: Catalog) -> None:

@@ -38,8 +38,8 @@ from shared.errors import Conflict
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.model_changes import start_model_change
-from shared.jobs.transitions import succeed_job
+from shared.jobs.model_changes import CANCELLED_PER_TRANSACTION, start_model_change
+from shared.jobs.transitions import cancel_jobs, succeed_job
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,10 @@ def search_workers_have_loaded(session: Session, job: Job, generation: Generatio
     if not lagging:
         return True
     job.waiting_for, job.stage = WaitingFor.SEARCH, "load"
-    if _loading_is_slow(session, generation):
+    is_slow = select(Generation.complete_at < db_now_plus(-SLOW_LOAD_SECONDS)).where(
+        Generation.id == generation.id
+    )
+    if session.scalar(is_slow):
         names = [worker.name for worker in lagging]
         if names != job.awaited:
             log.warning(
@@ -83,16 +86,6 @@ def search_workers_have_loaded(session: Session, job: Job, generation: Generatio
             )
         job.awaited = names
     return False
-
-
-def _loading_is_slow(session: Session, generation: Generation) -> bool:
-    return bool(
-        session.scalar(
-            select(Generation.complete_at < db_now_plus(-SLOW_LOAD_SECONDS)).where(
-                Generation.id == generation.id
-            )
-        )
-    )
 
 
 ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
@@ -113,11 +106,8 @@ def advance_model_changes(
 ) -> None:
     """Advance every model change that waits for descriptors or for search workers by one step.
 
-    Args:
-        catalog: The catalog.
-        wakeups: Notified when photos were queued.
-        queued_chunks: What earlier calls have queued, updated by this one. It may be lost: then all
-            chunks are read again.
+    `queued_chunks` is what earlier calls have queued, updated by this one. It may be lost: then all
+    chunks are read again.
     """
     queued_chunks = {} if queued_chunks is None else queued_chunks
     with catalog.read() as session:
@@ -159,6 +149,31 @@ def _advance_model_change(
         _finish_model_change(session, job, generation)
     if switched:
         adopt_failed_reindex_jobs(catalog)
+
+
+def cancel_jobs_of_abandoned_generations(catalog: Catalog) -> None:
+    """Cancel the reindex jobs of model changes that were cancelled or failed.
+
+    Works for up to SLICE_SECONDS: a model change has as many jobs as its map has photos.
+    """
+    unfinished = (
+        select(Job.id)
+        .join(Generation, Generation.id == Job.generation_id)
+        .where(
+            Generation.state == GenerationState.ABANDONED,
+            Job.state.in_(UNFINISHED_STATES),
+            Job.kind == JobKind.REINDEX,
+        )
+        .limit(CANCELLED_PER_TRANSACTION)
+    )
+    deadline = time.monotonic() + SLICE_SECONDS
+    while time.monotonic() < deadline:
+        with catalog.read() as session:
+            job_ids = session.scalars(unfinished).all()
+        if not job_ids:
+            return
+        with catalog.write() as session:
+            cancel_jobs(session, Job.id.in_(job_ids))
 
 
 def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
@@ -331,6 +346,10 @@ def _queue_photos(
     for begin in range(0, len(missing), REINDEX_JOBS_PER_TRANSACTION):
         batch = missing[begin : begin + REINDEX_JOBS_PER_TRANSACTION]
         with catalog.write() as session:
+            # The new jobs refer to the map, which PostgreSQL locks for that. Finishing a model
+            # change locks the map before the job, so the same order prevents a deadlock.
+            reference = select(Map.id).where(Map.id == generation.map_id)
+            session.execute(reference.with_for_update(read=True, key_share=True))
             # Of several stewards, one queues at a time; and none for a cancelled model change.
             current = session.get_one(Job, job.id, with_for_update=True)
             if current.waiting_for not in ADVANCED_WAITS:

@@ -19,7 +19,7 @@ from itertools import groupby, islice
 from uuid import UUID
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
@@ -292,14 +292,11 @@ def _referenced_vocabularies(session: Session, keys: list[str]) -> Iterable[str]
     return [*stored, *(params["object_key"] for params in waiting)]
 
 
-def _referenced_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
-    return session.scalars(
-        select(StoredWhitening.object_key).where(StoredWhitening.object_key.in_(keys))
-    )
-
-
-def _referenced_models(session: Session, keys: list[str]) -> Iterable[str]:
-    return filter(None, session.scalars(select(Model.object_key).where(Model.object_key.in_(keys))))
+def _referenced_by_column(
+    column: InstrumentedAttribute[str] | InstrumentedAttribute[str | None],
+) -> Callable[[Session, list[str]], Iterable[str]]:
+    """Make a lookup of the keys that are in a column."""
+    return lambda session, keys: session.scalars(select(column).where(column.in_(keys)))
 
 
 def _referenced_queries(session: Session, keys: list[str]) -> Iterable[str]:
@@ -339,13 +336,13 @@ REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] =
     INCOMING: _referenced_incoming,
     ARCHIVES: _referenced_by_unfinished_jobs(JobKind.BATCH),
     CHECKPOINTS: _referenced_by_unfinished_jobs(JobKind.ADD_MODEL),
-    MODELS: _referenced_models,
+    MODELS: _referenced_by_column(Model.object_key),
     ORIGINALS: _referenced_originals,
     THUMBNAILS: _referenced_derived_images,
     PREVIEWS: _referenced_derived_images,
     "chunks/": _referenced_chunks,
     VOCABULARIES: _referenced_vocabularies,
-    WHITENINGS: _referenced_whitenings,
+    WHITENINGS: _referenced_by_column(StoredWhitening.object_key),
     QUERIES: _referenced_queries,
     FEATURES: _referenced_local_features,
 }

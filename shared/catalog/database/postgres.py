@@ -3,10 +3,13 @@
 Timeouts are set inside the transaction (`SET LOCAL`) and no statements are prepared on the server,
 so that PgBouncer in transaction mode works. Without prepared statements the planner also sees the
 values: a plan that is good for a map with a million photos is bad for one with ten.
+
+The driver is in autocommit mode: `BEGIN` is sent here, in one round trip with the timeouts.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,13 +17,20 @@ import psycopg
 from psycopg.abc import RV, PQGen
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
+from sqlalchemy.exc import InvalidatePoolError
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from shared.catalog.database.session import PoolConfig, TransactionTimeouts
 
 # Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
 ANSWER_MARGIN_SECONDS = 2.0
 PING_TIMEOUT_SECONDS = 2.0
+# A connection that was in use a moment ago is not pinged: a server that went away since then would
+# have ended that request as well.
+PING_AFTER_UNUSED_SECONDS = 1.0
 DEFAULT_PORT = 5432
+BEGIN_SNAPSHOT = "BEGIN ISOLATION LEVEL REPEATABLE READ, READ ONLY"
+USED_AT = "placewise_used_at"  # of a pooled connection: when it was returned, in monotonic seconds
 
 # Detects a peer that disappeared without closing the connection (lost network or machine).
 TCP_KEEPALIVE_OPTIONS = {
@@ -54,18 +64,30 @@ class TimeoutConnection(psycopg.Connection[Any]):
 def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
     """Create the engine.
 
-    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions.
+    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions, and
+    `placewise_write=False` makes them read-only, on one snapshot.
     """
     engine = create_engine(
         url,
         pool_size=pool.size,
         max_overflow=pool.overflow,
         pool_timeout=pool.wait_seconds,
-        pool_pre_ping=True,
         creator=_connector(url, pool),
     )
-    event.listen(engine, "begin", _set_timeouts)
-    event.listen(engine, "checkin", _limit_ping)
+    event.listen(engine, "begin", _begin)
+    event.listen(engine, "checkin", _on_checkin)
+
+    def ping(connection: Any, record: ConnectionPoolEntry, _proxy: object) -> None:
+        """Replace all connections if this one, which was not used for a while, is dead."""
+        used_at = record.info.get(USED_AT)
+        if used_at is None or time.monotonic() - used_at < PING_AFTER_UNUSED_SECONDS:
+            return
+        try:
+            engine.dialect.do_ping(connection)
+        except psycopg.Error as error:
+            raise InvalidatePoolError from error
+
+    event.listen(engine, "checkout", ping)
     return engine
 
 
@@ -81,28 +103,34 @@ def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
 
     def connect() -> TimeoutConnection:
         try:
-            return TimeoutConnection.connect(prepare_threshold=None, **arguments)
+            return TimeoutConnection.connect(autocommit=True, prepare_threshold=None, **arguments)
         except psycopg.OperationalError as error:
             # libpq names neither the database nor, for some failures, the host.
-            target = f"database {url.database} at {url.host}:{url.port or DEFAULT_PORT}"
+            local = url.query.get("host", "the local socket")
+            address = f"{url.host}:{url.port or DEFAULT_PORT}" if url.host else local
+            target = f"database {url.database or 'of the user'} at {address}"
             raise type(error)(f"{target}: {error}") from error
 
     return connect
 
 
-def _set_timeouts(connection: Connection) -> None:
-    limits: TransactionTimeouts | None = connection.get_execution_options().get("placewise_limits")
+def _begin(connection: Connection) -> None:
+    options = connection.get_execution_options()
+    limits: TransactionTimeouts | None = options.get("placewise_limits")
     driver = connection.connection.driver_connection
     assert isinstance(driver, TimeoutConnection)
+    if options.get("isolation_level") != "AUTOCOMMIT":
+        if not driver.autocommit:  # as SQLAlchemy leaves a connection after AUTOCOMMIT
+            driver.autocommit = True
+        begin = "BEGIN" if options.get("placewise_write", True) else BEGIN_SNAPSHOT
+        driver.answer_seconds = PING_TIMEOUT_SECONDS  # it waits for no lock
+        connection.exec_driver_sql(begin if limits is None else f"{begin};{limits.sql()}")
     driver.answer_seconds = None
-    if limits is None:
-        return
-    if limits.statement_seconds:
+    if limits is not None and limits.statement_seconds:
         driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
-    if not driver.autocommit:  # SET LOCAL needs a transaction
-        connection.exec_driver_sql(limits.sql())
 
 
-def _limit_ping(connection: TimeoutConnection | None, _record: object) -> None:
+def _on_checkin(connection: TimeoutConnection | None, record: ConnectionPoolEntry) -> None:
     if connection is not None:  # None: the connection was invalidated
         connection.answer_seconds = PING_TIMEOUT_SECONDS
+        record.info[USED_AT] = time.monotonic()

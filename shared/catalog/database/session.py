@@ -132,7 +132,6 @@ class Catalog:
         limits: TransactionTimeouts = TransactionTimeouts(),
     ) -> None:
         self.url = make_url(url)
-        self.limits = limits
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.engine = create_engine(
@@ -146,6 +145,7 @@ class Catalog:
 
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
+        self._bind(limits)
         # SQLite has one writer: a lock is fair and does not poll, unlike SQLite's busy handler.
         self._sqlite_writer = threading.Lock()
         self.commits = CommitSignal()
@@ -153,18 +153,20 @@ class Catalog:
     def with_timeouts(self, limits: TransactionTimeouts) -> Catalog:
         """Return a catalog on the same connection pool with other timeouts."""
         catalog = copy.copy(self)
-        catalog.limits = limits
+        catalog._bind(limits)
         return catalog
+
+    def _bind(self, limits: TransactionTimeouts) -> None:
+        self.limits = limits
+        self._reads, self._writes = (
+            self.engine.execution_options(placewise_limits=limits, placewise_write=writes)
+            for writes in (False, True)
+        )
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Session]:
         """Open a read-only session on one consistent snapshot."""
-        isolation: dict[str, Any] = (
-            {}
-            if self.is_sqlite
-            else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
-        )
-        with self._session(placewise_write=False, **isolation) as session:
+        with self._sessions(bind=self._reads) as session:
             yield session
 
     @contextlib.contextmanager
@@ -174,11 +176,11 @@ class Catalog:
         A heartbeat ends no wait of a `ChangePoll`: nobody has anything to do because of it.
         """
         if not self.is_sqlite:
-            with self._session(placewise_write=True) as session:
+            with self._sessions(bind=self._writes) as session:
                 yield session
                 session.commit()
             return
-        with self._sqlite_writer, self._session(placewise_write=True) as session:
+        with self._sqlite_writer, self._sessions(bind=self._writes) as session:
             before = _changed_rows(session)
             yield session
             session.flush()
@@ -219,11 +221,6 @@ class Catalog:
         """Close every pooled connection."""
         self.engine.dispose()
 
-    def _session(self, **options: Any) -> Session:
-        return self._sessions(
-            bind=self.engine.execution_options(placewise_limits=self.limits, **options)
-        )
-
 
 def _changed_rows(session: Session) -> int:
     """Rows that the session's SQLite connection has changed since it was opened."""
@@ -247,6 +244,15 @@ class ChangePoll:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._seen = -1
+        self._look_at = 0.0
+
+    def is_due(self, longest_seconds: float = IDLE_SECONDS) -> bool:
+        """Return whether a loop that does not `wait` here has to look now, which counts as done."""
+        commits, now = self._catalog.commits.count, time.monotonic()
+        if self._catalog.is_sqlite and commits == self._seen and now < self._look_at:
+            return False
+        self._seen, self._look_at = commits, now + longest_seconds
+        return True
 
     def wait(
         self, stop: threading.Event, interval_seconds: float, longest_seconds: float = IDLE_SECONDS
@@ -279,5 +285,7 @@ def _begin_sqlite(connection: Any) -> None:
     # IMMEDIATE acquires the write lock at once: otherwise a transaction that reads before it writes
     # fails when another one writes in between.
     writes = connection.get_execution_options().get("placewise_write", True)
-    connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
+    if connection.info.get("placewise_write") != writes:
+        connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
+        connection.info["placewise_write"] = writes
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

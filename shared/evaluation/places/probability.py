@@ -36,6 +36,7 @@ CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
 log = logging.getLogger(__name__)
 
 OUT_OF_MAP_SHARE = 0.02
+SMALL_MAP_PHOTOS = 200  # with fewer, the coefficients stay near the prior's
 MODEL_VERSION = 3
 PRIOR_FILE = Path(__file__).with_name("prior.json")
 
@@ -91,6 +92,7 @@ class PlaceModel(BaseModel):
 
     version: int = MODEL_VERSION
     source: CalibrationSource = "prior"
+    """what the coefficients and thresholds were fitted on"""
     scheme: LevelScheme | None = None
     """levels that the model was fitted for; None for those of any map"""
     spread: float | None = None
@@ -107,6 +109,13 @@ class PlaceModel(BaseModel):
     def is_fitted(self) -> bool:
         """Whether the probabilities were fitted to the map; those of the prior answer nothing."""
         return self.source != "prior"
+
+    @property
+    def calibration_source(self) -> CalibrationSource:
+        """What determines the probabilities most: in a small map without labelled queries, the
+        prior that they are shrunk towards."""
+        is_small = self.source == "own_photos" and self.own_photos < SMALL_MAP_PHOTOS
+        return "prior" if is_small else self.source
 
     @model_validator(mode="before")
     @classmethod

@@ -8,11 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
 
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import func, select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
+from shared.catalog.database import postgres as postgres_module
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.database.session import (
     MAX_TRANSACTION_ATTEMPTS,
@@ -157,6 +158,37 @@ def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
     assert error.code == "catalog_busy"
     with quick.read() as session:
         assert session.scalar(select(1)) == 1
+
+
+def test_a_connection_that_died_while_it_was_not_used_is_replaced(
+    catalog: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(postgres_module, "PING_AFTER_UNUSED_SECONDS", 0.0)
+    with catalog.read() as session:
+        dead = session.scalar(select(func.pg_backend_pid()))
+    other = Catalog(catalog.url.render_as_string(hide_password=False))
+    with other.write() as session:
+        session.scalar(select(func.pg_terminate_backend(dead)))
+    other.close()
+    with catalog.write() as session:
+        assert session.scalar(select(func.pg_backend_pid())) != dead
+
+
+def add_two_maps(session: Session, name: str) -> None:
+    for _ in range(2):
+        add_map(session, name)
+
+
+def test_transactions_after_autocommit_are_transactions(catalog: Catalog) -> None:
+    """Migrations build indexes outside of a transaction, on a connection of the same pool."""
+    with catalog.engine.connect() as connection:
+        connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM maps")
+    with pytest.raises(IntegrityError), catalog.write() as session:
+        add_two_maps(session, "undone")
+    with catalog.read() as session:
+        assert session.scalars(select(Map.name)).all() == []
+        with pytest.raises(DBAPIError, match="read-only"):
+            add_map(session, "refused")
 
 
 def test_no_free_connection_is_an_error_within_the_configured_wait(catalog: Catalog) -> None:

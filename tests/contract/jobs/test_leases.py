@@ -11,7 +11,7 @@ from typing import Any
 from uuid import UUID
 
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import select
 from sqlalchemy.exc import OperationalError
 
 from shared.catalog.database.base import db_now, db_now_plus
@@ -41,6 +41,7 @@ from tests.support.catalog_rows import (
     add_job,
     add_map,
     expire_lease,
+    is_lock_awaited,
     read_job,
     set_columns,
     states,
@@ -71,7 +72,7 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
             first = [job for job in jobs if job.id == low]
             assert ids(lock_leased_jobs(session, token_of(jobs), first)) == [low]
             extending = pool.submit(extend)
-            while not _someone_waits_for_a_lock(catalog):
+            while not is_lock_awaited(catalog):
                 assert not extending.done()
                 time.sleep(0.01)
             # The one that waits for the first job must not have the second one already.
@@ -79,12 +80,6 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
             assert session.scalar(second) == high
         assert extending.result()
     catalog.close()
-
-
-def _someone_waits_for_a_lock(catalog: Catalog) -> bool:
-    waiting = "SELECT count(*) FROM pg_locks WHERE NOT granted"
-    with catalog.read() as session:
-        return bool(session.scalar(text(waiting)))
 
 
 def test_a_worker_that_was_taken_over_can_not_finish(catalog: Catalog, map_id: UUID) -> None:

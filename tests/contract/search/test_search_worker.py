@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import BinaryIO
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,11 +14,12 @@ from services.search import worker as worker_module
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
+from shared.storage.chunks import decode_rows
 from tests.contract.search.search_methods import always_by_codes, always_by_int8
 from tests.contract.search.test_search_backend import (
     OpenPort,
@@ -187,6 +189,45 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         response = port().search(places.request(places.query(vector)))
         assert_answers(response, places.brute_force(vector))
         assert response.certificate == "exhaustive"
+
+
+@whatever_the_catalog
+class TestSearchWorkerOfFloat16Rows(SearchPortContract):
+    """The same promises for rows that are stored in half precision, compared as they are stored."""
+
+    length_error = 2.0**-11
+
+    @pytest.fixture
+    def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
+        return SmallMap(catalog, store, RowType.FLOAT16)
+
+    @pytest.fixture
+    def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
+        def open_port(**changes: object) -> SearchBackend:
+            return SearchWorker(catalog, store, settings.model_copy(update=changes))
+
+        return open_port
+
+    def test_merged_rows_are_those_that_were_written(
+        self, places: SmallMap, store: FolderStore
+    ) -> None:
+        places.add(unit_rows(1, 5))
+        places.add(unit_rows(2, 4), dead=1)
+        assert places.merge()
+        (key,) = places.chunk_keys()
+        rows = decode_rows(store.get(key))
+        assert rows.dtype == np.float16
+        assert np.array_equal(rows, np.stack(list(places.rows.values())))
+
+
+class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):
+    """The same promises where sign codes of such rows select the rows first."""
+
+    certificate = "statistical"
+
+    @pytest.fixture(autouse=True)
+    def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always_by_codes(monkeypatch)
 
 
 @whatever_the_catalog

@@ -7,6 +7,7 @@ import json
 from typing import Any
 from uuid import UUID, uuid4
 
+import numpy as np
 import pytest
 from sqlalchemy import delete, func, insert, select
 
@@ -22,11 +23,12 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation, get_or_create_installation
 from shared.catalog.jobs import Job
-from shared.catalog.maps import get_or_create_default_map
+from shared.catalog.maps import Map, get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.tables import SchemaCompatibility
 from shared.config.settings import Settings
 from shared.errors import Conflict, StorageFull
+from shared.ids import new_id
 from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.journal.outbox import catalog_lag, write_journal
@@ -34,13 +36,17 @@ from shared.journal.segments import list_segments
 from shared.rebuild import recover as recover_module
 from shared.rebuild.recover import RecoveryReport, begin_rebuild, recover_catalog
 from shared.storage import FolderStore
-from shared.storage.chunks import manifest_key
+from shared.storage.chunks import manifest_key, write_chunk
 from shared.storage.keys import JOURNAL, ORIGINALS
 from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import stored_rows
 from tests.support.photos import photo_bytes
 
 # tests/faults/test_rebuild_catalog.py does the same on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
+
+VLAD = "test-tiny-vlad"
+POOLED = "test-tiny-vlad:aggregator=gem"
 
 SAID: dict[str, Any] = {
     "latitude": 45.5,
@@ -134,6 +140,21 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     assert write_journal(service.catalog, store).lines > 0
     assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
     assert verify_store(service.catalog, store, originals=True).faults == []
+
+
+def test_a_map_with_float16_rows_goes_on_with_them(service: Service, store: FolderStore) -> None:
+    service.json("POST", "/maps", 201, json={"name": "half", "rows": "float16"})
+    photos = service.indexed(1, 2, 3, map_name="half")
+    before = [answers(service, photo_id, "half") for photo_id in photos]
+    write_journal(service.catalog, store)
+    lose_catalog(service.catalog)
+    service, _ = rebuilt(service)
+    assert [answers(service, photo_id, "half") for photo_id in photos] == before
+    service.indexed(4, map_name="half")
+    (generation,) = service.json("GET", "/generations", params={"map": "half"})
+    assert generation["rows"] == "float16"
+    rows = stored_rows(service.catalog, store, UUID(generation["generation_id"]))
+    assert [row.dtype for row in rows.values()] == 4 * [np.dtype(np.float16)]
 
 
 def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
@@ -252,6 +273,26 @@ def test_a_home_of_before_the_journal_comes_back_with_what_exif_says(
     with service.catalog.read() as session:
         first = str(session.scalars(select(Photo.id)).first())
     assert len(answers(service, first)) == 1
+
+
+@pytest.mark.parametrize(("pools", "recovered"), [(True, VLAD), (False, POOLED)])
+def test_a_map_that_began_pooled_comes_back_with_the_extractor_that_waits_for_a_vocabulary(
+    catalog: Catalog, store: FolderStore, settings: Settings, pools: bool, recovered: str
+) -> None:
+    started = settings.model_copy(update={"extractor": VLAD, "pool_without_vocabulary": pools})
+    store.put(f"{ORIGINALS}{uuid4()}", photo_bytes(1))
+    chunk_id = new_id()
+    write_chunk(
+        store,
+        generation_id=new_id(),
+        chunk_id=chunk_id,
+        rows=np.eye(1, 4, dtype=np.float32),
+        photo_ids=[new_id()],
+        spec={"extractor": POOLED},
+    )
+    recover_catalog(catalog, store, started, unnamed_age_seconds=0)
+    with catalog.read() as session:
+        assert session.scalars(select(Map.extractor)).one() == recovered
 
 
 def test_a_photo_whose_original_is_gone_stays_away(

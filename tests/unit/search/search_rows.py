@@ -22,6 +22,7 @@ from shared.codes.int8_codes import int8_codes
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import SearchResponse
+from shared.storage.chunks import StoredRows
 
 DIMENSION = 7168
 
@@ -32,7 +33,7 @@ def photo(number: int) -> UUID:
     return UUID(int=number + 1)
 
 
-def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
+def snapshot_of(rows: StoredRows, pieces: int = 3, by: str = "signs") -> Snapshot:
     """The rows in so many chunks, with one kind of codes or none."""
     bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
     chunks = [
@@ -50,7 +51,7 @@ def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
 
 
 def brute_force(
-    rows: Rows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
+    rows: StoredRows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
 ) -> list[tuple[UUID, float]]:
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
@@ -61,6 +62,23 @@ def brute_force(
         if selected[number] and score >= min_score
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: int) -> None:
+    """Assert that these are the k best, ordered by score and then by id.
+
+    A score may differ by one in its last decimal: the order of a sum depends on the processor.
+    """
+    last_decimal = 1.5 * 10**-SCORE_DECIMALS
+    assert len(found) == min(k, len(exact))
+    assert found == sorted(found, key=lambda hit: (-hit[1], hit[0]))
+    assert all(abs(score - exact[photo_id]) < last_decimal for photo_id, score in found)
+    if not found:
+        return
+    last_id, lowest = found[-1]
+    for photo_id in exact.keys() - {photo_id for photo_id, _ in found}:
+        assert exact[photo_id] < lowest + last_decimal
+        assert exact[photo_id] != exact[last_id] or photo_id > last_id
 
 
 def answer(
@@ -88,7 +106,7 @@ def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
 class Case:
     """A map of rows, with duplicates and zeros among them, and a query."""
 
-    rows: Rows
+    rows: StoredRows
     pieces: int
     query: Rows
     selected: NDArray[np.bool_]
@@ -96,9 +114,10 @@ class Case:
     min_score: float | None
 
     @property
-    def expected(self) -> list[tuple[UUID, float]]:
+    def exact(self) -> dict[UUID, float]:
+        """The scores of all rows that may be found."""
         least = -2.0 if self.min_score is None else self.min_score
-        return brute_force(self.rows, self.query, self.k, self.selected, least)
+        return dict(brute_force(self.rows, self.query, len(self.rows), self.selected, least))
 
 
 @st.composite
@@ -113,8 +132,9 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
     query = rng.standard_normal(dimension).astype(np.float32)
     if draw(st.booleans()):  # of a place on the map
         query = query * np.float32(0.005) + rows[rng.integers(count)]
+    stored: StoredRows = rows.astype(draw(st.sampled_from([np.float32, np.float16])))
     return Case(
-        rows=rows,
+        rows=stored,
         pieces=draw(st.integers(1, 4)),
         query=query,
         selected=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),

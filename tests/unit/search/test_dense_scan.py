@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.dense_scan import FLOAT32_MARGIN
+from services.search.exact_rerank import RowBlocks
 from services.search.executor import SCORE_DECIMALS, SearchOptions, execute_query
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from services.search.query_batcher import QueryBatcher
@@ -21,7 +23,8 @@ from services.search.snapshot import Snapshot
 from shared.ids import new_id
 from shared.search_api.photo_filter import NO_FILTER
 from shared.search_api.protocol import SearchResponse
-from tests.unit.search.search_rows import facts_of
+from shared.storage.chunks import StoredRows
+from tests.unit.search.search_rows import assert_best, facts_of
 
 Rows = NDArray[np.float32]
 
@@ -41,7 +44,9 @@ def photo(number: int) -> UUID:
     return UUID(int=number + 1)
 
 
-def chunk_of(rows: Rows, numbers: list[int], dead: frozenset[int] = frozenset()) -> LoadedChunk:
+def chunk_of(
+    rows: StoredRows, numbers: list[int], dead: frozenset[int] = frozenset()
+) -> LoadedChunk:
     live = [
         (row, facts_of(photo(number))) for row, number in enumerate(numbers) if number not in dead
     ]
@@ -49,7 +54,7 @@ def chunk_of(rows: Rows, numbers: list[int], dead: frozenset[int] = frozenset())
 
 
 def split(
-    rows: Rows, pieces: int, numbers: list[int], dead: frozenset[int] = frozenset()
+    rows: StoredRows, pieces: int, numbers: list[int], dead: frozenset[int] = frozenset()
 ) -> list[LoadedChunk]:
     """The rows in several chunks of different sizes."""
     bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
@@ -57,7 +62,7 @@ def split(
 
 
 def brute_force(
-    rows: Rows, numbers: list[int], query: Rows, k: int, dead: frozenset[int] = frozenset()
+    rows: StoredRows, numbers: list[int], query: Rows, k: int, dead: frozenset[int] = frozenset()
 ) -> list[tuple[UUID, float]]:
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
@@ -70,21 +75,6 @@ def brute_force(
         if number not in dead
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
-
-
-def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: int) -> None:
-    """Assert that these are the k best, ordered by score and then by id.
-
-    A score may differ by one in its last decimal: the order of a sum depends on the processor.
-    """
-    last_decimal = 1.5 * 10**-SCORE_DECIMALS
-    assert len(found) == min(k, len(exact))
-    assert found == sorted(found, key=lambda hit: (-hit[1], hit[0]))
-    assert all(abs(score - exact[photo_id]) < last_decimal for photo_id, score in found)
-    last_id, lowest = found[-1] if found else (photo(0), 1.0)
-    for photo_id in exact.keys() - {photo_id for photo_id, _ in found}:
-        assert exact[photo_id] < lowest + last_decimal
-        assert exact[photo_id] != exact[last_id] or photo_id > last_id
 
 
 def hits_of(
@@ -123,6 +113,7 @@ def ask(
     k=st.integers(1, 50),
     duplicates=st.integers(0, 20),
     nearly=st.booleans(),
+    row_type=st.sampled_from([np.float32, np.float16]),
     data=st.data(),
 )
 def test_answers_equal_brute_force_with_order_and_ties(
@@ -133,6 +124,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
     k: int,
     duplicates: int,
     nearly: bool,
+    row_type: Any,
     data: st.DataObject,
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -147,14 +139,31 @@ def test_answers_equal_brute_force_with_order_and_ties(
     query = rows[rng.integers(0, count)] if data.draw(st.booleans()) else rows.sum(axis=0)
     if not np.linalg.norm(query):
         return
-    chunks = split(rows, pieces, numbers, dead)
-    exact = dict(brute_force(rows, numbers, query, count, dead))
+    stored: StoredRows = rows.astype(row_type)
+    chunks = split(stored, pieces, numbers, dead)
+    exact = dict(brute_force(stored, numbers, query, count, dead))
     found = ask(chunks, query, SearchOptions(k))
     assert_best([(hit.photo_id, hit.score) for hit in found.hits], exact, k)
     assert found.certificate == "exhaustive"
     assert found.certified_k == len(found.hits)
     assert found.rows_scanned == count - len(dead)
     assert len(found.hits) <= found.rows_reranked <= found.rows_scanned
+
+
+def test_chunks_of_both_types_are_searched_as_one_map() -> None:
+    """An extractor of an earlier release writes float32 into a generation of float16 rows."""
+    rows = unit_rows(5, 30, 700)
+    rows[:15] = rows[:15].astype(np.float16)
+    chunks = [
+        chunk_of(rows[:15].astype(np.float16), list(range(15))),
+        chunk_of(rows[15:], list(range(15, 30))),
+    ]
+    for query in rows[::7]:
+        assert hits_of(chunks, query, 30) == brute_force(rows, list(range(30)), query, 30)
+        blocks = RowBlocks.of(chunks)
+        products = np.empty(30)
+        blocks.multiply(np.arange(30), query, products)
+        np.testing.assert_allclose(products, rows.astype(np.float64) @ query, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -85,12 +85,28 @@ def test_file_is_a_plain_npy_file_that_numpy_itself_reads(store: FolderStore) ->
     assert chunk.object_key == chunk_key(GENERATION, CHUNK)
 
 
+def test_float16_rows_come_back_as_they_were_written_and_single_ones_as_float32(
+    store: FolderStore,
+) -> None:
+    rows = some_rows().astype(np.float16)
+    photo_ids = [new_id() for _ in rows]
+    chunk = write_chunk(
+        store, generation_id=GENERATION, chunk_id=CHUNK, rows=rows, photo_ids=photo_ids, spec={}
+    )
+    back = read_chunk(store, chunk.object_key, chunk.sha256)
+    np.testing.assert_array_equal(back, rows)
+    assert back.dtype == np.float16
+    row = read_row(store, chunk.object_key, 3)
+    np.testing.assert_array_equal(row, rows[3])
+    assert row.dtype == np.float32
+
+
 def test_every_other_row_of_an_array_is_written_whole() -> None:
     rows = some_rows(8)[::2, ::-1]
     np.testing.assert_array_equal(decode_rows(encode_rows(rows)), rows)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int32, ">f4"])
+@pytest.mark.parametrize("dtype", [np.float64, np.int32, ">f4", ">f2"])
 def test_other_dtypes_are_refused_when_written_and_when_read(dtype: Any) -> None:
     rows = some_rows().astype(dtype)
     with pytest.raises(ValueError, match="2-D float32"):
@@ -237,3 +253,9 @@ def test_row_is_whole_with_the_length_of_a_descriptor_and_damaged_with_any_other
     lengths = [1, 0, 1.0009, 0.9991, 1.0011, 0.5, np.nan, np.inf]
     rows = np.stack([direction * length for length in lengths]).astype(np.float32)
     assert rows_are_valid(rows).tolist() == [True, True, True, True, False, False, False, False]
+
+
+def test_norms_of_float16_rows_are_summed_more_precisely_than_they_are_stored() -> None:
+    rows = some_rows(2, 98_304)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    assert rows_are_valid(rows.astype(np.float16)).all()

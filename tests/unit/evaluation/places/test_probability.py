@@ -331,6 +331,8 @@ def test_a_map_of_few_photos_keeps_the_prior_and_a_small_one_stays_near_it() -> 
         return float(np.linalg.norm(np.array(model.levels[0]) - shipped_prior().level))
 
     assert change(small) < change(large)
+    sources = (small.source, small.calibration_source, large.calibration_source)
+    assert sources == ("own_photos", "prior", "own_photos")
 
 
 def test_labelled_queries_refine_the_model() -> None:

@@ -1,0 +1,139 @@
+"""Maps whose descriptor rows are stored as float16, from the upload to the answer."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.model_changes import advance_model_changes
+from shared.catalog.database.session import Catalog
+from shared.integrity.verify import verify_store
+from shared.jobs import InProcessWakeups
+from shared.storage import FolderStore
+from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import stored_rows
+from tests.support.photos import photo_bytes
+
+
+def half_map(service: Service) -> list[str]:
+    """A map `half` with five searchable photos in three chunks; their ids."""
+    service.json("POST", "/maps", 201, json={"name": "half", "rows": "float16"})
+    return [
+        photo_id
+        for numbers in ((1, 2), (3,), (4, 5))
+        for photo_id in service.indexed(*numbers, map_name="half")
+    ]
+
+
+def generation(service: Service, map_name: str = "half") -> Any:
+    return service.json("GET", "/generations", params={"map": map_name})[0]
+
+
+def rows_of(service: Service) -> dict[UUID, Any]:
+    generation_id = UUID(generation(service)["generation_id"])
+    return stored_rows(service.catalog, service.store, generation_id)
+
+
+def answers(service: Service, file_id: str) -> list[tuple[str, float]]:
+    service.search.sync()
+    found = service.json("POST", f"/similarity/{file_id}", params={"map": "half"})
+    return [(hit["image_id"], hit["similarity_score"]) for hit in found["similar_images"]]
+
+
+def brute_force(rows: dict[UUID, Any], file_id: str) -> list[tuple[str, float]]:
+    query = rows[UUID(file_id)].astype(np.float64)
+    query /= np.linalg.norm(query)
+    scores = [
+        (-min(1.0, float(row.astype(np.float64) @ query)), str(photo_id))
+        for photo_id, row in rows.items()
+        if str(photo_id) != file_id
+    ]
+    return [(photo_id, -score) for score, photo_id in sorted(scores)]
+
+
+def assert_same(found: list[tuple[str, float]], expected: list[tuple[str, float]]) -> None:
+    assert [photo_id for photo_id, _ in found] == [photo_id for photo_id, _ in expected]
+    np.testing.assert_allclose([s for _, s in found], [s for _, s in expected], atol=1e-6)
+
+
+def test_uploads_are_searched_by_their_float16_rows_before_and_after_a_merge(
+    service: Service, store: FolderStore
+) -> None:
+    photos = half_map(service)
+    assert generation(service)["rows"] == "float16"
+    rows = rows_of(service)
+    assert {row.dtype for row in rows.values()} == {np.dtype(np.float16)}
+    before = [answers(service, photo_id) for photo_id in photos]
+    for photo_id, found in zip(photos, before, strict=True):
+        assert_same(found, brute_force(rows, photo_id))
+    assert merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
+    merged = rows_of(service)
+    assert {row.dtype for row in merged.values()} == {np.dtype(np.float16)}
+    assert all(np.array_equal(merged[photo_id], row) for photo_id, row in rows.items())
+    assert [answers(service, photo_id) for photo_id in photos] == before
+    assert verify_store(service.catalog, store, originals=True).faults == []
+
+
+def test_exported_descriptors_are_the_stored_rows_in_float32(service: Service) -> None:
+    half_map(service)
+    generation_id = generation(service)["generation_id"]
+    path = f"/generations/{generation_id}/descriptors"
+    answer = service("GET", path, params={"map": "half"})
+    assert len(answer.content) == int(answer.headers["content-length"])
+    with tarfile.open(fileobj=io.BytesIO(answer.content), mode="r:") as tar:
+        file = tar.extractfile("descriptors.npy")
+        assert file is not None
+        exported = np.load(io.BytesIO(file.read()), allow_pickle=False)
+    assert exported.dtype == np.float32
+    stored = np.stack(list(rows_of(service).values()))
+    assert sorted(map(bytes, exported)) == sorted(map(bytes, stored.astype(np.float32)))
+
+
+def test_an_old_map_keeps_its_rows_until_its_next_generation(
+    service: Service, catalog: Catalog
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "half", "extractor": "test-tiny-avg"})
+    photos = service.indexed(1, 2, 3, map_name="half")
+    changed = service.json("PATCH", "/maps/half", json={"rows": "float16"})
+    assert changed["rows"] == "float16"
+    photos += service.indexed(4, map_name="half")
+    assert generation(service)["rows"] == "float32"
+    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float32)}
+    before = answers(service, photos[0])
+    service.search.sync()
+    service.json(
+        "POST", "/generations", 202, params={"map": "half"}, json={"extractor": "test-tiny-avg"}
+    )
+    for _ in range(20):
+        service.drain()
+        service.search.sync()
+        advance_model_changes(catalog, InProcessWakeups())
+    assert generation(service)["state"] == "active"
+    assert generation(service)["rows"] == "float16"
+    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float16)}
+    after = answers(service, photos[0])
+    assert [photo_id for photo_id, _ in after] == [photo_id for photo_id, _ in before]
+    np.testing.assert_allclose([s for _, s in after], [s for _, s in before], atol=1e-3)
+
+
+def test_an_unknown_type_of_rows_is_refused(service: Service) -> None:
+    answer = service("POST", "/maps", json={"name": "half", "rows": "int8"})
+    assert answer.status_code == 422
+    assert "rows" in answer.text
+
+
+def test_a_photo_that_is_not_stored_is_searched_in_float16_rows(service: Service) -> None:
+    photos = half_map(service)
+    job = service.ask(photo_bytes(3), map_name="half")
+    service.drain()
+    service.search.sync()
+    found = service.json("GET", f"/jobs/{job}/result", params={"map": "half"})
+    best = found["similar_images"][0]
+    assert best["image_id"] == photos[2]
+    assert best["similarity_score"] == pytest.approx(1.0, abs=1e-4)
