@@ -12,7 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
 from typing import Self
 from uuid import UUID
@@ -23,6 +23,7 @@ from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.errors import Misconfigured, Unavailable
 from shared.search_api.protocol import (
+    BACKGROUND_FEATURE,
     CERTIFICATES,
     NONE,
     SearchHit,
@@ -195,11 +196,11 @@ class HttpSearchClient:
         if not layout:  # no worker has answered yet
             self._workers.refresh()
             layout = self._workers.layout(request.generation_id, request.min_version)
+        if request.background and not self._workers.all_know(BACKGROUND_FEATURE):
+            # All shards rank by the same query, so that their scores can be merged.
+            request = request.model_copy(update={"background": ()})
         calls = {
-            # In the request's context, so that its id and trace are propagated.
-            shard: self._call_executor.submit(
-                copy_context().run, self._search_shard, shard, urls, request, deadline
-            )
+            shard: self._submit_call(shard, urls, request, deadline)
             for shard, urls in layout.items()
         }
         wait(calls.values(), timeout=deadline + RESPONSE_MARGIN_SECONDS - time.monotonic())
@@ -221,6 +222,20 @@ class HttpSearchClient:
         if not statuses:
             raise Unavailable("search_unavailable", "No search worker answers.")
         return merge_statuses(statuses, unreachable)
+
+    def _submit_call(
+        self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
+    ) -> Future[SearchResponse]:
+        # In the request's context, so that its id and trace are propagated.
+        run = copy_context().run
+        try:
+            return self._call_executor.submit(
+                run, self._search_shard, shard, urls, request, deadline
+            )
+        except RuntimeError as error:  # the executor was shut down
+            raise Unavailable(
+                "search_unavailable", "The server is stopping. Retry in a moment."
+            ) from error
 
     def _search_shard(
         self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
@@ -273,7 +288,7 @@ def _collect(
     for shard, call in calls.items():
         try:
             responses.append(call.result(timeout=0))
-        except (WorkerUnavailable, TimeoutError):
+        except (WorkerUnavailable, TimeoutError, CancelledError):  # cancelled: the client is closed
             call.cancel()
             unreachable.append(shard)
         except Unavailable as error:
