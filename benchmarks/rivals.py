@@ -5,8 +5,9 @@
 Some engines take whole descriptors, others at most some thousand numbers: those get a PCA of the
 rows, fitted on a sample of them. Columns: length of an indexed row; time to build the index from
 the rows, without the PCA; p50 of a query and of the projection before it; private memory that the
-process gains (of PostgreSQL: the size of table and index, which it caches); disk; and recall@10,
-the share of the 10 best photos by brute force over whole rows that are among the 10 found.
+process gains (of PostgreSQL also the size of table and index, which it caches); disk; and
+recall@10, the share of the 10 best photos by brute force over whole rows that are among the 10
+found.
 
 Qdrant's embedded mode is a NumPy scan: only its server has an index. autofaiss, with which
 clip-retrieval makes its indices, takes `IVF` with flat lists for these sizes.
@@ -334,7 +335,8 @@ def measure(
 ) -> Report:
     """Build each engine over `photos` rows, one after another, and search for revisited places.
 
-    Files are written to a temporary folder below `folder`: three times the rows at once.
+    Files are written to a temporary folder below `folder`: twice the rows at once. An index of
+    whole rows takes the memory of the rows, and twice as much while it is trained.
 
     Raises:
         Misconfigured: `no_benchmarks` if packages of the engines are not installed.

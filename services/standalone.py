@@ -44,11 +44,7 @@ from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import (
-    delete_dead_search_workers,
-    delete_processes,
-    process_heartbeat,
-)
+from shared.catalog.processes import delete_dead_search_workers, delete_processes, process_heartbeat
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home

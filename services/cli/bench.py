@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.output import JsonOption, print_json, print_table, progress_bar, report_errors
+from services.cli.output import JsonOption, print_json, print_table, progress_bar
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Run benchmarks on this machine.", no_args_is_help=True)
@@ -278,7 +278,9 @@ def rivals(
     queries: Annotated[int, typer.Option(min=2)] = 50,
     folder: Annotated[
         Path | None,
-        typer.Option(exists=True, file_okay=False, help="Folder for the files; 12 GB by default."),
+        typer.Option(
+            exists=True, file_okay=False, help="Folder for the files; 9 GB for 10,000 photos."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -370,13 +372,12 @@ def scale(
     """Estimate machines, storage and cost for 10 thousand, 1 million and 100 million photos."""
     if page is not None and (inputs or measured):
         raise typer.BadParameter("edit the inputs in the page instead of --set or --measure")
-    with report_errors(as_json):
-        program = _load_benchmark("scale")
-        values = program.measure_inputs() if measured else {}
-        values |= program.parse_assignments(inputs or [])
-        sizing = program.Sizing(values, page.read_text(encoding="utf-8") if page else None)
-        if page is not None:
-            page.write_text(sizing.updated_page(), encoding="utf-8")
+    program = _load_benchmark("scale")
+    values = program.measure_inputs() if measured else {}
+    values |= program.parse_assignments(inputs or [])
+    sizing = program.Sizing(values, page.read_text(encoding="utf-8") if page else None)
+    if page is not None:
+        page.write_text(sizing.updated_page(), encoding="utf-8")
     if as_json:
         print_json(sizing.as_json())
     elif page is None:
@@ -387,10 +388,9 @@ def scale(
 def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
     # Must be set before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with report_errors(as_json):
-        program = _load_benchmark(name)
-        with progress_bar() as progress:
-            report = program.measure(progress, **options)
+    program = _load_benchmark(name)
+    with progress_bar() as progress:
+        report = program.measure(progress, **options)
     if as_json:
         print_json(report.as_json())
     else:

@@ -9,14 +9,7 @@ from pydantic import SecretStr, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from services.cli.output import (
-    JsonOption,
-    Table,
-    print_json,
-    print_message,
-    print_table,
-    report_errors,
-)
+from services.cli.output import JsonOption, Table, print_json, print_message, print_table
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -66,8 +59,7 @@ def is_secret(field: FieldInfo) -> bool:
 
 def config(as_json: JsonOption = False) -> None:
     """Print the effective settings. Secrets are masked."""
-    with report_errors(as_json):
-        settings = read_settings()
+    settings = read_settings()
     values = settings.model_dump(mode="json")
     if as_json:
         print_json({name.upper(): value for name, value in values.items()})

@@ -35,9 +35,9 @@ from services.cli.output import (
     print_result,
     printable_path,
     progress_bar,
-    report_errors,
+    refuse_unwritable,
 )
-from shared.errors import Conflict, InvalidRequest, Misconfigured
+from shared.errors import Conflict, InvalidRequest
 
 EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
 
@@ -68,7 +68,7 @@ def export_descriptors(
         else _parse_generation_id(generation_id)
     )
     receiving = progress.add_task("receiving (bytes)", total=None)
-    try:
+    with refuse_unwritable(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out) as received:
             client.export_descriptors(
@@ -81,10 +81,6 @@ def export_descriptors(
                     assert member is not None, "the archive contains regular files"
                     with member, atomic_write(out / name) as file:
                         shutil.copyfileobj(member, file)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't write to {printable_path(out)}: {error.strerror}."
-        ) from error
     rows = np.load(out / "descriptors.npy", mmap_mode="r")
     return {
         "file": printable_path(out / "descriptors.npy"),
@@ -290,14 +286,13 @@ def descriptors(
     Writes descriptors.npy (photos x dimension, float32), and photos.csv and names.txt in the order
     of its rows. Use np.load(..., mmap_mode="r") to read descriptors.npy without loading it.
     """
-    with report_errors(as_json):
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            written = export_descriptors(client, out, generation, progress)
-        print_result(
-            written,
-            as_json,
-            f"{written['file']}: {written['rows']} rows of {written['dimension']} dimensions.",
-        )
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        written = export_descriptors(client, out, generation, progress)
+    print_result(
+        written,
+        as_json,
+        f"{written['file']}: {written['rows']} rows of {written['dimension']} dimensions.",
+    )
 
 
 @app.command("pairs")
@@ -318,20 +313,19 @@ def pairs(
 
     The queries are the map's labelled queries, or all of its photos if it has none.
     """
-    with report_errors(as_json):
-        check_output_path(out, ".txt", "a list of pairs")
-        with (
-            connect(server, map_name, key) as client,
-            progress_bar() as progress,
-            atomic_write(out) as file,
-        ):
-            written = export_pairs(client, file, top_k, names, progress)
-        print_result(
-            {"file": str(out), **written},
-            as_json,
-            f"{out}: {written['pairs']} pairs for {written['asked']} queries, "
-            f"{written['passed_over']} of them without a descriptor.",
-        )
+    check_output_path(out, ".txt", "a list of pairs")
+    with (
+        connect(server, map_name, key) as client,
+        progress_bar() as progress,
+        atomic_write(out) as file,
+    ):
+        written = export_pairs(client, file, top_k, names, progress)
+    print_result(
+        {"file": str(out), **written},
+        as_json,
+        f"{out}: {written['pairs']} pairs for {written['asked']} queries, "
+        f"{written['passed_over']} of them without a descriptor.",
+    )
 
 
 @app.command("geojson")
@@ -347,16 +341,15 @@ def geojson(
     as_json: JsonOption = False,
 ) -> None:
     """Export every photo with its metadata as a GeoJSON feature (RFC 7946)."""
-    with report_errors(as_json):
-        check_output_path(out, ".geojson", "a GeoJSON export")
-        with (
-            connect(server, map_name, key) as client,
-            progress_bar() as progress,
-            atomic_write(out) as file,
-        ):
-            written = export_geojson(client, file, estimates, progress)
-        print_result(
-            {"file": str(out), **written},
-            as_json,
-            f"{out}: {written['photos']} photos, {written['estimates']} estimates.",
-        )
+    check_output_path(out, ".geojson", "a GeoJSON export")
+    with (
+        connect(server, map_name, key) as client,
+        progress_bar() as progress,
+        atomic_write(out) as file,
+    ):
+        written = export_geojson(client, file, estimates, progress)
+    print_result(
+        {"file": str(out), **written},
+        as_json,
+        f"{out}: {written['photos']} photos, {written['estimates']} estimates.",
+    )

@@ -13,9 +13,10 @@ import sys
 from collections.abc import Collection
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 # Command -> (module below services.cli, attribute). The order is that of the help.
 COMMANDS = {
@@ -51,6 +52,20 @@ COMMANDS = {
     "rebuild-catalog": ("operations.backup", "rebuild_catalog"),
     "bench": ("bench", "app"),
 }
+
+
+class PlacewiseGroup(TyperGroup):
+    """Reports the error of a command in one line, as JSON with `--json`, and exits with code 1."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            from services.cli.output import AS_JSON, report_error  # the help does not need rich
+
+            if report_error(error, ctx.meta.get(AS_JSON, False)):
+                raise typer.Exit(1) from error
+            raise
 
 
 def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
@@ -101,6 +116,7 @@ def run() -> None:
 def _new_app() -> typer.Typer:
     app = typer.Typer(
         name="placewise",
+        cls=PlacewiseGroup,
         help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,

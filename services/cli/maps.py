@@ -19,7 +19,6 @@ from services.cli.output import (
     print_result,
     print_table,
     progress_bar,
-    report_errors,
 )
 from shared.errors import Conflict
 
@@ -35,27 +34,26 @@ def list_maps(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
     """List all maps with their photo counts and extractors."""
-    with report_errors(as_json):
-        with connect(server, None, key) as client:
-            maps = client.maps()
-        if as_json:
-            print_json(maps)
-            return
-        counts = ("photos", "searchable", "queries")
-        table = Table("map", *counts, "extractor", "vocabulary", "dimension", "rows", "labels")
-        for map_ in maps:
-            table.add_row(
-                map_.name,
-                str(map_.photos),
-                str(map_.searchable),
-                str(map_.labelled_queries),
-                map_.extractor,
-                map_.vocabulary or "",
-                _format_dimension(map_),
-                map_.rows,
-                "paths" if map_.place_labels_are_paths else "names",
-            )
-        print_table(table)
+    with connect(server, None, key) as client:
+        maps = client.maps()
+    if as_json:
+        print_json(maps)
+        return
+    counts = ("photos", "searchable", "queries")
+    table = Table("map", *counts, "extractor", "vocabulary", "dimension", "rows", "labels")
+    for map_ in maps:
+        table.add_row(
+            map_.name,
+            str(map_.photos),
+            str(map_.searchable),
+            str(map_.labelled_queries),
+            map_.extractor,
+            map_.vocabulary or "",
+            _format_dimension(map_),
+            map_.rows,
+            "paths" if map_.place_labels_are_paths else "names",
+        )
+    print_table(table)
 
 
 def _format_dimension(map_: Map) -> str:
@@ -91,14 +89,13 @@ def create(
     as_json: JsonOption = False,
 ) -> None:
     """Create an empty map."""
-    with report_errors(as_json):
-        if preprocessing is not None:
-            extractor = extractor_name(extractor, None, preprocessing=preprocessing)
-        with connect(server, None, key) as client:
-            created = client.create_map(
-                name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
-            )
-        print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
+    if preprocessing is not None:
+        extractor = extractor_name(extractor, None, preprocessing=preprocessing)
+    with connect(server, None, key) as client:
+        created = client.create_map(
+            name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
+        )
+    print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 
 
 @app.command("switch")
@@ -125,17 +122,16 @@ def switch(
 
     Searches use the current descriptors until the new ones are complete.
     """
-    with report_errors(as_json):
-        with connect(server, name, key) as client, progress_bar() as progress:
-            started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
-            job = wait_for_job(client, started, progress, "switching")
-        result = job.result or {}
-        print_result(
-            job,
-            as_json,
-            f"Map {name} now uses {extractor}: {result['photos']} photos, "
-            f"{result['dimension']} dimensions, {result['failed']} failed.",
-        )
+    with connect(server, name, key) as client, progress_bar() as progress:
+        started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
+        job = wait_for_job(client, started, progress, "switching")
+    result = job.result or {}
+    print_result(
+        job,
+        as_json,
+        f"Map {name} now uses {extractor}: {result['photos']} photos, "
+        f"{result['dimension']} dimensions, {result['failed']} failed.",
+    )
 
 
 @app.command("delete")
@@ -147,15 +143,14 @@ def delete(
     as_json: JsonOption = False,
 ) -> None:
     """Delete a map and all its photos."""
-    with report_errors(as_json):
-        with connect(server, None, key) as client:
-            photos = next((m.photos for m in client.maps() if m.name == name), None)
-            if photos and not yes and not sys.stdin.isatty():
-                raise Conflict(
-                    "not_confirmed",
-                    f"Map {name} contains {photos} photos. Pass --yes to delete them.",
-                )
-            if photos and not yes:
-                typer.confirm(f"Delete map {name} and its {photos} photos?", abort=True)
-            deleted = client.delete_map(name)
-        print_result(deleted, as_json, deleted.message)
+    with connect(server, None, key) as client:
+        photos = next((m.photos for m in client.maps() if m.name == name), None)
+        if photos and not yes and not sys.stdin.isatty():
+            raise Conflict(
+                "not_confirmed",
+                f"Map {name} contains {photos} photos. Pass --yes to delete them.",
+            )
+        if photos and not yes:
+            typer.confirm(f"Delete map {name} and its {photos} photos?", abort=True)
+        deleted = client.delete_map(name)
+    print_result(deleted, as_json, deleted.message)

@@ -40,7 +40,18 @@ console = Console(highlight=False)
 
 Json = dict[str, Any]
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+AS_JSON = "as_json"
+"""Key of the context's `meta`: whether the command prints JSON, for the report of its error."""
+
+
+def _note_json(context: typer.Context, as_json: bool) -> bool:
+    context.meta[AS_JSON] = as_json
+    return as_json
+
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON.", callback=_note_json)
+]
 MapOption = Annotated[
     str | None, typer.Option("--map", help="Name of the map. Default: `default`.")
 ]
@@ -183,20 +194,17 @@ def _plain_text(cell: RenderableType) -> str:
     return " ".join(text.plain.split()) if isinstance(text, Text) else ""
 
 
-@contextlib.contextmanager
-def report_errors(as_json: bool) -> Iterator[None]:
-    """Report a PlacewiseError or database outage in one line and exit with code 1."""
-    try:
-        yield
-    except PlacewiseError as error:
-        _print_error(error, as_json)
-        raise typer.Exit(1) from error
-    except Exception as error:
-        unavailable = _database_problem(error)
-        if unavailable is None:
-            raise
-        _print_error(unavailable, as_json)
-        raise typer.Exit(1) from error
+def report_error(error: Exception, as_json: bool) -> bool:
+    """Print a PlacewiseError or database outage in one line; False for any other error."""
+    problem = error if isinstance(error, PlacewiseError) else _database_problem(error)
+    if problem is None:
+        return False
+    if as_json:
+        print_json(problem.as_problem())
+    else:
+        # Escaped: file names may contain brackets, which rich would read as markup.
+        err_console.print(f"[red]{problem.code}[/red]: {escape(problem.detail)}", soft_wrap=True)
+    return True
 
 
 def _database_problem(error: Exception) -> PlacewiseError | None:
@@ -206,14 +214,6 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     from shared.catalog.database.errors import explain_outage  # few commands use a database
 
     return explain_outage(error)
-
-
-def _print_error(error: PlacewiseError, as_json: bool) -> None:
-    if as_json:
-        print_json(error.as_problem())
-    else:
-        # Escaped: file names may contain brackets, which rich would read as markup.
-        err_console.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
 
 
 def progress_bar() -> Progress:
@@ -253,6 +253,17 @@ def print_failures(report: dict[str, Any], *outcomes: str) -> None:
 
 
 @contextlib.contextmanager
+def refuse_unwritable(out: Path) -> Iterator[None]:
+    """Raise Misconfigured (`out_unwritable`) if the block fails to write to a file or folder."""
+    try:
+        yield
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"Can't write to {printable_path(out)}: {error.strerror or error}."
+        ) from error
+
+
+@contextlib.contextmanager
 def atomic_write(out: Path) -> Iterator[BinaryIO]:
     """Open a temporary file that replaces `out` if the block succeeds and is removed otherwise.
 
@@ -261,15 +272,12 @@ def atomic_write(out: Path) -> Iterator[BinaryIO]:
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     try:
-        with partial.open("w+b") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(out)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't write {printable_path(out)}: {error.strerror}."
-        ) from error
+        with refuse_unwritable(out):
+            with partial.open("w+b") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(out)
     finally:
         # Fails if the folder itself is missing: then there is no file to remove.
         with contextlib.suppress(OSError):

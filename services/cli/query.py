@@ -21,7 +21,6 @@ from services.cli.output import (
     print_json,
     print_message,
     print_table,
-    report_errors,
 )
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 
@@ -92,66 +91,65 @@ def query(
     as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
-    with report_errors(as_json):
-        with connect(server, map_name, key) as client:
-            answer = client.similar(
-                photo,
-                top_k=top_k,
-                min_score=min_score,
-                rerank=rerank,
-                explain=explain,
-                near=near,
-                box=box,
-                captured_after=captured_after,
-                captured_before=captured_before,
-                place=place,
-                tags=tags,
-                tags_like=tags_like,
-                word_weights=None if word_weights else False,
-                certainty=certainty,
-            )
-            target = describe_target(client, server, map_name)
-        if as_json:
-            print_json(answer)
-            return
-        weighted = answer.word_weights == "applied"
-        levels = answer.estimate.levels
-        table = Table(
-            "rank",
-            Column("score", no_wrap=True),
-            *([Column("match", justify="right", no_wrap=True)] if levels else []),
-            *([Column("weighted", no_wrap=True)] if weighted else []),
-            *([Column("reranked", no_wrap=True)] if rerank else []),
-            Column("photo", overflow="fold"),
-            Column("latitude", no_wrap=True),
-            Column("longitude", no_wrap=True),
-            "place",
-            *([Column("explained by", overflow="fold")] if explain else []),
+    with connect(server, map_name, key) as client:
+        answer = client.similar(
+            photo,
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain,
+            near=near,
+            box=box,
+            captured_after=captured_after,
+            captured_before=captured_before,
+            place=place,
+            tags=tags,
+            tags_like=tags_like,
+            word_weights=None if word_weights else False,
+            certainty=certainty,
         )
-        for rank, match in enumerate(answer.similar_images, start=1):
-            table.add_row(
-                str(rank),
-                f"{match.similarity_score:.4f}",
-                *([_format_percent(match.match_probability)] if levels else []),
-                *([_format_score(match.weighted_score)] if weighted else []),
-                *([_format_score(match.rerank_score)] if rerank else []),
-                escape(match.original_filename),
-                _format_degrees(match.latitude),
-                _format_degrees(match.longitude),
-                escape(match.place or ""),
-                *([_format_explanation(match.explanation)] if explain else []),
-            )
-        print_table(table)
-        if levels:
-            print_message(_summarize_levels(answer.estimate))
-            print_table(_levels_table(answer.estimate))
-        else:
-            print_message(_format_estimate(answer.estimate))
-        print_message(
-            f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
-            f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
-            f"Searched {target}"
+        target = describe_target(client, server, map_name)
+    if as_json:
+        print_json(answer)
+        return
+    weighted = answer.word_weights == "applied"
+    levels = answer.estimate.levels
+    table = Table(
+        "rank",
+        Column("score", no_wrap=True),
+        *([Column("match", justify="right", no_wrap=True)] if levels else []),
+        *([Column("weighted", no_wrap=True)] if weighted else []),
+        *([Column("reranked", no_wrap=True)] if rerank else []),
+        Column("photo", overflow="fold"),
+        Column("latitude", no_wrap=True),
+        Column("longitude", no_wrap=True),
+        "place",
+        *([Column("explained by", overflow="fold")] if explain else []),
+    )
+    for rank, match in enumerate(answer.similar_images, start=1):
+        table.add_row(
+            str(rank),
+            f"{match.similarity_score:.4f}",
+            *([_format_percent(match.match_probability)] if levels else []),
+            *([_format_score(match.weighted_score)] if weighted else []),
+            *([_format_score(match.rerank_score)] if rerank else []),
+            escape(match.relative_path or match.original_filename),
+            _format_degrees(match.latitude),
+            _format_degrees(match.longitude),
+            escape(match.place or ""),
+            *([_format_explanation(match.explanation)] if explain else []),
         )
+    print_table(table)
+    if levels:
+        print_message(_summarize_levels(answer.estimate))
+        print_table(_levels_table(answer.estimate))
+    else:
+        print_message(_format_estimate(answer.estimate))
+    print_message(
+        f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
+        f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
+        f"Searched {target}"
+    )
 
 
 def _format_score(value: float | None) -> str:

@@ -23,6 +23,7 @@ from services.extractor.decoder_process import limit_memory
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto, decode_photo
+from shared.imaging.file_formats import Previews
 from shared.imaging.preprocessing import Preprocessing
 
 log = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ class DecoderPool:
         photos: Iterable[bytes],
         preprocessing: Preprocessing,
         *,
-        with_previews: bool = False,
+        previews: Previews = Previews.NONE,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -68,7 +69,7 @@ class DecoderPool:
             decode_photo,
             preprocessing=preprocessing,
             max_pixels=self._settings.max_image_pixels,
-            with_preview=with_previews,
+            previews=previews,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()

@@ -26,11 +26,12 @@ from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.errors import NotFound, PlacewiseError
 from shared.imaging.decode import DecodedPhoto
+from shared.imaging.file_formats import Previews
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, Rows, read_row, rows_are_valid
-from shared.storage.keys import preview_key, query_key, thumbnail_key
+from shared.storage.keys import preview_key, query_key, query_preview_key, thumbnail_key
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +89,9 @@ def read_rows_to_project(
     return [job for job, _ in jobs_with_rows], np.stack([row for _, row in jobs_with_rows])
 
 
+PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
+
+
 @dataclass(slots=True)
 class DescribeBatch:
     """Claimed jobs of one kind, map and generation, from their preparation to publication."""
@@ -140,6 +144,8 @@ def prepare_batch(
 ) -> DescribeBatch:
     """Read and decode the photos of the claimed jobs; store thumbnails and previews of new ones.
 
+    Query photos get a preview if their format is one that not all browsers show.
+
     Where possible, stored rows are read instead (`read_rows_to_project`).
     """
     batch = DescribeBatch(jobs=jobs, target=target)
@@ -175,8 +181,8 @@ def prepare_batch(
 
     batch.seconds["read"] = time.perf_counter() - started
     started = time.perf_counter()
-    is_new = batch.kind == JobKind.INDEX
-    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing, with_previews=is_new)
+    previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
+    outcomes = decoders.decode(read_photos(), target.extractor.preprocessing, previews=previews)
     for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
             batch.failed.append((job, outcome))
@@ -185,14 +191,16 @@ def prepare_batch(
             batch.decoded.append(outcome)
     batch.seconds["decode"] = time.perf_counter() - started
 
-    if is_new:
-        # Stored here and not with the chunk, while the model runs the previous batch.
-        started = time.perf_counter()
-        for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+    # Stored here and not with the chunk, while the model runs the previous batch.
+    started = time.perf_counter()
+    for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+        if batch.kind == JobKind.INDEX:
             store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
-            if decoded.preview is not None:
-                store.put(preview_key(photo_id_of(job)), decoded.preview)
-        batch.seconds["thumbnails"] = time.perf_counter() - started
+        if decoded.preview is not None:
+            is_query = batch.kind == JobKind.DESCRIBE
+            key = query_preview_key(job.id) if is_query else preview_key(photo_id_of(job))
+            store.put(key, decoded.preview)
+    batch.seconds["thumbnails"] = time.perf_counter() - started
     return batch
 
 

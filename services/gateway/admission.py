@@ -16,9 +16,10 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
+from functools import partial
 from typing import Annotated
 from uuid import UUID
 
@@ -26,7 +27,7 @@ from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Caller, get_caller
-from services.gateway.dependencies import GatewayDep, get_map_name
+from services.gateway.dependencies import GatewayContext, get_map_name
 from services.http_connections import address_group
 from shared.catalog.database.session import Catalog
 from shared.config.disk_space import QUERY_SHARE, DiskSpace
@@ -159,6 +160,10 @@ class AdmissionControl:
                 raise _queue_full_error(f"jobs{suffix}", queued, limit, depth.finished_per_second)
         self._admitted[map_name] += 1
 
+    def may_block(self) -> bool:
+        """Return whether admitting queries the catalog or a local disk now."""
+        return self.disk.is_used or self._queue_depth.is_due()
+
     def check_queue(self) -> None:
         """Check that the queue has room for jobs of some map.
 
@@ -225,15 +230,29 @@ async def get_admission_control(request: Request) -> AdmissionControl:
 AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
 
 
-def _admit_job(request: Request, admission: AdmissionDep) -> None:
-    admission.admit_job(get_map_name(request))
+# These read `app.state` instead of declaring what they use: FastAPI resolves each dependency of a
+# dependency for every request, which takes as long as admitting it.
 
 
-def _admit_query(admission: AdmissionDep) -> None:
-    admission.admit_query()
+async def _admit_job(request: Request) -> None:
+    admission: AdmissionControl = request.app.state.admission
+    await _run(admission, partial(admission.admit_job, get_map_name(request)))
 
 
-async def _check_photo_quota(request: Request, gateway: GatewayDep) -> None:
+async def _admit_query(request: Request) -> None:
+    admission: AdmissionControl = request.app.state.admission
+    await _run(admission, admission.admit_query)
+
+
+async def _run(admission: AdmissionControl, admit: Callable[[], None]) -> None:
+    if admission.may_block():
+        await run_in_threadpool(admit)
+    else:
+        admit()
+
+
+async def _check_photo_quota(request: Request) -> None:
+    gateway: GatewayContext = request.app.state.gateway
     key_limit = get_photo_limit(get_caller(request), gateway.settings)
     if key_limit is not None:
         quota: PhotoQuota = request.app.state.photo_quota

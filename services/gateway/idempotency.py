@@ -12,7 +12,7 @@ and `idempotent.accept_job(session, job)` stores and returns the 202 of a job.
 
 The content of a multipart form is known only after it has been received: its routes use
 `IdempotentFormDep`, and `await idempotent.claim_form(gateway.store, received)` after
-`store_form_file`.
+`store_form_file`, or `claim_received` in a worker thread.
 
 Stored are responses of executed requests, and 4xx responses that a repetition would get again;
 never a 5xx, nor responses that depend on the caller and the time (401, 403, 408, 429). A request
@@ -107,20 +107,20 @@ class IdempotentRequest:
     async def claim_form(
         self, store: ObjectStore, received: StoredUpload, *, life_seconds: float | None = None
     ) -> None:
+        """As `claim_received`, from the event loop."""
+        if self._key is not None:
+            await run_in_threadpool(self.claim_received, store, received, life_seconds)
+
+    def claim_received(
+        self, store: ObjectStore, received: StoredUpload, life_seconds: float | None = None
+    ) -> None:
         """Claim the key for the content of a form.
 
         Deletes the received file from `store` if the request is refused or was already executed.
         """
-
-        if self._key is None:
-            return
-
-        def claim() -> None:
-            content = [received.filename, received.sha256, received.fields]
-            with delete_if_refused(store, received.key):
-                self.claim_key(content, life_seconds)
-
-        await run_in_threadpool(claim)
+        content = [received.filename, received.sha256, received.fields]
+        with delete_if_refused(store, received.key):
+            self.claim_key(content, life_seconds)
 
     def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
         """Claim the key: from here on only this request is executed under it.

@@ -55,11 +55,7 @@ from shared.evaluation.places.evidence import (
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.samples import (
-    SAME_SESSION_PERIOD,
-    IndexRanking,
-    OwnPhotoSampler,
-)
+from shared.evaluation.places.samples import SAME_SESSION_PERIOD, IndexRanking, OwnPhotoSampler
 from shared.search_api.protocol import SearchBackend, SearchHit
 
 RECALL_RANKS = (1, 5, 10)

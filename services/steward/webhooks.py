@@ -32,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog
+from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.webhooks import SECRET_PREFIX, Delivery, DeliveryState, Webhook
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
@@ -199,13 +199,15 @@ class WebhookDispatcher:
     async def _run(self, stop: threading.Event) -> None:
         stopped = in_daemon_thread(stop.wait)
         tasks: dict[UUID, asyncio.Task[None]] = {}
+        poll = ChangePoll(self._catalog)
         while not stopped.done():
+            due: list[UUID] = []
             try:
-                due = await asyncio.to_thread(self.due_webhooks, list(tasks))
-                if not due:
-                    self._outage.record_success()
+                if tasks or poll.is_due(RETRY_DELAYS_SECONDS[0]):
+                    due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                    if not due:
+                        self._outage.record_success()
             except SQLAlchemyError as error:
-                due = []
                 self._outage.record_error(error)
             # At random, so that webhooks with a backlog don't starve the others.
             for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):

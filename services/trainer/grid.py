@@ -42,12 +42,7 @@ from services.trainer.losses import make_loss
 from services.trainer.miners import make_miner
 from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
-from services.trainer.run_folder import (
-    CHECKPOINTS_FOLDER,
-    CONFIG_FILE,
-    METRICS_FILE,
-    lock_folder,
-)
+from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE, lock_folder
 from shared.errors import Conflict, InvalidRequest, PlacewiseError
 
 RESERVED_ARGUMENTS = ("default_root_dir", "run_name")

@@ -168,8 +168,6 @@ def get_model_for_loading(session: Session, name: str, *, lock: bool = False) ->
     """Return the added model of this name, for extractors.
 
     Args:
-        session: The session.
-        name: Name of the model.
         lock: Lock the row, so that the model can't be removed before the transaction ends.
 
     Raises:

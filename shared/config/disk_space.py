@@ -91,6 +91,11 @@ class DiskSpace:
         if settings.s3_endpoint is None or settings.database_url is None:
             self._folders.append(settings.placewise_home)
 
+    @property
+    def is_used(self) -> bool:
+        """Whether this process writes to a local disk."""
+        return bool(self._folders)
+
     def free_bytes(self) -> int | None:
         """Return the smallest free space among the disks, in bytes.
 

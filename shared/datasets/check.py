@@ -114,7 +114,6 @@ def inspect_dataset(
     """Open all sets at or below a folder and collect their problems.
 
     Args:
-        root: The folder.
         protocol: Protocol of the evaluation sets; None for their default.
         rule: Positive-match criterion of the evaluation sets; None for their own.
         min_photos: Training places with fewer photos are left out.
@@ -269,7 +268,6 @@ def find_suspect_labels(
     heading; 25 m if the rule is unknown or `place-label`.
 
     Args:
-        evaluation: The evaluation set.
         ranked: (queries, k) database indices, best first.
         scores: (queries, k) scores, higher is better; None treats every first match as confident.
         min_score: Minimum score of a confident match; None for the median score of the first

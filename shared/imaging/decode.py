@@ -30,6 +30,7 @@ from shared.imaging.file_formats import (
     PHOTO_READ_ERRORS,
     PHOTO_SIGNATURE_BYTES,
     PREVIEW_PIXELS,
+    Previews,
     check_pixel_count,
     detect_media_type,
     needs_preview,
@@ -67,7 +68,11 @@ class DecodedPhoto:
 
 
 def decode_photo(
-    data: bytes, preprocessing: Preprocessing, max_pixels: int, *, with_preview: bool = False
+    data: bytes,
+    preprocessing: Preprocessing,
+    max_pixels: int,
+    *,
+    previews: Previews = Previews.NONE,
 ) -> DecodedPhoto:
     """Decode and preprocess a photo, and make its upright thumbnail and preview.
 
@@ -76,10 +81,9 @@ def decode_photo(
     which bounds the memory; no preprocessing needs as many pixels.
 
     Args:
-        data: The file's bytes.
         preprocessing: Resizes the pixels for the backbone.
         max_pixels: Maximum of width x height.
-        with_preview: Whether to make a preview, too, if the photo needs one.
+        previews: Whether to make a preview, too, if the photo needs one.
 
     Raises:
         Unprocessable: `undecodable_photo` with the decoder's reason, `too_many_pixels`,
@@ -91,7 +95,7 @@ def decode_photo(
             media_type = detect_media_type(data[:PHOTO_SIGNATURE_BYTES])
             with _open_image(data, media_type) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
-                with_preview &= needs_preview(media_type, image.width, image.height)
+                with_preview = needs_preview(media_type, image.width, image.height, previews)
                 if image.width * image.height > FULL_DECODE_PIXELS:
                     # None keeps the mode; other formats than JPEG ignore the call.
                     image.draft(None, (image.width // 2, image.height // 2))

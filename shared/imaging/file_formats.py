@@ -100,9 +100,21 @@ PREVIEW_PIXELS = 1600
 BROWSER_MEDIA_TYPES = ("image/jpeg", "image/png", "image/webp")
 
 
-def needs_preview(media_type: str | None, width: int, height: int) -> bool:
+class Previews(StrEnum):
+    """The photos that previews are made of."""
+
+    NONE = "none"
+    OTHER_FORMATS = "other_formats"  # those that not all browsers show
+    ALL = "all"  # and large ones (`needs_preview`)
+
+
+def needs_preview(
+    media_type: str | None, width: int, height: int, previews: Previews = Previews.ALL
+) -> bool:
     """Return whether browsers need a preview because the photo is large, or of another format."""
-    return media_type not in BROWSER_MEDIA_TYPES or max(width, height) > PREVIEW_PIXELS
+    if media_type not in BROWSER_MEDIA_TYPES:
+        return previews != Previews.NONE
+    return previews == Previews.ALL and max(width, height) > PREVIEW_PIXELS
 
 
 def open_photo(file: BinaryIO) -> Image.Image:

@@ -39,7 +39,12 @@ def _clear_waiting(job: Job) -> None:
 
 
 def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
-    """Mark the job as succeeded with its result."""
+    """Mark the job as succeeded with its result.
+
+    A job that has a result already has succeeded before, and webhooks got its event
+    (`repeat_job`).
+    """
+    has_succeeded_before = job.result is not None
     job.state = JobState.SUCCEEDED
     job.result = result
     job.error = None
@@ -47,7 +52,8 @@ def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
     job.progress_done = job.progress_total - job.progress_failed
     job.finished_at = db_now()
     _drop_lease(job)
-    _enqueue_job_event(job, EventKind.JOB_SUCCEEDED)
+    if not has_succeeded_before:
+        _enqueue_job_event(job, EventKind.JOB_SUCCEEDED)
 
 
 def fail_job(job: Job, problem: dict[str, Any]) -> None:
@@ -219,6 +225,13 @@ def requeue_job(job: Job) -> None:
     job.started_at = None
     job.finished_at = None
     _drop_lease(job)
+
+
+def repeat_job(job: Job) -> None:
+    """Queue a succeeded job again; it keeps its result, so that webhooks get no second event."""
+    result = job.result
+    requeue_job(job)
+    job.result = result
 
 
 def cancel_batch(session: Session, job: Job) -> None:

@@ -233,12 +233,9 @@ def recover_originals(
     They are stored like uploads. Originals with the bytes of a live photo are skipped.
 
     Args:
-        catalog: the catalog.
-        store: the object store.
         settings: limits and the extractor of new maps.
         unnamed: key, size in bytes and time (seconds since 1970) of the originals.
         extractor: extractor of the default map, if it is created now and may be loaded here.
-        progress: called for each original.
     """
     recovered = RecoveredOriginals()
     for done, (key, _, modified_at) in enumerate(unnamed, start=1):

@@ -16,6 +16,7 @@
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
+| `queries/<job>.jpg` | a preview of a query photo in a format that not all browsers show |
 | `queries/<job>.json` | the result of a comparison |
 | `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
 | `work/<job>/...` | checkpoints of a job that runs in several steps |

@@ -160,6 +160,11 @@ def query_vector_key(job_id: UUID) -> str:
     return f"{QUERIES}{job_id}.npy"
 
 
+def query_preview_key(job_id: UUID) -> str:
+    """Return the key of a query photo's preview, JPEG, if browsers need one."""
+    return f"{QUERIES}{job_id}.jpg"
+
+
 def comparison_key(job_id: UUID) -> str:
     """Return the key of a comparison's result.
 
@@ -170,7 +175,12 @@ def comparison_key(job_id: UUID) -> str:
 
 def query_object_keys(job_id: UUID) -> tuple[str, ...]:
     """Return the keys of all objects that a query or a comparison may have."""
-    return query_key(job_id), query_vector_key(job_id), comparison_key(job_id)
+    return (
+        query_key(job_id),
+        query_vector_key(job_id),
+        query_preview_key(job_id),
+        comparison_key(job_id),
+    )
 
 
 def local_features_prefix(generation_id: UUID) -> str:

@@ -92,7 +92,7 @@ NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most prob
             1,
             0.02,
             "In this map",
-            "45.07000, 7.68000 ± 100 m",
+            "45.07000, 7.68000 ± 42 m (68 %)",
             f"{FINEST} a radius of 100 m, with a probability of 97.0 %.",
         ),
         (

@@ -12,6 +12,7 @@ from playwright.sync_api import expect
 
 from shared.ingest.photo_metadata import read_csv_manifest
 from tests.browser.conftest import Town, Visitor
+from tests.support.photos import photo_bytes
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
@@ -76,3 +77,34 @@ def test_a_folder_is_located_accepted_by_probability_and_downloaded(
     expect(page.get_by_role("button", name="Download CSV")).to_have_count(0)
     expect(page.get_by_text("3 photos without coordinates, 0 accepted").first).to_be_visible()
     visitor.untroubled()
+
+
+def test_the_time_zone_and_the_error_of_the_clock_move_a_photo_along_the_track(
+    visitor: Visitor, town: Town, tmp_path: Path
+) -> None:
+    nowhere = tmp_path / "nowhere.png"
+    nowhere.write_bytes(photo_bytes(5, "PNG"))
+    take_photo(nowhere, tmp_path / "walk.jpg", 0, None)  # at 12:00, without a time zone
+    nowhere.unlink()
+    (tmp_path / "walk.gpx").write_text(TRACK)
+    page = visitor.visit("locate")
+    page.get_by_label("Time zone of the cameras").select_option("UTC")
+    page.locator("input[data-use=locate]").set_input_files(sorted(tmp_path.iterdir()))
+    photo = page.locator("tr", has_text="walk.jpg")
+    expect(photo).to_contain_text("45.00000, 7.12000")
+    page.get_by_label("Time zone of the cameras").select_option("Europe/Rome")  # 10:00 UTC
+    expect(photo).to_contain_text("45.00000, 7.10000")
+    page.get_by_label("The clock was ahead by").fill("-3600")
+    page.get_by_label("The clock was ahead by").blur()
+    expect(photo).to_contain_text("45.00000, 7.11000")
+    visitor.untroubled()
+
+
+TRACK = (
+    '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    + "".join(
+        f'<trkpt lat="45" lon="7.{hour}"><time>2026-05-01T{hour}:00:00Z</time></trkpt>'
+        for hour in (10, 11, 12)
+    )
+    + "</trkseg></trk></gpx>"
+)

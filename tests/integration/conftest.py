@@ -17,6 +17,7 @@ from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.imaging.decode import DecodedPhoto
+from shared.imaging.file_formats import Previews
 from shared.imaging.preprocessing import Preprocessing
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import Door
@@ -34,9 +35,13 @@ class LentDecoders:
         self._pool = pool
 
     def decode(
-        self, photos: Sequence[bytes], preprocessing: Preprocessing, *, with_previews: bool = False
+        self,
+        photos: Sequence[bytes],
+        preprocessing: Preprocessing,
+        *,
+        previews: Previews = Previews.NONE,
     ) -> list[DecodedPhoto | PlacewiseError]:
-        return self._pool.decode(photos, preprocessing, with_previews=with_previews)
+        return self._pool.decode(photos, preprocessing, previews=previews)
 
     def close(self) -> None:
         pass

@@ -1,8 +1,8 @@
 """The fork server behind tests/support/processes.py: `python -m` it with the number of a socket.
 
 It imports what the `placewise` command imports, once, and then is forked for each start: a start
-costs a fork instead of seconds of imports. It serves one request at a time and has no threads, as a
-fork would copy the locks that they hold.
+costs a fork instead of seconds of imports. All test processes of a run are its clients. It serves
+one request at a time and has no threads, as a fork would copy the locks that they hold.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import importlib
 import json
 import os
 import runpy
+import selectors
 import signal
 import socket
 import sys
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from sqlalchemy.orm import configure_mappers
 
@@ -57,35 +58,63 @@ MODULES = (
 REQUEST_BYTES = 128 * 1024  # an environment has a few KiB
 
 
-def serve(control: socket.socket) -> dict[str, Any] | None:
-    """Answer until the tests end. In a child: what it is to run."""
-    codes: dict[int, int | None] = {}  # of the children, by pid; None for those that run
-    while True:
-        message, given, _, _ = socket.recv_fds(control, REQUEST_BYTES, maxfds=3)
-        if not message:  # the tests have ended, in good order or not
-            for pid, code in codes.items():
-                if code is None:
-                    os.kill(pid, signal.SIGKILL)
-            return None
-        request = json.loads(message)
-        if "ended" in request:
-            pid = request["ended"]
-            if codes[pid] is None:
-                codes[pid] = _exit_code(pid)
-            answer = codes[pid]
-        else:
-            answer = os.fork()
+def serve(listener: socket.socket) -> dict[str, Any] | None:
+    """Answer until the last client has gone. In a child: what it is to run."""
+    clients: dict[socket.socket, dict[int, int | None]] = {}  # with the exit codes of its processes
+    with selectors.DefaultSelector() as selector:
+        selector.register(listener, selectors.EVENT_READ)
+        while True:
+            for key, _ in selector.select():
+                ready = cast(socket.socket, key.fileobj)
+                if ready is listener:
+                    client, _ = listener.accept()
+                    clients[client] = {}
+                    selector.register(client, selectors.EVENT_READ)
+                    continue
+                try:
+                    request = _answer(ready, clients[ready])
+                except EOFError:  # its tests have ended, in good order or not
+                    selector.unregister(ready)
+                    ready.close()
+                    _kill(clients.pop(ready))
+                    if not clients:
+                        return None
+                else:
+                    if request is not None:
+                        for inherited in (listener, *clients):
+                            inherited.close()
+                        return request
+
+
+def _answer(client: socket.socket, codes: dict[int, int | None]) -> dict[str, Any] | None:
+    """Answer a request; `codes` are None for processes that run. In a child: what it is to run."""
+    message, given, _, _ = socket.recv_fds(client, REQUEST_BYTES, maxfds=3)
+    if not message:
+        raise EOFError
+    request: dict[str, Any] = json.loads(message)
+    if "ended" in request:
+        pid = request["ended"]
+        if codes[pid] is None:
+            codes[pid] = _exit_code(pid)
+        answer = codes[pid]
+    else:
+        answer = os.fork()
+        for standard, descriptor in enumerate(given):
             if answer == 0:
-                control.close()
-                for standard, descriptor in enumerate(given):
-                    os.dup2(descriptor, standard)
-            else:
-                codes[answer] = None
-            for descriptor in given:
-                os.close(descriptor)
-            if answer == 0:
-                return dict(request)
-        control.send(json.dumps([request["number"], answer]).encode())
+                os.dup2(descriptor, standard)
+            os.close(descriptor)
+        if answer == 0:
+            return request
+        codes[answer] = None
+    client.send(json.dumps([request["number"], answer]).encode())
+    return None
+
+
+def _kill(codes: dict[int, int | None]) -> None:
+    for pid, code in codes.items():
+        if code is None:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
 
 
 def run(request: dict[str, Any]) -> None:
@@ -134,14 +163,14 @@ def _import() -> None:
 
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests, which then end this
-    control = socket.socket(fileno=int(sys.argv[1]))
+    listener = socket.socket(fileno=int(sys.argv[1]))
     _import()
     assert threading.active_count() == 1, threading.enumerate()
     tasks = list(Path("/proc/self/task").iterdir())
     assert len(tasks) == 1, [task.joinpath("comm").read_text() for task in tasks]
     gc.collect()
     gc.freeze()  # children's collections leave these pages shared
-    request = serve(control)
+    request = serve(listener)
     if request is not None:
         run(request)
 

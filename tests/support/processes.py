@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import functools
 import json
 import os
@@ -30,6 +31,8 @@ READ_AT_START = frozenset(
 # Torch reads it when it first looks for a GPU, not at its import.
 READ_AT_FIRST_USE = frozenset({"CUDA_VISIBLE_DEVICES"})
 ANSWER_BYTES = 1024
+# In Linux's abstract namespace, which needs no file; the same for all workers of pytest-xdist.
+ADDRESS = f"\0placewise-tests-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
 LOOK_SECONDS = 0.01
 
 
@@ -134,26 +137,34 @@ class ForkedProcess:
 
 
 class ForkServer:
-    """tests/support/fork_server.py in a process that ends with the tests, however they end."""
+    """A connection to tests/support/fork_server.py, which ends with the last of a run's tests.
+
+    The first process of the run that needs the server starts it.
+    """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """`environment` is what its libraries see when they are imported."""
         self._asking = threading.Lock()
         self._asked = 0
         self._log = tempfile.TemporaryFile()  # noqa: SIM115, it is open as long as the server runs
-        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
+        self._process: subprocess.Popen[bytes] | None = None
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with listener, contextlib.suppress(OSError):  # the name is taken: the server runs
+            listener.bind(ADDRESS)
+            listener.listen()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.support.fork_server", str(listener.fileno())],
                 # OpenBLAS starts its threads at import.
                 env={**environment, "OPENBLAS_NUM_THREADS": "1"},
                 cwd=REPOSITORY,
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[listener.fileno()],
             )
-        self.pid = self._process.pid
+        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        while self._control.connect_ex(ADDRESS) == errno.ECONNREFUSED:
+            time.sleep(LOOK_SECONDS)  # the other process has not listened yet
 
     def start(
         self,
@@ -186,15 +197,16 @@ class ForkServer:
         raise AssertionError(f"the fork server ended: {self._log.read()[-3000:].decode()}")
 
     def close(self) -> None:
-        """End it, and its processes that nobody has waited for."""
+        """End this process's children that it has not waited for, and the last one the server."""
         self._control.close()
-        self._process.wait()
+        if self._process is not None:
+            self._process.wait()
         self._log.close()
 
 
 @functools.cache
 def _fork_server() -> ForkServer:
-    """This test process's own, from the first start on."""
+    """This test process's connection, from the first start on."""
     server = ForkServer(INHERITED)
     atexit.register(server.close)
     return server

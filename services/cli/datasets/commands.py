@@ -33,7 +33,7 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
-    report_errors,
+    refuse_unwritable,
 )
 from shared.datasets.check import (
     MAX_RULE_MULTIPLE,
@@ -49,7 +49,7 @@ from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rul
 from shared.datasets.ground_truth_files import sidecar_path, write_ground_truth
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 
 
 def check(
@@ -73,7 +73,7 @@ def check(
 
     The exit code is 1 if there are problems.
     """
-    with report_errors(as_json), progress_bar() as progress:
+    with progress_bar() as progress:
         bar = progress.add_task("scanning the folder", total=None)
         report = inspect_dataset(folder, protocol=protocol, rule=rule, min_photos=min_photos)
         progress.remove_task(bar)
@@ -218,23 +218,20 @@ def ground_truth(
     Rows and indices follow the order of the lists. OUT.json records the fingerprints of both lists
     to detect a mismatch when the file is used.
     """
-    with report_errors(as_json):
-        criterion = _resolve_rule(radius, rule)
-        if out.suffix != ".npy":
-            raise InvalidRequest("bad_out", f"--out {out}: the file name must end in .npy.")
-        database_photos = read_photo_list(database, folder)
-        query_photos = read_photo_list(queries, folder)
-        positives = find_positives(criterion, query_photos, database_photos)
-        try:
-            write_ground_truth(
-                out,
-                positives,
-                database=[photo.name for photo in database_photos],
-                queries=[photo.name for photo in query_photos],
-                rule=str(criterion),
-            )
-        except OSError as error:
-            raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
+    criterion = _resolve_rule(radius, rule)
+    if out.suffix != ".npy":
+        raise InvalidRequest("bad_out", f"--out {out}: the file name must end in .npy.")
+    database_photos = read_photo_list(database, folder)
+    query_photos = read_photo_list(queries, folder)
+    positives = find_positives(criterion, query_photos, database_photos)
+    with refuse_unwritable(out):
+        write_ground_truth(
+            out,
+            positives,
+            database=[photo.name for photo in database_photos],
+            queries=[photo.name for photo in query_photos],
+            rule=str(criterion),
+        )
     counts = [len(indices) for indices in positives]
     figures = {
         "out": printable_path(out),
@@ -295,18 +292,17 @@ def audit(
     Near means within 4 times the criterion's metres or frames, regardless of heading. Review these
     pairs: if both photos show the same place, the ground truth is wrong, not the descriptor.
     """
-    with report_errors(as_json):
-        evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
-        ranked = _load_array(predictions, "iu").astype(np.int64)
-        outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
-        if outside:
-            raise InvalidRequest(
-                "predictions_out_of_range",
-                f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
-                f"database of {evaluation.name} has {len(evaluation.database)} photos.",
-            )
-        score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
-        suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
+    evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
+    ranked = _load_array(predictions, "iu").astype(np.int64)
+    outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
+    if outside:
+        raise InvalidRequest(
+            "predictions_out_of_range",
+            f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
+            f"database of {evaluation.name} has {len(evaluation.database)} photos.",
+        )
+    score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
+    suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
     if as_json:
         print_json(
             {

@@ -19,7 +19,6 @@ from services.cli.output import (
     print_message,
     print_table,
     progress_bar,
-    report_errors,
 )
 from shared.synthetic_city.plan import CityOptions, CityPlan, make_plan
 from shared.synthetic_city.write import (
@@ -96,20 +95,19 @@ def synth(
     options = CityOptions(
         places, views, query_count, seed, catalogue_seed, out_of_map, width, height, train, rides
     )
-    with report_errors(as_json):
-        check_output_empty(out)
-        started = time.perf_counter()
-        plan = with_training_layout(make_plan(options), layout)
-        with progress_bar() as progress:
-            bar = progress.add_task("rendering", total=len(plan.photos))
-            write_city(plan, out, lambda count: progress.advance(bar, count))
-            seconds = time.perf_counter() - started
-            baselines = evaluate_baselines(plan, out, progress) if ladder else []
-        figures = {
-            **_city_summary(plan, out, seconds),
-            "ladder": baselines,
-            "seconds": time.perf_counter() - started,
-        }
+    check_output_empty(out)
+    started = time.perf_counter()
+    plan = with_training_layout(make_plan(options), layout)
+    with progress_bar() as progress:
+        bar = progress.add_task("rendering", total=len(plan.photos))
+        write_city(plan, out, lambda count: progress.advance(bar, count))
+        seconds = time.perf_counter() - started
+        baselines = evaluate_baselines(plan, out, progress) if ladder else []
+    figures = {
+        **_city_summary(plan, out, seconds),
+        "ladder": baselines,
+        "seconds": time.perf_counter() - started,
+    }
     if as_json:
         print_json(figures)
         return

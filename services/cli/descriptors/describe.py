@@ -20,13 +20,7 @@ from services.cli.extractor_options import (
     TemperatureOption,
     extractor_name,
 )
-from services.cli.output import (
-    JsonOption,
-    print_result,
-    printable_path,
-    progress_bar,
-    report_errors,
-)
+from services.cli.output import JsonOption, print_result, printable_path, progress_bar
 from shared.errors import InvalidRequest
 from shared.extractor_config.configs import get_extractor_config
 
@@ -97,41 +91,40 @@ def describe(
     """
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with report_errors(as_json):
-        names = _hdf5_names(photos, out, root)
-        settings = read_settings()
-        name = extractor_name(
-            extractor or (settings.new_map_extractor if backbone is None else None),
-            backbone,
-            layer=layer,
-            facet=facet,
-            preprocessing=preprocessing,
-            aggregator=aggregator,
-            temperature=temperature,
-        )
-        config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
-        if weights is not None:
-            if config.depth is None:
-                raise InvalidRequest(
-                    "weights_unused",
-                    f"--weights applies only to extractors based on DINOv2, not to {config.name}.",
-                )
-            settings = settings.model_copy(update={"dino_weights": weights.absolute()})
-
-        from services.cli.descriptors.local_extractor import describe_files
-
-        with progress_bar() as progress:
-            bar = progress.add_task("describing", total=len(photos))
-            result = describe_files(
-                photos,
-                out,
-                config,
-                vocabulary,
-                pca,
-                settings,
-                lambda n: progress.advance(bar, n),
-                names=names,
+    names = _hdf5_names(photos, out, root)
+    settings = read_settings()
+    name = extractor_name(
+        extractor or (settings.new_map_extractor if backbone is None else None),
+        backbone,
+        layer=layer,
+        facet=facet,
+        preprocessing=preprocessing,
+        aggregator=aggregator,
+        temperature=temperature,
+    )
+    config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+    if weights is not None:
+        if config.depth is None:
+            raise InvalidRequest(
+                "weights_unused",
+                f"--weights applies only to extractors based on DINOv2, not to {config.name}.",
             )
+        settings = settings.model_copy(update={"dino_weights": weights.absolute()})
+
+    from services.cli.descriptors.local_extractor import describe_files
+
+    with progress_bar() as progress:
+        bar = progress.add_task("describing", total=len(photos))
+        result = describe_files(
+            photos,
+            out,
+            config,
+            vocabulary,
+            pca,
+            settings,
+            lambda n: progress.advance(bar, n),
+            names=names,
+        )
     print_result(
         result.as_json(),
         as_json,

@@ -46,7 +46,6 @@ from services.cli.output import (
     print_result,
     print_table,
     progress_bar,
-    report_errors,
 )
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -92,52 +91,50 @@ def add(
     The server's extractor validates the checkpoint and stores only what is needed to describe
     photos. `--map` only selects the map whose job list shows the job.
     """
-    with report_errors(as_json):
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            client.models()  # fails before the upload if the URL or key is wrong
-            sending = progress.add_task("uploading (bytes)", total=checkpoint.stat().st_size)
-            started = client.add_model(
-                checkpoint,
-                name,
-                licence=licence,
-                note=note,
-                on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
-            )
-            job = wait_for_job(client, started, progress, "checking")
-        model = job.result or {}
-        print_result(
-            job,
-            as_json,
-            f"{model['extractor']}: {model['dimension']} dimensions, "
-            f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
-            f"{'; already stored' if model['already_there'] else ''}.",
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        client.models()  # fails before the upload if the URL or key is wrong
+        sending = progress.add_task("uploading (bytes)", total=checkpoint.stat().st_size)
+        started = client.add_model(
+            checkpoint,
+            name,
+            licence=licence,
+            note=note,
+            on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
         )
+        job = wait_for_job(client, started, progress, "checking")
+    model = job.result or {}
+    print_result(
+        job,
+        as_json,
+        f"{model['extractor']}: {model['dimension']} dimensions, "
+        f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
+        f"{'; already stored' if model['already_there'] else ''}.",
+    )
 
 
 def list_added(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
     """List added models and the maps that use them."""
-    with report_errors(as_json):
-        with connect(server, None, key) as client:
-            models = client.models()
-        if as_json:
-            print_json(models)
-            return
-        name = Column("extractor", overflow="fold", min_width=12)
-        table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
-        for model in models:
-            table.add_row(
-                escape(model.extractor),
-                f"{model.config['backbone_arch']} {model.config['agg_arch']}",
-                "{}x{}".format(*model.image_size),
-                str(model.dimension),
-                f"{model.size_bytes / 1e6:.1f} MB",
-                escape(model.licence),
-                escape(", ".join(model.maps)),
-                escape(model.note or ""),
-            )
-        print_table(table)
+    with connect(server, None, key) as client:
+        models = client.models()
+    if as_json:
+        print_json(models)
+        return
+    name = Column("extractor", overflow="fold", min_width=12)
+    table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
+    for model in models:
+        table.add_row(
+            escape(model.extractor),
+            f"{model.config['backbone_arch']} {model.config['agg_arch']}",
+            "{}x{}".format(*model.image_size),
+            str(model.dimension),
+            f"{model.size_bytes / 1e6:.1f} MB",
+            escape(model.licence),
+            escape(", ".join(model.maps)),
+            escape(model.note or ""),
+        )
+    print_table(table)
 
 
 def remove(
@@ -147,10 +144,9 @@ def remove(
     as_json: JsonOption = False,
 ) -> None:
     """Remove a model that no map uses. Its name can't be reused for other weights."""
-    with report_errors(as_json):
-        with connect(server, None, key) as client:
-            removed = client.remove_model(name)
-        print_result(removed, as_json, removed.message)
+    with connect(server, None, key) as client:
+        removed = client.remove_model(name)
+    print_result(removed, as_json, removed.message)
 
 
 app = typer.Typer(help="Manage extractor weights and trained models.")
@@ -165,17 +161,16 @@ def list_(as_json: JsonOption = False) -> None:
 
     The first listing reads each weights file to compute its fingerprint.
     """
-    with report_errors(as_json):
-        settings = read_settings()
-        with err_console.status("Searching for weights") as status:
+    settings = read_settings()
+    with err_console.status("Searching for weights") as status:
 
-            def reading(path: Path) -> None:
-                status.update(f"Computing the fingerprint of {path}")
+        def reading(path: Path) -> None:
+            status.update(f"Computing the fingerprint of {path}")
 
-            all_weights = [
-                inspect_weights(config, settings, reading)
-                for config in list_extractor_configs(settings)
-            ]
+        all_weights = [
+            inspect_weights(config, settings, reading)
+            for config in list_extractor_configs(settings)
+        ]
     if as_json:
         print_json([asdict(weights) for weights in all_weights])
         return
@@ -205,26 +200,25 @@ def fetch(
     Weights of a torch.hub entry (torchhub:OWNER/NAME@COMMIT:ENTRY) are downloaded by running its
     code: review the code first.
     """
-    with report_errors(as_json):
-        settings = read_settings()
-        config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
-        if config.for_tests:
-            raise Misconfigured("no_weights", f"The extractor {config.name} has no weights.")
-        if config.trained is not None:
-            raise Misconfigured(
-                "no_weights",
-                f"The weights of {config.name} are in the object store, from which extractors load "
-                "them. There is nothing to fetch.",
-            )
-        with _download_progress(config.name) as on_progress:
-            dimension = config.dimension
-            if config.hub is not None:
-                dimension = _fetch_torchhub(config.hub, on_progress)
-            elif config.depth is not None:
-                _fetch_dinov2(config.backbone, settings, on_progress)
-        weights = inspect_weights(config, settings)
-        if not weights.here:
-            raise Misconfigured("weights_unfit", weights.note or "")
+    settings = read_settings()
+    config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+    if config.for_tests:
+        raise Misconfigured("no_weights", f"The extractor {config.name} has no weights.")
+    if config.trained is not None:
+        raise Misconfigured(
+            "no_weights",
+            f"The weights of {config.name} are in the object store, from which extractors load "
+            "them. There is nothing to fetch.",
+        )
+    with _download_progress(config.name) as on_progress:
+        dimension = config.dimension
+        if config.hub is not None:
+            dimension = _fetch_torchhub(config.hub, on_progress)
+        elif config.depth is not None:
+            _fetch_dinov2(config.backbone, settings, on_progress)
+    weights = inspect_weights(config, settings)
+    if not weights.here:
+        raise Misconfigured("weights_unfit", weights.note or "")
     if as_json:
         print_json({**asdict(weights), "dimension": dimension})
         return

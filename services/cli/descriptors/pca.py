@@ -18,7 +18,6 @@ from services.cli.output import (
     print_failures,
     print_result,
     progress_bar,
-    report_errors,
 )
 from shared.errors import Conflict, InvalidRequest
 from shared.extractor_config.configs import MAX_PCA_DIMENSION
@@ -62,19 +61,18 @@ def fit(
 
     With ROWS.npy or DIR, write the whitening to a file for `describe --pca`.
     """
-    with report_errors(as_json):
-        if source is not None:
-            _fit_file(source, out, dimension, extractor, vocabulary, map_name, as_json)
-            return
-        if out is not None or extractor is not None or vocabulary is not None:
-            raise InvalidRequest(
-                "options_contradict",
-                "--out, --extractor and --vocabulary require ROWS.npy or DIR.",
-            )
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            started = client.start_generation(pca=dimension)
-            job = wait_for_job(client, started, progress, "pca")
-        _print_generation(job, as_json)
+    if source is not None:
+        _fit_file(source, out, dimension, extractor, vocabulary, map_name, as_json)
+        return
+    if out is not None or extractor is not None or vocabulary is not None:
+        raise InvalidRequest(
+            "options_contradict",
+            "--out, --extractor and --vocabulary require ROWS.npy or DIR.",
+        )
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        started = client.start_generation(pca=dimension)
+        job = wait_for_job(client, started, progress, "pca")
+    _print_generation(job, as_json)
 
 
 @app.command("undo")
@@ -85,14 +83,13 @@ def undo(
     as_json: JsonOption = False,
 ) -> None:
     """Reindex the map without PCA, with its current vocabulary, and switch to the result."""
-    with report_errors(as_json):
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            active = active_generation(client)
-            if active is None or active.pca_from is None:
-                raise Conflict("not_reduced", "The map's descriptors are not reduced by PCA.")
-            started = client.start_generation(vocabulary_id=active.vocabulary_id)
-            job = wait_for_job(client, started, progress, "reindexing")
-        _print_generation(job, as_json)
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        active = active_generation(client)
+        if active is None or active.pca_from is None:
+            raise Conflict("not_reduced", "The map's descriptors are not reduced by PCA.")
+        started = client.start_generation(vocabulary_id=active.vocabulary_id)
+        job = wait_for_job(client, started, progress, "reindexing")
+    _print_generation(job, as_json)
 
 
 def _fit_file(

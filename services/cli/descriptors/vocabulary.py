@@ -28,7 +28,6 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
-    report_errors,
 )
 from shared.errors import InvalidRequest
 from shared.extractor_config.configs import MAX_CLUSTERS
@@ -72,20 +71,19 @@ def fit(
 
     With DIR, fit on a folder and write the vocabulary to a file for `import`.
     """
-    with report_errors(as_json):
-        if folder is not None:
-            # --server and --key are not rejected: the environment may set them for all commands.
-            _reject_options("a map", {"--map": map_name})
-            if out is None:
-                raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
-            _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
-            return
-        _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
-        options = {"clusters": clusters, "sample": sample, "seed": seed}
-        parameters = {name: value for name, value in options.items() if value is not None}
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            job = fit_and_wait(client, parameters, progress)
-        _print_generation(job, as_json)
+    if folder is not None:
+        # --server and --key are not rejected: the environment may set them for all commands.
+        _reject_options("a map", {"--map": map_name})
+        if out is None:
+            raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
+        _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
+        return
+    _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
+    options = {"clusters": clusters, "sample": sample, "seed": seed}
+    parameters = {name: value for name, value in options.items() if value is not None}
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        job = fit_and_wait(client, parameters, progress)
+    _print_generation(job, as_json)
 
 
 @app.command("import")
@@ -106,18 +104,17 @@ def import_(
     """Import a vocabulary, reindex the map with it, and switch to the result."""
     from shared.descriptors.vocabulary_file import read_vocabulary  # imports torch
 
-    with report_errors(as_json):
-        vocabulary = read_vocabulary(file)
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            connect(server, map_name, key) as client,
-            progress_bar() as progress,
-        ):
-            normalised_file = Path(folder, f"{file.stem}{vocabulary.suffix}")
-            normalised_file.write_bytes(vocabulary.encode())
-            started = client.import_vocabulary(normalised_file)
-            job = wait_for_job(client, started, progress, "vocabulary")
-        _print_generation(job, as_json)
+    vocabulary = read_vocabulary(file)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        connect(server, map_name, key) as client,
+        progress_bar() as progress,
+    ):
+        normalised_file = Path(folder, f"{file.stem}{vocabulary.suffix}")
+        normalised_file.write_bytes(vocabulary.encode())
+        started = client.import_vocabulary(normalised_file)
+        job = wait_for_job(client, started, progress, "vocabulary")
+    _print_generation(job, as_json)
 
 
 @app.command("export")
@@ -134,23 +131,22 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a vocabulary of the map to a file: .npz, or .npy if its provenance is unknown."""
-    with report_errors(as_json):
-        _validate_id(vocabulary_id)
-        with connect(server, map_name, key) as client:
-            data = client.vocabulary_file(vocabulary_id)
-        suffix = ".npz" if data.startswith(b"PK") else ".npy"
-        if out.suffix != suffix:
-            raise InvalidRequest(
-                "bad_out",
-                f"{printable_path(out)}: the file name of this vocabulary must end in {suffix}.",
-            )
-        with atomic_write(out) as file:
-            file.write(data)
-        print_result(
-            {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)},
-            as_json,
-            f"{printable_path(out)}: {len(data)} bytes.",
+    _validate_id(vocabulary_id)
+    with connect(server, map_name, key) as client:
+        data = client.vocabulary_file(vocabulary_id)
+    suffix = ".npz" if data.startswith(b"PK") else ".npy"
+    if out.suffix != suffix:
+        raise InvalidRequest(
+            "bad_out",
+            f"{printable_path(out)}: the file name of this vocabulary must end in {suffix}.",
         )
+    with atomic_write(out) as file:
+        file.write(data)
+    print_result(
+        {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)},
+        as_json,
+        f"{printable_path(out)}: {len(data)} bytes.",
+    )
 
 
 @app.command("list")
@@ -161,32 +157,29 @@ def list_(
     as_json: JsonOption = False,
 ) -> None:
     """List the map's vocabularies, newest first. The active one is marked."""
-    with report_errors(as_json):
-        with connect(server, map_name, key) as client:
-            vocabularies = client.vocabularies()
-            active = active_generation(client)
-        active_id = active and active.vocabulary_id
-        if as_json:
-            print_json(
-                [{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies]
-            )
-            return
-        # IDs are folded, not truncated, so that they can be copied.
-        name = Column("vocabulary", overflow="fold", min_width=36)
-        table = Table("active", name, "origin", "clusters", "dimension", "photos", "created")
-        for v in vocabularies:
-            is_active = v.vocabulary_id == active_id
-            table.add_row(
-                "*" if is_active else "",
-                f"{v.vocabulary_id}\n{_format_provenance(v.provenance)}\nsha256 {v.sha256[:12]}"
-                + _format_pca(active if is_active else None),
-                v.origin,
-                str(v.clusters),
-                str(v.dimension),
-                str(v.provenance.get("photos", "")),
-                f"{v.created_at:%Y-%m-%d %H:%M:%S}",
-            )
-        print_table(table)
+    with connect(server, map_name, key) as client:
+        vocabularies = client.vocabularies()
+        active = active_generation(client)
+    active_id = active and active.vocabulary_id
+    if as_json:
+        print_json([{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies])
+        return
+    # IDs are folded, not truncated, so that they can be copied.
+    name = Column("vocabulary", overflow="fold", min_width=36)
+    table = Table("active", name, "origin", "clusters", "dimension", "photos", "created")
+    for v in vocabularies:
+        is_active = v.vocabulary_id == active_id
+        table.add_row(
+            "*" if is_active else "",
+            f"{v.vocabulary_id}\n{_format_provenance(v.provenance)}\nsha256 {v.sha256[:12]}"
+            + _format_pca(active if is_active else None),
+            v.origin,
+            str(v.clusters),
+            str(v.dimension),
+            str(v.provenance.get("photos", "")),
+            f"{v.created_at:%Y-%m-%d %H:%M:%S}",
+        )
+    print_table(table)
 
 
 def _validate_id(vocabulary_id: str) -> None:

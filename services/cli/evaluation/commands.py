@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from services.cli.environment import require_packages
-from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, report_errors
+from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
 from shared.errors import InvalidRequest
 
 OptionValues = dict[str, object]
@@ -234,77 +234,74 @@ def evaluate(
         "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
         "--sequences": sequences, "--kidnap-every": kidnap_every, "--recall-at": recall_at,
     }  # fmt: skip
-    with report_errors(as_json):
-        report_options = ReportOptions(
-            out,
-            against,
-            pairs,
-            depth,
-            _parse_recall_at(recall_at, depth),
-            grids,
-            only_wrong,
-            faiss_gpu,
-            place_labels_are_paths,
-            as_json,
+    report_options = ReportOptions(
+        out,
+        against,
+        pairs,
+        depth,
+        _parse_recall_at(recall_at, depth),
+        grids,
+        only_wrong,
+        faiss_gpu,
+        place_labels_are_paths,
+        as_json,
+    )
+    # Must be set before torch is loaded below; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if predictions is not None:
+        rules: OptionValues = {"--protocol": protocol, "--rule": rule}
+        models = {name: value for name, value in model_options.items() if name not in rules}
+        _reject_options("with --predictions", map_options | models)
+        require_packages()
+        from services.cli.evaluation.results import (
+            evaluate_predictions,
+            evaluate_predictions_of_set,
         )
-        # Must be set before torch is loaded below; see services/cli/__init__.py.
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-        if predictions is not None:
-            rules: OptionValues = {"--protocol": protocol, "--rule": rule}
-            models = {name: value for name, value in model_options.items() if name not in rules}
-            _reject_options("with --predictions", map_options | models)
-            require_packages()
-            from services.cli.evaluation.results import (
-                evaluate_predictions,
-                evaluate_predictions_of_set,
+
+        if ground_truth is not None:
+            _reject_options("with --ground-truth", rules)
+            evaluate_predictions(
+                predictions, ground_truth, database, queries, data, sets, report_options
             )
-
-            if ground_truth is not None:
-                _reject_options("with --ground-truth", rules)
-                evaluate_predictions(
-                    predictions, ground_truth, database, queries, data, sets, report_options
-                )
-                return
-            if data is None:
-                raise InvalidRequest(
-                    "no_ground_truth",
-                    "--predictions requires the data set, --data DIR --set NAME, or a ground "
-                    "truth file, --ground-truth GT.npy.",
-                )
-            _reject_options("without --ground-truth", file_options)
-            evaluate_predictions_of_set(predictions, data, sets, protocol, rule, report_options)
             return
-        if data is not None:
-            lists: OptionValues = {"--database": database, "--queries": queries}
-            _reject_options("with --data", map_options | lists)
-            if ground_truth is not None:
-                _reject_options("with --ground-truth", {"--rule": rule})
-            require_packages()
-            from services.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
-
-            size = _parse_image_size(image_size, checkpoint)
-            target = EvaluationTarget(
-                checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
+        if data is None:
+            raise InvalidRequest(
+                "no_ground_truth",
+                "--predictions requires the data set, --data DIR --set NAME, or a ground "
+                "truth file, --ground-truth GT.npy.",
             )
-            if sequences:
-                from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
+        _reject_options("without --ground-truth", file_options)
+        evaluate_predictions_of_set(predictions, data, sets, protocol, rule, report_options)
+        return
+    if data is not None:
+        lists: OptionValues = {"--database": database, "--queries": queries}
+        _reject_options("with --data", map_options | lists)
+        if ground_truth is not None:
+            _reject_options("with --ground-truth", {"--rule": rule})
+        require_packages()
+        from services.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
 
-                unused: OptionValues = {
-                    "--out": out, "--pairs": pairs, "--recall-at": recall_at,
-                    "--ground-truth": ground_truth,
-                }  # fmt: skip
-                _reject_options("with --sequences", unused)
-                speeds = parse_motion(motion)
-                evaluate_sequences(
-                    data, sets, protocol, rule, target, speeds, kidnap_every, as_json
-                )
-                return
-            evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
+        size = _parse_image_size(image_size, checkpoint)
+        target = EvaluationTarget(
+            checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
+        )
+        if sequences:
+            from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
+
+            unused: OptionValues = {
+                "--out": out, "--pairs": pairs, "--recall-at": recall_at,
+                "--ground-truth": ground_truth,
+            }  # fmt: skip
+            _reject_options("with --sequences", unused)
+            speeds = parse_motion(motion)
+            evaluate_sequences(data, sets, protocol, rule, target, speeds, kidnap_every, as_json)
             return
-        _reject_options("without --data", model_options | file_options | output_options)
-        from services.cli.evaluation.live_map import evaluate_map
+        evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
+        return
+    _reject_options("without --data", model_options | file_options | output_options)
+    from services.cli.evaluation.live_map import evaluate_map
 
-        evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
+    evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
 def _reject_options(context: str, options: OptionValues) -> None:
@@ -381,17 +378,16 @@ def compare(
     """
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with report_errors(as_json):
-        require_packages()
-        from services.cli.evaluation.compare_extractors import compare_extractors
+    require_packages()
+    from services.cli.evaluation.compare_extractors import compare_extractors
 
-        compare_extractors(
-            data,
-            extractors,
-            set_name=set_name,
-            protocol=protocol,
-            rule=rule,
-            out=out,
-            faiss_gpu=faiss_gpu,
-            as_json=as_json,
-        )
+    compare_extractors(
+        data,
+        extractors,
+        set_name=set_name,
+        protocol=protocol,
+        rule=rule,
+        out=out,
+        faiss_gpu=faiss_gpu,
+        as_json=as_json,
+    )

@@ -39,10 +39,7 @@ from shared.evaluation.exact_knn import Rankings, exact_knn
 from shared.evaluation.places.data_set import measure_places
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.ranking import (
-    describe_evaluation_set,
-    refused_photos_error,
-)
+from shared.evaluation.ranking import describe_evaluation_set, refused_photos_error
 from shared.evaluation.results import EvaluationResult, EvaluationRun
 
 Result = TypeVar("Result")

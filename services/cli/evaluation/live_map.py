@@ -11,14 +11,7 @@ from rich.table import Column
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import (
-    Json,
-    Table,
-    print_json,
-    print_message,
-    print_table,
-    progress_bar,
-)
+from services.cli.output import Json, Table, print_json, print_message, print_table, progress_bar
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 

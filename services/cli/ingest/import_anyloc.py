@@ -21,7 +21,6 @@ from services.cli.output import (
     print_json,
     print_note,
     progress_bar,
-    report_errors,
 )
 
 DESCRIPTORS_NOTE = (
@@ -63,18 +62,17 @@ def import_anyloc(
 
     DIR is only read. The command is idempotent: run it again after an interruption.
     """
-    with report_errors(as_json):
-        source = read_anyloc_folder(folder, database, uploads)
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            report = _build_report(
-                source, upload_photos(client, source.photos, fit, progress, update=update)
-            )
-        if as_json:
-            print_json(report)
-        else:
-            _print_report(report)
-        if report["refused"] or report["failed"] or report["missing"]:
-            raise typer.Exit(1)
+    source = read_anyloc_folder(folder, database, uploads)
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        report = _build_report(
+            source, upload_photos(client, source.photos, fit, progress, update=update)
+        )
+    if as_json:
+        print_json(report)
+    else:
+        _print_report(report)
+    if report["refused"] or report["failed"] or report["missing"]:
+        raise typer.Exit(1)
 
 
 def _build_report(source: AnylocFolder, uploaded: Json) -> Json:

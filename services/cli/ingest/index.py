@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -44,10 +45,11 @@ from services.cli.output import (
     print_json,
     print_note,
     progress_bar,
-    report_errors,
 )
 from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest
+
+MAX_LISTED_SUFFIXES = 5
 
 
 def index(
@@ -117,56 +119,55 @@ def index(
         "--role": role != PhotoRole.DATABASE,
     }
     local_file_options = {**folder_options, "--update": update, "--journal": journal}
-    with report_errors(as_json):
-        if failures is not None:
-            check_output_path(failures, ".jsonl", "a list of failures")
-        source, path = sources[0], Path(sources[0])
-        local = find_local_sources(sources)
-        if local is not None:
-            if len(sources) > 1 or not path.is_dir():
-                _reject_options("photos and several folders", {"--csv": table})
-            photos = [
-                photo
-                for one in local
-                for photo in find_photos(one, table, utm_zone, places_by_folder=places)
-            ]
-            if role != PhotoRole.DATABASE:
-                photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-            # Vocabularies are fitted on database photos only.
-            fit_after_upload = fit and role == PhotoRole.DATABASE
-            report = _upload_photos(
-                photos, fit_after_upload, update, journal, server, map_name, key
-            )
-            report["other_files"] = sum(map(count_other_files, local))
-            report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
-        elif len(sources) > 1:
-            raise InvalidRequest(
-                "several_sources",
-                f"{source} and {len(sources) - 1} more: index archives, manifests and bucket "
-                "prefixes one at a time. Only folders, photos and patterns can be combined.",
-            )
-        elif source.startswith("s3://"):
-            _reject_options("a bucket prefix", local_file_options)
+    if failures is not None:
+        check_output_path(failures, ".jsonl", "a list of failures")
+    source, path = sources[0], Path(sources[0])
+    local = find_local_sources(sources)
+    if local is not None:
+        if len(sources) > 1 or not path.is_dir():
+            _reject_options("photos and several folders", {"--csv": table})
+        photos = [
+            photo
+            for one in local
+            for photo in find_photos(one, table, utm_zone, places_by_folder=places)
+        ]
+        if role != PhotoRole.DATABASE:
+            photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
+        # Vocabularies are fitted on database photos only.
+        fit_after_upload = fit and role == PhotoRole.DATABASE
+        report = _upload_photos(photos, fit_after_upload, update, journal, server, map_name, key)
+        suffixes = sum(map(count_other_files, local), Counter[str]())
+        report["other_files"] = suffixes.total()
+        report["other_suffixes"] = dict(suffixes.most_common())
+        report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
+    elif len(sources) > 1:
+        raise InvalidRequest(
+            "several_sources",
+            f"{source} and {len(sources) - 1} more: index archives, manifests and bucket "
+            "prefixes one at a time. Only folders, photos and patterns can be combined.",
+        )
+    elif source.startswith("s3://"):
+        _reject_options("a bucket prefix", local_file_options)
+        with _connect(server, map_name, key) as client, progress_bar() as progress:
+            report = import_prefix(client, source, fit, progress)
+    elif path.suffix == ".jsonl":
+        _reject_options("a manifest", folder_options)
+        data = _read_manifest(path)
+        if manifest_has_keys(data):
+            _reject_options("a manifest of object keys", local_file_options)
             with _connect(server, map_name, key) as client, progress_bar() as progress:
-                report = import_prefix(client, source, fit, progress)
-        elif path.suffix == ".jsonl":
-            _reject_options("a manifest", folder_options)
-            data = _read_manifest(path)
-            if manifest_has_keys(data):
-                _reject_options("a manifest of object keys", local_file_options)
-                with _connect(server, map_name, key) as client, progress_bar() as progress:
-                    report = import_keys(client, data, fit, progress)
-            else:
-                photos = read_photo_manifest(path, data)
-                report = _upload_photos(photos, fit, update, journal, server, map_name, key)
+                report = import_keys(client, data, fit, progress)
         else:
-            check_archive(path)
-            _reject_options("an archive", local_file_options)
-            with _connect(server, map_name, key) as client, progress_bar() as progress:
-                report = upload_archive(client, path, fit, progress)
-        if failures is not None:
-            _write_failures(failures, report)
-        _finish_command(report, server, map_name, role, as_json)
+            photos = read_photo_manifest(path, data)
+            report = _upload_photos(photos, fit, update, journal, server, map_name, key)
+    else:
+        check_archive(path)
+        _reject_options("an archive", local_file_options)
+        with _connect(server, map_name, key) as client, progress_bar() as progress:
+            report = upload_archive(client, path, fit, progress)
+    if failures is not None:
+        _write_failures(failures, report)
+    _finish_command(report, server, map_name, role, as_json)
 
 
 @contextlib.contextmanager
@@ -235,6 +236,16 @@ def _finish_command(
         raise typer.Exit(1)
 
 
+def _list_suffixes(report: Json) -> str:
+    """Name the most frequent kinds of skipped files: ` (12 .mov, 3 .dng)`."""
+    kinds = [
+        f"{number} {suffix or 'without an ending'}"
+        for suffix, number in report["other_suffixes"].items()
+    ]
+    shown = kinds[:MAX_LISTED_SUFFIXES] + ["..."] * (len(kinds) > MAX_LISTED_SUFFIXES)
+    return f" ({', '.join(shown)})" if kinds else ""
+
+
 def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
     print_note(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
@@ -243,7 +254,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     )
     if report.get("other_files") or report.get("without_coordinates"):
         print_note(
-            f"{_count(report['other_files'], 'other file')} skipped, "
+            f"{_count(report['other_files'], 'other file')} skipped{_list_suffixes(report)}, "
             f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
     print_failures(report, "refused", "failed")

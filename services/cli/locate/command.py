@@ -17,12 +17,7 @@ from rich.table import Column
 from placewise.answers import Similar
 from placewise.client import Client
 from services.cli.client import connect
-from services.cli.locate.folder import (
-    FolderPhoto,
-    check_time_zones,
-    read_folder,
-    read_gpx,
-)
+from services.cli.locate.folder import FolderPhoto, check_time_zones, read_folder, read_gpx
 from services.cli.locate.undo_journal import UndoReport, undo
 from services.cli.locate.writers import Location, Target, WriteReport, write_locations
 from services.cli.output import (
@@ -39,7 +34,6 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
-    report_errors,
 )
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
@@ -156,38 +150,37 @@ def locate(
     taken shortly before and after and have coordinates, and a GPX track. Coordinates that a photo
     has are never changed.
     """
-    with report_errors(as_json):
-        if undo_changes:
-            _report_undo(undo(folder), as_json)
-            return
-        moves = _parse_motion(motion)
-        photos = read_folder(folder, time_zone, clock_offset)
-        if together:
-            check_time_zones(photos, "--together")
-        track: Sequence[KnownPosition] = ()
-        if gpx is not None:
-            check_time_zones([p for p in photos if p.latitude is None], "--gpx")
-            track = read_gpx(gpx)
-        unlocated = [photo for photo in photos if photo.latitude is None]
-        searches: Sequence[Similar | str | None] = [None] * len(unlocated)
-        photo_count = 0
-        if picture and unlocated:
-            with connect(server, map_name, key) as client:
-                photo_count = client.stats().searchable_images
-                searches = _search_photos(client, unlocated)
-        neighbours = TimeNeighbours(photos, together)
-        located = [
-            _locate_photo(photo, search, photo_count, neighbours, track, moves, radius)
-            for photo, search in zip(unlocated, searches, strict=True)
-        ]
-        accepted = [each for each in located if each.probability >= max(accept, 1e-9)]
-        written = None
-        if write is not None:
-            written = write_locations(folder, write, [_location(each) for each in accepted])
-        if as_json:
-            print_json(_to_json(photos, located, accept, written))
-        else:
-            _print_proposals(folder, photos, located, accepted, accept, written)
+    if undo_changes:
+        _report_undo(undo(folder), as_json)
+        return
+    moves = _parse_motion(motion)
+    photos = read_folder(folder, time_zone, clock_offset)
+    if together:
+        check_time_zones(photos, "--together")
+    track: Sequence[KnownPosition] = ()
+    if gpx is not None:
+        check_time_zones([p for p in photos if p.latitude is None], "--gpx")
+        track = read_gpx(gpx)
+    unlocated = [photo for photo in photos if photo.latitude is None]
+    searches: Sequence[Similar | str | None] = [None] * len(unlocated)
+    photo_count = 0
+    if picture and unlocated:
+        with connect(server, map_name, key) as client:
+            photo_count = client.stats().searchable_images
+            searches = _search_photos(client, unlocated)
+    neighbours = TimeNeighbours(photos, together)
+    located = [
+        _locate_photo(photo, search, photo_count, neighbours, track, moves, radius)
+        for photo, search in zip(unlocated, searches, strict=True)
+    ]
+    accepted = [each for each in located if each.probability >= max(accept, 1e-9)]
+    written = None
+    if write is not None:
+        written = write_locations(folder, write, [_location(each) for each in accepted])
+    if as_json:
+        print_json(_to_json(photos, located, accept, written))
+    else:
+        _print_proposals(folder, photos, located, accepted, accept, written)
     if any(each.error for each in located) or (written is not None and written.skipped):
         raise typer.Exit(1)
 
@@ -263,7 +256,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
                 photo.latitude,
                 photo.longitude,
                 photo.similarity_score if photo.weighted_score is None else photo.weighted_score,
-                photo.original_filename,
+                photo.relative_path or photo.original_filename,
             )
             for photo in answer.similar_images
             if photo.latitude is not None and photo.longitude is not None
@@ -347,8 +340,10 @@ def _print_proposals(
             escape(each.error or (found.reason if found else "nothing is known about its place")),
             style=None if each in accepted else "dim",
         )
-    if located:
-        print_table(table)
+    if not located:
+        print_message(f"All {len(photos)} photos have coordinates: there is nothing to locate.")
+        return
+    print_table(table)
     print_message(
         f"{len(photos) - len(located)} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "

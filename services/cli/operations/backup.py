@@ -25,7 +25,6 @@ from services.cli.output import (
     print_note,
     print_result,
     progress_bar,
-    report_errors,
     stage_bars,
 )
 
@@ -47,7 +46,7 @@ def backup(
     The exit code is 1 if an object that the catalog refers to is missing or damaged. The backup
     then contains everything else.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import back_up
 
         manifest = back_up(read_settings(), out, progress)
@@ -77,7 +76,7 @@ def restore(
 
     An interrupted restore resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations import maintenance
 
         manifest, restored = maintenance.restore(read_settings(), source, progress)
@@ -108,7 +107,7 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     Recovers photos with their metadata, maps, generations and vocabularies. An interrupted rebuild
     resumes when the command is run again.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import rebuild
 
         taken = rebuild(read_settings(), progress)

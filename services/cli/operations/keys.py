@@ -25,7 +25,6 @@ from services.cli.output import (
     print_json,
     print_result,
     print_table,
-    report_errors,
 )
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
@@ -76,38 +75,36 @@ def create(
         "upload_bytes_per_day": upload_bytes_per_day,
         "max_photos": max_photos,
     }
-    with report_errors(as_json):
-        with _open_keys(server, key) as keys:
-            created = keys.create_key(name, list(scope), days=days, maps=maps or None, **limits)
-        if as_json:
-            print_json(created)
-            return
-        # The key alone goes to stdout, so that it can be redirected to a file.
-        typer.echo(created.key)
-        typer.echo("This key is shown only once. Use it as PLACEWISE_KEY.", err=True)
+    with _open_keys(server, key) as keys:
+        created = keys.create_key(name, list(scope), days=days, maps=maps or None, **limits)
+    if as_json:
+        print_json(created)
+        return
+    # The key alone goes to stdout, so that it can be redirected to a file.
+    typer.echo(created.key)
+    typer.echo("This key is shown only once. Use it as PLACEWISE_KEY.", err=True)
 
 
 @app.command("list")
 def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
     """List all keys, including revoked and expired ones, without their secrets."""
-    with report_errors(as_json):
-        with _open_keys(server, key) as keys:
-            listed = keys.keys()
-        if as_json:
-            print_json(listed)
-            return
-        table = Table("key", "name", "scopes", "maps", "created", "last used", "state")
-        for item in listed:
-            table.add_row(
-                f"{item.prefix}...",
-                item.name,
-                ", ".join(item.scopes),
-                "all" if item.maps is None else ", ".join(item.maps),
-                f"{item.created_at:%Y-%m-%d}",
-                f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
-                _key_status(item),
-            )
-        print_table(table)
+    with _open_keys(server, key) as keys:
+        listed = keys.keys()
+    if as_json:
+        print_json(listed)
+        return
+    table = Table("key", "name", "scopes", "maps", "created", "last used", "state")
+    for item in listed:
+        table.add_row(
+            f"{item.prefix}...",
+            item.name,
+            ", ".join(item.scopes),
+            "all" if item.maps is None else ", ".join(item.maps),
+            f"{item.created_at:%Y-%m-%d}",
+            f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
+            _key_status(item),
+        )
+    print_table(table)
 
 
 @app.command("revoke")
@@ -118,10 +115,9 @@ def revoke(
     as_json: JsonOption = False,
 ) -> None:
     """Revoke a key with immediate effect."""
-    with report_errors(as_json):
-        with _open_keys(server, key) as keys:
-            revoked = keys.revoke_key(_resolve_key_id(which, keys.keys()))
-        print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
+    with _open_keys(server, key) as keys:
+        revoked = keys.revoke_key(_resolve_key_id(which, keys.keys()))
+    print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
 
 
 class _CatalogKeys:

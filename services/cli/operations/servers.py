@@ -15,7 +15,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
-from services.cli.output import err_console, print_note, report_errors
+from services.cli.output import err_console, print_note
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
 
@@ -31,29 +31,28 @@ def serve() -> None:
     repository, the server restarts when its code changes.
     """
     changed = threading.Event()
-    with report_errors(as_json=False):
-        from services.code_reload import can_reload, restart_process, watch_code
-        from services.standalone import serve_standalone
+    from services.code_reload import can_reload, restart_process, watch_code
+    from services.standalone import serve_standalone
 
-        settings = read_settings()
-        is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
+    settings = read_settings()
+    is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
 
-        def announce(running: Standalone) -> None:
-            print_note(_startup_message(running, settings))
-            if is_first_start and settings.database_url is None:
-                from services.cli.descriptors.local_weights import suggest_extractor
+    def announce(running: Standalone) -> None:
+        print_note(_startup_message(running, settings))
+        if is_first_start and settings.database_url is None:
+            from services.cli.descriptors.local_weights import suggest_extractor
 
-                if suggestion := suggest_extractor(settings):
-                    print_note(f"  note:     {suggestion}")
-            if settings.debug and can_reload():
+            if suggestion := suggest_extractor(settings):
+                print_note(f"  note:     {suggestion}")
+        if settings.debug and can_reload():
 
-                def restart() -> None:
-                    changed.set()
-                    running.server.should_exit = True
+            def restart() -> None:
+                changed.set()
+                running.server.should_exit = True
 
-                watch_code(restart)
+            watch_code(restart)
 
-        serve_standalone(settings, announce)
+    serve_standalone(settings, announce)
     if changed.is_set():
         restart_process()
 
@@ -117,10 +116,9 @@ def search() -> None:
     The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
     gateway and the steward, which find it through SEARCH_URLS.
     """
-    with report_errors(as_json=False):
-        from services.search.service import serve_search
+    from services.search.service import serve_search
 
-        serve_search(read_settings(), print_note)
+    serve_search(read_settings(), print_note)
 
 
 def gateway() -> None:
@@ -128,10 +126,9 @@ def gateway() -> None:
 
     Every call requires an API key: ADMIN_KEY, or one created with `placewise keys`.
     """
-    with report_errors(as_json=False):
-        from services.gateway.service import serve_gateway
+    from services.gateway.service import serve_gateway
 
-        serve_gateway(read_settings(), print_note)
+    serve_gateway(read_settings(), print_note)
 
 
 def extractor() -> None:
@@ -139,10 +136,9 @@ def extractor() -> None:
 
     It is a Celery worker on REDIS_URL, DATABASE_URL and the object store.
     """
-    with report_errors(as_json=False):
-        from services.extractor.service import serve_extractor
+    from services.extractor.service import serve_extractor
 
-        serve_extractor(read_settings(), print_note)
+    serve_extractor(read_settings(), print_note)
 
 
 def steward() -> None:
@@ -150,10 +146,9 @@ def steward() -> None:
 
     Any number of stewards can run at the same time.
     """
-    with report_errors(as_json=False):
-        from services.steward.service import serve_steward
+    from services.steward.service import serve_steward
 
-        serve_steward(read_settings(), print_note)
+    serve_steward(read_settings(), print_note)
 
 
 def migrate() -> None:
@@ -162,8 +157,7 @@ def migrate() -> None:
     Run it once per release, before the new services start. Services of the previous release keep
     working during the migration.
     """
-    with report_errors(as_json=False):
-        from services.service_process import migrate_catalog
+    from services.service_process import migrate_catalog
 
-        installation_id = migrate_catalog(read_settings())
+    installation_id = migrate_catalog(read_settings())
     print_note(f"The catalog's schema is up to date (installation {installation_id})")

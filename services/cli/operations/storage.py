@@ -22,7 +22,6 @@ from services.cli.output import (
     print_message,
     print_note,
     print_result,
-    report_errors,
 )
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def verify(
     The exit code is 1 if a fault is found, even if it is repaired. If the catalog is older than the
     object store, --repair also recovers the missing records from the store's journal.
     """
-    with report_errors(as_json), progress_reporter() as progress:
+    with progress_reporter() as progress:
         from services.cli.operations.maintenance import verify_storage
 
         result = verify_storage(read_settings(), progress, originals=originals, repair=repair)
@@ -144,11 +143,10 @@ def create_bucket_command(as_json: JsonOption = False) -> None:
 
     S3_ACCESS_KEY must be allowed to create buckets. Placewise itself does not need this permission.
     """
-    with report_errors(as_json):
-        from shared.storage.s3 import Bucket, create_bucket  # importing minio is slow
+    from shared.storage.s3 import Bucket, create_bucket  # importing minio is slow
 
-        bucket = Bucket.from_settings(read_settings())
-        created = create_bucket(bucket)
+    bucket = Bucket.from_settings(read_settings())
+    created = create_bucket(bucket)
     state = "was created" if created else "already exists"
     print_result(
         {"bucket": bucket.name, "endpoint": bucket.endpoint, "made": created},
@@ -165,10 +163,9 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     services with the previous catalog refuse to start afterwards. Objects that are not in this
     catalog are kept until you run `placewise storage collect --confirm`.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import adopt_storage
+    from services.cli.operations.maintenance import adopt_storage
 
-        count = adopt_storage(read_settings(), confirm=confirm)
+    count = adopt_storage(read_settings(), confirm=confirm)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
@@ -191,11 +188,10 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
     overrides a hold on garbage collection. Services can keep running.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import collect_storage
+    from services.cli.operations.maintenance import collect_storage
 
-        settings = read_settings()
-        count, moved, hold = collect_storage(settings, confirm=confirm)
+    settings = read_settings()
+    count, moved, hold = collect_storage(settings, confirm=confirm)
     if as_json:
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
@@ -229,10 +225,9 @@ def restore(
     ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise rebuild-catalog`
     rebuilds a catalog from all objects.
     """
-    with report_errors(as_json):
-        from services.cli.operations.maintenance import restore_from_trash
+    from services.cli.operations.maintenance import restore_from_trash
 
-        counts = restore_from_trash(read_settings(), prefix)
+    counts = restore_from_trash(read_settings(), prefix)
     restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})

@@ -30,7 +30,6 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
-    report_errors,
 )
 from services.cli.track.frame_sources import (
     FrameTiming,
@@ -124,36 +123,35 @@ def track(
     shows it.
     """
     files = out or []
-    with report_errors(as_json):
-        check_track_files(files)
-        timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
-        with (
-            connect(server, map_name, key) as client,
-            progress_bar() as progress,
-            tempfile.TemporaryDirectory() as folder,
-        ):
-            frames = (
-                read_photo_frames(source, timing)
-                if source.is_dir()
-                else read_video_frames(source, timing, Path(folder))
-            )
-            begun = client.begin_track(motion=motion, max_speed_mps=max_speed)
-            _send_frames(client, begun.track_id, frames, gps_accuracy, progress)
-            try:
-                result = client.track(begun.track_id, smoothed=smoothed)
-            except Conflict as error:
-                if error.code != "track_too_long":
-                    raise
-                print_note(error.detail)
-                result = client.track(begun.track_id)
-            draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
-            photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
-        for file in files:
-            write_track_file(file, result, photos)
-        if as_json:
-            print_json(result)
-        else:
-            _print_track(result, files)
+    check_track_files(files)
+    timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
+    with (
+        connect(server, map_name, key) as client,
+        progress_bar() as progress,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        frames = (
+            read_photo_frames(source, timing)
+            if source.is_dir()
+            else read_video_frames(source, timing, Path(folder))
+        )
+        begun = client.begin_track(motion=motion, max_speed_mps=max_speed)
+        _send_frames(client, begun.track_id, frames, gps_accuracy, progress)
+        try:
+            result = client.track(begun.track_id, smoothed=smoothed)
+        except Conflict as error:
+            if error.code != "track_too_long":
+                raise
+            print_note(error.detail)
+            result = client.track(begun.track_id)
+        draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
+        photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
+    for file in files:
+        write_track_file(file, result, photos)
+    if as_json:
+        print_json(result)
+    else:
+        _print_track(result, files)
 
 
 def _send_frames(

@@ -35,7 +35,6 @@ from services.cli.output import (
     print_message,
     print_note,
     print_table,
-    report_errors,
 )
 from services.cli.training.options import given_options, with_training_options
 from services.trainer.arguments import build_arguments, load_yaml
@@ -166,9 +165,8 @@ def train(
     False. Option names may contain hyphens or underscores. A run stopped with Ctrl-C can be
     continued with --resume.
     """
-    with report_errors(as_json):
-        require_packages(*TRAINING_PACKAGES)
-        report = _run_training(config, resume, given_options(arguments))
+    require_packages(*TRAINING_PACKAGES)
+    report = _run_training(config, resume, given_options(arguments))
     if as_json:
         print_json(report)
     else:
@@ -217,9 +215,8 @@ def grid(
     grid continues, unless no other run can start for the same reason. Options of `placewise train`
     override those of every run.
     """
-    with report_errors(as_json):
-        require_packages(*TRAINING_PACKAGES)
-        failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
+    require_packages(*TRAINING_PACKAGES)
+    failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
     if failed:
         raise typer.Exit(1)
 

@@ -14,11 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from services.trainer.arguments import (
-    TrainingArguments,
-    argument_group,
-    normalise_name,
-)
+from services.trainer.arguments import TrainingArguments, argument_group, normalise_name
 
 FIELDS = TrainingArguments.model_fields
 BOOLEANS = {name for name, field in FIELDS.items() if field.annotation is bool}

@@ -58,7 +58,7 @@ from shared.ingest.photo_metadata import (
     parse_time,
 )
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.transitions import cancel_jobs, requeue_job
+from shared.jobs.transitions import cancel_jobs, repeat_job
 from shared.storage.keys import preview_key, thumbnail_key
 
 router = APIRouter(tags=["photos"])
@@ -272,12 +272,13 @@ def _queue_preview(
             kind=JobKind.INDEX,
             priority=Priority.UPLOAD,
             photo_id=photo.id,
+            result={"file_id": str(photo.id)},  # described before: webhooks get no second event
         )
         session.add(job)
         session.flush()
         get_photo(session, photo.map_id, photo.id).job_id = job.id
     else:
-        requeue_job(job)
+        repeat_job(job)
         session.flush()
     return job
 

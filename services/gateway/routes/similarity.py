@@ -48,7 +48,7 @@ from services.gateway.uploads.query_photo import (
     query_job_search_params,
     receive_query_photo,
 )
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
@@ -56,6 +56,7 @@ from shared.ingest.validation import StoredUpload
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import query_expired_error
+from shared.storage.keys import query_preview_key
 
 router = APIRouter(tags=["similarity"])
 
@@ -176,6 +177,32 @@ async def read_similarity_result(
         )
     wait = gateway.settings.compare_wait_seconds
     return await _wait_for_result(gateway, response, job, query.map, wait)
+
+
+@router.get(
+    "/jobs/{job_id}/preview",
+    operation_id="get_query_preview",
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}, "description": "the preview"}},
+    dependencies=[READ],
+)
+def read_query_preview(gateway: GatewayDep, job_id: JobId, query: MapQuery) -> Response:
+    """Get an uploaded query photo as browsers show it: an upright JPEG of at most 1,600 pixels.
+
+    It exists once the photo is described, if the photo is a HEIC, TIFF or BMP file, until the query
+    is deleted.
+    """
+    with gateway.catalog.read() as session:
+        job = get_job(session, get_map(session, query.map).id, job_id)
+    try:
+        data = gateway.store.get(query_preview_key(job.id))
+    except NotFound:
+        raise NotFound(
+            "preview_not_found",
+            "The job has no preview: its photo is not described yet, or all browsers show its "
+            "format.",
+        ) from None
+    return Response(data, media_type="image/jpeg", headers={"Cache-Control": "private, no-cache"})
 
 
 async def _wait_for_result(

@@ -29,7 +29,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
 from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import multipart_schema, use_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
@@ -89,32 +89,34 @@ async def upload_photo(
     with `Prefer: wait=N`, 201 once the photo is searchable. If the map already has the same bytes,
     the existing photo is returned (200), or queued again after a failed job (202).
     """
+    key_id = get_caller(request).key_id
+    quota = reserve_photo_quota(request, gateway.settings)
+
+    def store_row(received: StoredUpload) -> tuple[StoreResult, str]:
+        def store_response(session: Session, stored: StoreResult) -> StoreResult:
+            outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
+            idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
+            return stored
+
+        idempotent.claim_received(gateway.store, received)
+        stored = _store_upload(gateway, query.map, received, key_id, quota, store_response)
+        return stored, received.key
+
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        received = await store_form_file(
+        stored, key = await use_form_file(
             request,
             gateway.store,
             lambda filename: new_original_key(photo_suffix(filename)),
             gateway.settings.max_file_size,
+            store_row,
             check_photo_signature,
         )
-    await idempotent.claim_form(gateway.store, received)
-
-    def store_response(session: Session, stored: StoreResult) -> StoreResult:
-        outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
-        idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-        return stored
-
-    key_id = get_caller(request).key_id
-    quota = reserve_photo_quota(request, gateway.settings)
-    stored = await run_in_threadpool(
-        _store_upload, gateway, query.map, received, key_id, quota, store_response
-    )
 
     def replace_response(outcome: UploadOutcome) -> None:
         idempotent.replace_response(outcome.status, outcome.body, outcome.headers)
 
     return await respond_to_upload(
-        request, response, gateway, query.map, stored, received.key, replace_response
+        request, response, gateway, query.map, stored, key, replace_response
     )
 
 

@@ -8,7 +8,7 @@ A body that is too large, or whose file is not a photo, is refused without readi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from fastapi import Request
 from python_multipart.exceptions import MultipartParseError
@@ -160,6 +160,7 @@ def _parse_boundary(request: Request) -> bytes:
 
 
 FILE_FIELD = "file"
+Result = TypeVar("Result")
 # Size of one write to the store: each write is a switch to a worker thread.
 STORE_WRITE_BYTES = 512 * 1024
 
@@ -173,20 +174,39 @@ async def store_form_file(
     *,
     too_large: Callable[[int], PlacewiseError] = file_too_large_error,
 ) -> StoredUpload:
-    """Store the file of a form in the object store while it is received.
+    """Store the file of a form as `use_form_file` does, and return it."""
+    return await use_form_file(
+        request, store, make_key, max_bytes, lambda upload: upload, check_begin, too_large=too_large
+    )
 
-    Nothing is left in the store if it raises.
+
+async def use_form_file(
+    request: Request,
+    store: ObjectStore,
+    make_key: Callable[[str], str],
+    max_bytes: int,
+    use: Callable[[StoredUpload], Result],
+    check_begin: Callable[[bytes], object] = lambda begin: None,
+    *,
+    too_large: Callable[[int], PlacewiseError] = file_too_large_error,
+) -> Result:
+    """Store the file of a form in the object store while it is received, and use it.
+
+    Nothing is left in the store if it raises before `use` is called.
 
     Args:
         request: The request whose body is read.
         store: The object store.
         make_key: Makes the object key of the file from its name.
         max_bytes: Maximum size of the file.
+        use: Called with the stored file and the text fields of the form, in the worker thread that
+            has completed the object: a change of threads costs as much as a statement. The object
+            belongs to it, also if it raises.
         check_begin: Called with the first bytes before the rest is read; may raise.
         too_large: Builds the exception for a file of more than `max_bytes`.
 
     Returns:
-        The stored file, with the text fields of the form.
+        What `use` returns.
 
     Raises:
         InvalidRequest: No multipart body, no file, several files or an empty file.
@@ -214,20 +234,26 @@ async def store_form_file(
         if small_file == b"":
             raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
         key = key or make_key(parts.filename)
-        await run_in_threadpool(_finish_object, store, key, writer, rest)
+
+        def finish_and_use() -> Result:
+            _finish_object(store, key, writer, rest)
+            return use(
+                StoredUpload(
+                    key=key,
+                    filename=parts.filename,
+                    size_bytes=parts.file.size_bytes,
+                    sha256=parts.file.sha256,
+                    first_bytes=parts.file.first_bytes,
+                    fields=parts.fields,
+                    content=small_file,
+                )
+            )
+
+        return await run_in_threadpool(finish_and_use)
     except BaseException:
         if writer is not None:
             await run_in_threadpool(writer.abort)
         raise
-    return StoredUpload(
-        key=key,
-        filename=parts.filename,
-        size_bytes=parts.file.size_bytes,
-        sha256=parts.file.sha256,
-        first_bytes=parts.file.first_bytes,
-        fields=parts.fields,
-        content=small_file,
-    )
 
 
 def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:

@@ -14,21 +14,12 @@ from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from services.steward.tasks.model_changes import (
-    adopt_failed_reindex_jobs,
-    delete_done_reindex_jobs,
-)
+from services.steward.tasks.model_changes import adopt_failed_reindex_jobs, delete_done_reindex_jobs
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import (
-    MODEL_CHANGE_JOBS,
-    QUERY_JOBS,
-    UNFINISHED_STATES,
-    Job,
-    JobKind,
-)
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending

@@ -108,6 +108,7 @@ function addGround(map, element, settings) {
   const lines = L.layerGroup().addTo(map);
   const drawLines = () => drawGraticule(map, lines);
   map.on("moveend resize", drawLines);
+  if (map.getSize().x) drawLines();
   if (!settings.map_tiles) return;
   const { origin } = new URL(settings.map_tiles, location.href);
   const tiles = L.tileLayer(settings.map_tiles, { attribution: escaped(settings.map_attribution), className: "streets", maxZoom: MOST_ZOOM, maxNativeZoom: 19 });

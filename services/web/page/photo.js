@@ -93,8 +93,15 @@ export const thumbnail = (photo, alt = nameOf(photo)) => picture(photo.thumbnail
 /** The photo at the size of a screen. */
 export const preview = (photo, alt = nameOf(photo)) => picture(photo.preview_url, photo, alt);
 
-/** A file of this machine; where the browser can't show its format, as it can't HEIC, a drawing in its place. */
-export function localPicture(file, attributes) {
+// Formats that only some browsers show, by the file's name: not all systems know their media types.
+const OTHER_FORMAT = /\.(heic|heif|tiff?)$/i;
+
+/** Whether some browsers can't show the file. */
+export const mayNeedPreview = (file) => OTHER_FORMAT.test(file.name);
+
+/** A file of this machine; where the browser can't show its format, as it can't HEIC, the server's
+ * `preview` (a promise of its response, or of null), and until then a drawing. */
+export function localPicture(file, attributes, preview = null) {
   const url = URL.createObjectURL(file);
   const image = h("img", { src: url, ...attributes });
   image.addEventListener("load", () => URL.revokeObjectURL(url));
@@ -102,6 +109,11 @@ export function localPicture(file, attributes) {
     URL.revokeObjectURL(url);
     image.src = "/console/unshown.svg";
     image.title = "This browser can’t show photos of this format.";
+    preview?.then(async (response) => {
+      if (response === null) return; // the drawing stays
+      await draw(image, response.clone());
+      image.removeAttribute("title");
+    }).catch(noteError);
   }, { once: true });
   return image;
 }

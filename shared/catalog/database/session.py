@@ -244,6 +244,15 @@ class ChangePoll:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._seen = -1
+        self._look_at = 0.0
+
+    def is_due(self, longest_seconds: float = IDLE_SECONDS) -> bool:
+        """Return whether a loop that does not `wait` here has to look now, which counts as done."""
+        commits, now = self._catalog.commits.count, time.monotonic()
+        if self._catalog.is_sqlite and commits == self._seen and now < self._look_at:
+            return False
+        self._seen, self._look_at = commits, now + longest_seconds
+        return True
 
     def wait(
         self, stop: threading.Event, interval_seconds: float, longest_seconds: float = IDLE_SECONDS
@@ -276,5 +285,7 @@ def _begin_sqlite(connection: Any) -> None:
     # IMMEDIATE acquires the write lock at once: otherwise a transaction that reads before it writes
     # fails when another one writes in between.
     writes = connection.get_execution_options().get("placewise_write", True)
-    connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
+    if connection.info.get("placewise_write") != writes:
+        connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
+        connection.info["placewise_write"] = writes
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

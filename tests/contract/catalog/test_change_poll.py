@@ -39,6 +39,18 @@ def test_commit_without_changes_and_heartbeat_end_no_wait(catalog: Catalog) -> N
     assert catalog.commits.count == count
 
 
+def test_a_loop_that_waits_by_itself_looks_after_a_commit_and_seldom_without(
+    catalog: Catalog,
+) -> None:
+    poll = ChangePoll(catalog)
+    assert poll.is_due(60.0), "the first look"
+    assert poll.is_due(60.0) is not catalog.is_sqlite
+    with catalog.write() as session:
+        add_map(session)
+    assert poll.is_due(0.0)
+    assert poll.is_due(60.0), "as long after the last look as it was told"
+
+
 def test_stop_ends_the_wait(catalog: Catalog) -> None:
     poll, stop = ChangePoll(catalog), threading.Event()
     poll.wait(stop, 0.0, 0.0)

@@ -21,6 +21,7 @@ from services.extractor.decoder_pool import MAX_DECODE_ATTEMPTS, SCHEDULED_PER_P
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto
+from shared.imaging.file_formats import Previews
 from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
 from tests.support.photos import photo_bytes
 
@@ -114,7 +115,7 @@ def test_a_jpeg_of_200_megapixels_is_decoded_within_the_memory_limit(
         buffer = io.BytesIO()
         stripes = Image.effect_noise((200, 200), 50).resize((20_000, 10_000)).convert("RGB")
         stripes.save(buffer, "JPEG", quality=60, progressive=progressive)
-        (outcome,) = pool.decode([buffer.getvalue()], SQUARE, with_previews=True)
+        (outcome,) = pool.decode([buffer.getvalue()], SQUARE, previews=Previews.ALL)
         assert is_good(outcome)
         # Not ru_maxrss, which a child has from the process that started it.
         peak_kib = int(

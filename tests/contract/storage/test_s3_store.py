@@ -15,7 +15,7 @@ from minio.lifecycleconfig import LifecycleConfig
 from typer.testing import CliRunner
 from urllib3.exceptions import ProtocolError
 
-from services.cli.operations import storage
+from services.cli.main import build_app
 from services.cli.operations.deployment_checks import check_object_store
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, Unavailable
@@ -255,7 +255,9 @@ def test_command_makes_the_bucket_and_is_content_with_one(
     name = f"{bucket.name}-cli"
     for variable, value in s3.variables(name).items():
         monkeypatch.setenv(variable.upper(), str(value))
-    results = [CliRunner().invoke(storage.app, ["create-bucket"]) for _ in range(2)]
+    results = [
+        CliRunner().invoke(build_app(["storage"]), ["storage", "create-bucket"]) for _ in range(2)
+    ]
     assert [result.exit_code for result in results] == [0, 0]
     assert "was created" in results[0].stdout
     assert "already exists" in results[1].stdout
@@ -263,7 +265,7 @@ def test_command_makes_the_bucket_and_is_content_with_one(
 
 
 def test_command_without_an_endpoint_says_what_to_set() -> None:
-    result = CliRunner().invoke(storage.app, ["create-bucket"])
+    result = CliRunner().invoke(build_app(["storage"]), ["storage", "create-bucket"])
     assert result.exit_code == 1
     assert "S3_ENDPOINT" in result.output
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 import signal
 import subprocess
@@ -91,24 +91,28 @@ def test_what_a_library_may_read_at_its_import_is_executed(tmp_path: Path) -> No
 
 def test_it_ends_with_tests_that_are_killed(tmp_path: Path) -> None:
     script = (
-        "import json, sys, time\n"
+        "import sys, time\n"
         "from pathlib import Path\n"
-        "from tests.support.processes import PLACEWISE, _fork_server, start\n"
+        "from tests.support.processes import PLACEWISE, start\n"
         "from tests.support.server import environment\n"
         "cwd = Path(sys.argv[1])\n"
         "log = (cwd / 'log').open('wb')\n"
         "env = environment(cwd / 'home')\n"
         "process = start([PLACEWISE, 'serve'], env=env, cwd=cwd, stdout=log, stderr=log)\n"
-        "print(json.dumps([process.pid, _fork_server().pid]), flush=True)\n"
+        "print(process.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", script, str(tmp_path)],
         cwd=REPOSITORY,
+        env={**os.environ, "PYTEST_XDIST_TESTRUNUID": str(tmp_path)},  # of another run
         stdout=subprocess.PIPE,
         text=True,
     ) as tests:
         assert tests.stdout is not None
-        processes = [psutil.Process(pid) for pid in json.loads(tests.stdout.readline())]
+        process = psutil.Process(int(tests.stdout.readline()))
+        server = process.parent()
+        assert server is not None
+        assert tests.pid == server.ppid()
         tests.send_signal(signal.SIGKILL)
-    wait_until(lambda: all(has_ended(process) for process in processes))
+    wait_until(lambda: has_ended(process) and has_ended(server))

@@ -112,3 +112,17 @@ def test_a_photo_that_can_not_be_decoded_has_no_preview_and_the_reason(service: 
     refused = service("GET", f"/uploads/{file_id}/preview")
     assert (refused.status_code, refused.json()["code"]) == (404, "preview_not_found")
     assert "can't be decoded" in refused.json()["detail"]
+
+
+def test_a_query_photo_has_a_preview_if_not_all_browsers_show_its_format(service: Service) -> None:
+    expected = {"TIFF": (200, (1600, 800)), "JPEG": (404, None)}
+    for media, (status, size) in expected.items():
+        data = encoded(photo_image(7, 2400, 1200), media)
+        job_id = service.json("POST", "/similarity", 202, files={"file": ("asked", data)})["job_id"]
+        assert service("GET", f"/jobs/{job_id}/preview").status_code == 404, "not described yet"
+        service.drain()
+        answer = service("GET", f"/jobs/{job_id}/preview")
+        assert answer.status_code == status, media
+        if size is not None:
+            with Image.open(io.BytesIO(answer.content)) as image:
+                assert (image.format, image.size) == ("JPEG", size)

@@ -32,6 +32,7 @@ from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobState
 from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
 from shared.storage import FolderStore
+from shared.storage.keys import preview_key
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.integration.steward.webhook_receiver import (
     Receiver,
@@ -100,8 +101,12 @@ class WebhookSetup:
     def photo(self, number: int = 1) -> dict[str, Any]:
         """One that was put in and described."""
         uploaded: dict[str, Any] = self.door.put(ADMIN, number).json()
-        self._make_worker().drain(threading.Event())
+        self.describe()
         return uploaded
+
+    def describe(self) -> None:
+        """Describe all queued photos."""
+        self._make_worker().drain(threading.Event())
 
     def log(self, webhook: dict[str, Any] | None = None) -> list[dict[str, Any]]:
         webhook_id = (webhook or self.webhook)["id"]
@@ -145,6 +150,20 @@ def test_a_described_photo_is_delivered_and_signed(hooks: WebhookSetup) -> None:
     )
     assert message.headers["webhook-id"] == f"msg_{delivery['event_id']}"
     assert hooks.send() == 0, "a successful delivery is not repeated"
+
+
+def test_a_photo_whose_preview_is_made_again_is_not_delivered_again(hooks: WebhookSetup) -> None:
+    uploaded = hooks.door(
+        ADMIN, "POST", "/upload", files={"file": ("photo.tiff", photo_bytes(1, "TIFF"))}
+    ).json()
+    hooks.describe()
+    assert hooks.send() == 1
+    preview = f"/uploads/{uploaded['file_id']}/preview"
+    hooks.door.store.delete(preview_key(UUID(uploaded["file_id"])))
+    assert hooks.door(ADMIN, "GET", preview).status_code == 202
+    hooks.describe()
+    assert hooks.door(ADMIN, "GET", preview).status_code == 200
+    assert hooks.send() == 0
 
 
 def test_only_subscribed_events_are_delivered_and_to_each_webhook_alone(
@@ -423,7 +442,7 @@ def test_a_failed_job_and_a_finished_batch_are_delivered(
     store = hooks.door.store
     worker = BatchWorker(hooks.door.catalog, store, InProcessWakeups(), settings, "steward")
     worker.run_next(threading.Event())
-    hooks._make_worker().drain(threading.Event())
+    hooks.describe()
     with hooks.door.catalog.write() as session:
         session.execute(update(Job).values(run_after=None))
     worker.run_next(threading.Event())

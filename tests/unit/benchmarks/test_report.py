@@ -9,9 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.report import LatencySummary, Report
-from services.cli.bench import app
+from services.cli.main import build_app
 
 runner = CliRunner()
+app = build_app(["bench"])
 
 
 @pytest.mark.parametrize(
@@ -42,7 +43,7 @@ def test_missed_figure_is_exit_code_1(monkeypatch: pytest.MonkeyPatch, missed: b
             return report
 
     monkeypatch.setattr(importlib, "import_module", lambda name: Program)
-    ended = runner.invoke(app, ["rolling"])
+    ended = runner.invoke(app, ["bench", "rolling"])
     assert ended.exit_code == missed
     assert ("missed" in ended.output) == missed
 
@@ -52,7 +53,7 @@ def test_without_a_checkout_it_says_what_is_needed(monkeypatch: pytest.MonkeyPat
         raise ModuleNotFoundError("No module named 'benchmarks'", name="benchmarks")
 
     monkeypatch.setattr(importlib, "import_module", fail)
-    ended = runner.invoke(app, ["rolling", "--json"])
+    ended = runner.invoke(app, ["bench", "rolling", "--json"])
     assert ended.exit_code == 1
     assert '"code": "no_benchmarks"' in ended.output
     assert "make setup" in ended.output
@@ -60,7 +61,7 @@ def test_without_a_checkout_it_says_what_is_needed(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("workers", ["", "1,x", "0,1"])
 def test_numbers_that_are_none_are_refused(workers: str) -> None:
-    assert runner.invoke(app, ["scaling", "--workers", workers]).exit_code == 2
+    assert runner.invoke(app, ["bench", "scaling", "--workers", workers]).exit_code == 2
 
 
 def test_spread_is_of_the_slowest_too() -> None:

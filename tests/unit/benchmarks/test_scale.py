@@ -10,13 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.scale import PAGE, Sizing, format_amount, parse_assignments
-from services.cli.bench import app
+from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage.chunks import write_chunk
 from shared.storage.folder import FolderStore
 
 runner = CliRunner()
+app = build_app(["bench"])
 
 
 def plan_of(photos: int, dimension: int, **inputs: float) -> dict[str, float]:
@@ -99,7 +100,7 @@ def test_limits_come_with_the_lowest_first_and_follow_the_inputs() -> None:
 
 @pytest.mark.parametrize("given", ["price_gpu=2", "price_gpu_hour", "price_gpu_hour=no"])
 def test_what_is_no_input_is_refused(given: str) -> None:
-    ended = runner.invoke(app, ["scale", "--json", "--set", given])
+    ended = runner.invoke(app, ["bench", "scale", "--json", "--set", given])
     assert ended.exit_code == 1
     assert json.loads(ended.output)["code"] == "unknown_input"
 
@@ -107,9 +108,9 @@ def test_what_is_no_input_is_refused(given: str) -> None:
 def test_page_is_computed_from_its_own_inputs_only(tmp_path: Path) -> None:
     page = tmp_path / "scale.md"
     page.write_text(PAGE.read_text(encoding="utf-8"), encoding="utf-8")
-    ended = runner.invoke(app, ["scale", "--set", "ram_used=0.5", "--markdown", str(page)])
+    ended = runner.invoke(app, ["bench", "scale", "--set", "ram_used=0.5", "--markdown", str(page)])
     assert ended.exit_code == 2
-    assert runner.invoke(app, ["scale", "--markdown", str(page)]).exit_code == 0
+    assert runner.invoke(app, ["bench", "scale", "--markdown", str(page)]).exit_code == 0
     assert page.read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")
 
 
@@ -120,7 +121,7 @@ def test_an_input_is_a_positive_number(value: str) -> None:
 
 
 def test_json_has_inputs_plans_and_limits() -> None:
-    ended = runner.invoke(app, ["scale", "--json", "--set", "price_gpu_hour=7"])
+    ended = runner.invoke(app, ["bench", "scale", "--json", "--set", "price_gpu_hour=7"])
     assert ended.exit_code == 0
     found = json.loads(ended.output)
     assert found["inputs"]["price_gpu_hour"] == 7

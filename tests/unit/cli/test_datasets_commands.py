@@ -8,24 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
-from services.cli.datasets.commands import app
+from services.cli.main import build_app
 from shared.datasets.open_dataset import open_evaluation_set
 from tests.unit.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
 
 
-def called(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+def run(*arguments: object, code: int = 0) -> Result:
+    command = ["datasets", *map(str, arguments)]
+    result = CliRunner().invoke(build_app(["datasets"]), command)
     assert result.exit_code == code, result.output
-    return result.output
+    return result
+
+
+def called(*arguments: object, code: int = 0) -> str:
+    return run(*arguments, code=code).output
 
 
 def run_datasets(*arguments: object, code: int = 0) -> Any:
     """The answer as a program gets it."""
-    result = CliRunner().invoke(app, [*(str(argument) for argument in arguments), "--json"])
-    assert result.exit_code == code, result.output
-    return json.loads(result.stdout)
+    return json.loads(run(*arguments, "--json", code=code).stdout)
 
 
 def street(base: Path, folder: str, metres: list[float]) -> list[str]:

@@ -24,6 +24,7 @@ MAP: dict[str, Any] = {
     "dimension": None,
     "pca_from": None,
     "place_labels_are_paths": True,
+    "rows": "float16",
     "created_at": TIME,
 }
 
@@ -39,14 +40,24 @@ def test_create_makes_a_map_whose_labels_are_paths() -> None:
     assert json.loads(body) == {"name": "tower", "place_labels_are_paths": True}
 
 
-def test_list_says_whose_labels_are_paths() -> None:
+def test_create_makes_a_map_with_rows_in_half_precision() -> None:
+    with running_server() as server:
+        server.will_answer(201, MAP)
+        arguments = ["create", "tower", "--rows", "float16", "--server", server.url]
+        result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    _, _, body = server.requests[0]
+    assert json.loads(body) == {"name": "tower", "rows": "float16"}
+
+
+def test_list_says_whose_labels_are_paths_and_how_rows_are_stored() -> None:
     with running_server() as server:
         server.will_answer(200, [MAP, MAP | {"name": "city", "place_labels_are_paths": False}])
         result = CliRunner().invoke(app, ["list", "--server", server.url])
     assert result.exit_code == 0, result.output
     head, *rows = (line.split("\t") for line in result.output.splitlines())
     listed = [dict(zip(head, row, strict=True)) for row in rows]
-    assert [(each["map"], each["labels"]) for each in listed] == [
-        ("tower", "paths"),
-        ("city", "names"),
+    assert [(each["map"], each["labels"], each["rows"]) for each in listed] == [
+        ("tower", "paths", "float16"),
+        ("city", "names", "float16"),
     ]

@@ -14,7 +14,7 @@ import torch
 from typer.testing import CliRunner
 
 from services.cli.descriptors import local_weights as weights_here
-from services.cli.descriptors import models
+from services.cli.main import build_app
 from shared.config.settings import Settings
 from shared.descriptors import weight_files as download
 from shared.descriptors.backbones import torchhub as torchhub_code
@@ -64,7 +64,7 @@ def server(monkeypatch: pytest.MonkeyPatch, vits_weights: bytes) -> Iterator[Fil
 
 def command(*arguments: str, exit_code: int = 0) -> Any:
     """The JSON that `placewise models ARGUMENTS --json` prints."""
-    result = CliRunner().invoke(models.app, [*arguments, "--json"])
+    result = CliRunner().invoke(build_app(["models"]), ["models", *arguments, "--json"])
     assert result.exit_code == exit_code, result.output
     return json.loads(result.stdout)
 
@@ -100,7 +100,7 @@ def test_list_says_what_is_here_and_how_to_get_what_is_not(monkeypatch: pytest.M
 
 
 def test_table_shows_every_extractor() -> None:
-    result = CliRunner().invoke(models.app, ["list"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(build_app(["models"]), ["models", "list"], env={"COLUMNS": "200"})
     assert result.exit_code == 0, result.output
     for part in ("efficientnet-lite0-vlad", "18.8 MB", "Apache-2.0", "anyloc-vits14"):
         assert part in result.output
@@ -271,7 +271,7 @@ def test_an_archive_of_something_else_is_refused(
 
 def test_fetched_code_says_how_maps_may_use_it(caches: Path) -> None:
     name = f"torchhub:{write_hub(caches / 'hub', licence=None)}:colours"
-    result = CliRunner().invoke(models.app, ["fetch", name])
+    result = CliRunner().invoke(build_app(["models"]), ["models", "fetch", name])
     assert result.exit_code == 0, result.output
     reported = result.output.replace("\n", "")
     assert f"TORCHHUB_ALLOWED={name}" in reported

@@ -16,7 +16,7 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
 from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
-from shared.imaging.file_formats import detect_media_type
+from shared.imaging.file_formats import Previews, detect_media_type
 from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
 
@@ -246,7 +246,7 @@ def test_photos_that_are_large_or_that_browsers_do_not_show_get_a_preview(
     media: str, size: tuple[int, int], preview_size: tuple[int, int] | None
 ) -> None:
     data = encoded(Image.new("RGB", size, (1, 2, 3)), media)
-    preview = decode_photo(data, SQUARE, PIXELS, with_preview=True).preview
+    preview = decode_photo(data, SQUARE, PIXELS, previews=Previews.ALL).preview
     assert decode_photo(data, SQUARE, PIXELS).preview is None
     if preview_size is None:
         assert preview is None
@@ -256,11 +256,18 @@ def test_photos_that_are_large_or_that_browsers_do_not_show_get_a_preview(
             assert (image.format, image.size) == ("JPEG", preview_size)
 
 
+def test_previews_of_other_formats_leave_out_large_photos() -> None:
+    for media, has_preview in (("JPEG", False), ("TIFF", True)):
+        data = encoded(Image.new("RGB", (1601, 800), (1, 2, 3)), media)
+        decoded = decode_photo(data, SQUARE, PIXELS, previews=Previews.OTHER_FORMATS)
+        assert (decoded.preview is not None) is has_preview, media
+
+
 def test_a_preview_is_upright_and_carries_nothing_that_the_camera_wrote() -> None:
     exif = private_exif()
     exif[Base.Orientation] = 6
     data = encoded(photo_image(1, 2000, 1000), "JPEG", exif=exif)
-    preview = decode_photo(data, SQUARE, PIXELS, with_preview=True).preview
+    preview = decode_photo(data, SQUARE, PIXELS, previews=Previews.ALL).preview
     assert b"Secret" in data
     assert preview is not None
     assert b"Secret" not in preview

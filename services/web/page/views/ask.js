@@ -5,7 +5,7 @@ import { bar, button, fill, h, noteError, say } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
 import { nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
-import { localPicture, preview, thumbnail } from "../photo.js";
+import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
 import { drawRings, verdict } from "./verdict.js";
 
@@ -29,10 +29,12 @@ export async function showAsk(view, { signal, id }) {
   const map = await get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
   const entry = askEntry(map, (file) => {
     const small = shrinkPhoto(file, map.extractor);
+    const described = Promise.withResolvers();
+    const shown = mayNeedPreview(file) ? described.promise.then((job) => ask(`/jobs/${job}/preview`, { signal })).catch(() => null) : null;
     const asked = {
       name: file.name,
-      picture: () => localPicture(file, { alt: `The photo asked with: ${file.name}` }),
-      find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal),
+      picture: () => localPicture(file, { alt: `The photo asked with: ${file.name}` }, shown),
+      find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal, shown && described.resolve),
     };
     view.classList.add("asked");
     return showAnswer(answer, asked, signal);
@@ -82,15 +84,17 @@ function askEntry(map, onfile, signal) {
   return zone;
 }
 
-/** The answer to a photo, stored or not; `onjob` is told while it takes longer than a moment. */
-export async function findSimilar(path, query, file, onjob, signal) {
+/** The answer to a photo, stored or not; `onjob` is called while it takes longer than a moment,
+ * `ondescribed` with the id of the job that has described the photo. */
+export async function findSimilar(path, query, file, onjob, signal, ondescribed = null) {
   const form = file ? new FormData() : null;
   form?.append("file", file, file.name);
   let response = await ask(path, {
     method: "POST",
     query,
     body: form,
-    headers: { Prefer: `wait=${WAIT_SECONDS}`, "Idempotency-Key": idempotencyKey() },
+    // A response that is waited for does not name its job.
+    headers: { ...(ondescribed ? {} : { Prefer: `wait=${WAIT_SECONDS}` }), "Idempotency-Key": idempotencyKey() },
     signal,
   });
   // 202: its job first; of a photo that is then compared, a second one.
@@ -98,6 +102,7 @@ export async function findSimilar(path, query, file, onjob, signal) {
     const started = await response.json();
     const ended = await watchJob(started.job_id, onjob, signal);
     if (ended.state !== "succeeded") throw new Problem(422, ended.error ?? { detail: "The photo could not be described." }, null);
+    ondescribed?.(started.job_id);
     response = await ask(started.result_url, { signal });
   }
   return response.json();

@@ -3,7 +3,7 @@
 import { ask, currentMap, get } from "../api.js";
 import { bar, button, field, fill, h, note, noteError, say } from "../dom.js";
 import { takesDrops } from "../drop.js";
-import { count, degrees, metres, percent, plural } from "../format.js";
+import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
 import { findSimilar } from "./ask.js";
 
@@ -20,6 +20,8 @@ export async function showLocate(view, { signal }) {
   const map = await get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
   const together = h("input", { type: "checkbox" });
   const motion = h("select", {}, ["walk", "bicycle", "car", "train"].map((kind) => h("option", { value: kind }, kind)));
+  const zone = h("select", {}, [...new Set([OWN_ZONE, "UTC", ...Intl.supportedValuesOf("timeZone")])].map((name) => h("option", { value: name }, name)));
+  const ahead = h("input", { type: "number", step: "any", value: 0, required: true });
   const least = h("input", { type: "number", min: 0, max: 100, step: 1, value: 95, required: true });
   const progress = h("div", {});
   const result = h("div", { class: "view" });
@@ -27,6 +29,7 @@ export async function showLocate(view, { signal }) {
   let photos = [];
 
   const propose = async () => {
+    setTimes(photos, zone.value, Number(ahead.value));
     const proposals = await proposePositions(photos, track, { motion: motion.value, together: together.checked }, signal);
     const draw = () => drawResult(result, photos, proposals, Number(least.value) / 100, signal).catch(fail);
     least.onchange = draw;
@@ -45,12 +48,14 @@ export async function showLocate(view, { signal }) {
     if (chosen.length) photos = await readPhotos(chosen, map, progress, signal);
     await propose();
   };
-  for (const input of [together, motion]) input.addEventListener("change", () => photos.length && propose().catch(fail));
+  for (const input of [together, motion, zone, ahead]) input.addEventListener("change", () => photos.length && propose().catch(fail));
   fill(view,
     locateZone(map, (files) => take(files).catch(fail)),
     h("section", { class: "card filters-more" },
       field("The photographer moved by", motion),
       field("Accept from", least, "Probability in %"),
+      field("Time zone of the cameras", zone, "For photos whose EXIF has none"),
+      field("The clock was ahead by", ahead, "Seconds, for the cameras of photos without coordinates"),
       h("label", { class: "check" }, together, h("span", {}, "The cameras travelled together: photos of a phone show where a camera was"))),
     progress, result);
 }
@@ -71,14 +76,14 @@ function locateZone(map, take) {
       h("h1", {}, "Locate a folder"),
       h("p", { class: "lead" }, `Drop a folder of photos. Placewise proposes where those without coordinates were taken: by similar photos of the map “${map.name}”, by photos of the same camera shortly before and after, and by a GPX track if you add its file.`),
       h("div", { class: "row" }, button("Choose a folder", () => folder.click(), "primary not-touch"), button("Choose photos or a GPX file", () => files.click()), folder, files),
-      h("p", { class: "soft small" }, `Nothing is stored or changed. Times without a time zone count as ${OWN_ZONE}, that of this computer.`)));
+      h("p", { class: "soft small" }, "Nothing is stored or changed.")));
   takesDrops(zone, take);
   return zone;
 }
 
 /** Headers of all photos, and searches with those that have no coordinates. */
 async function readPhotos(files, map, progress, signal) {
-  const photos = files.map(({ file, path }) => ({ file, name: path, captured_at: null, time_zone_is_known: false, camera: null, latitude: null, longitude: null, search: null, error: null }));
+  const photos = files.toSorted((one, other) => one.path.localeCompare(other.path)).map(({ file, path }) => ({ file, name: path, clock: null, captured_at: null, time_zone_is_known: false, camera: null, latitude: null, longitude: null, search: null, error: null }));
   const step = async (label, some, work) => {
     let done = 0;
     const next = some.values();
@@ -109,11 +114,28 @@ async function readPhotos(files, map, progress, signal) {
 
 async function readHeader(photo, signal) {
   const response = await ask("/photo-headers", { method: "POST", body: photo.file.slice(0, HEADER_BYTES), headers: { "Content-Type": "application/octet-stream" }, signal });
-  const { captured_at: time, ...header } = await response.json();
-  Object.assign(photo, header);
-  if (time === null) return;
-  photo.captured_at = header.time_zone_is_known ? time : new Date(time.replace(/(Z|\+00:00)$/, "")).toISOString();
-  photo.time_zone_is_known = true;
+  const { captured_at: time, time_zone_is_known: zoned, ...header } = await response.json();
+  Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned } });
+}
+
+/** Set `captured_at` by the cameras' clocks: those without a time zone show that of `zone`, and those
+ * of photos without coordinates are `ahead` by so many seconds. */
+function setTimes(photos, zone, ahead) {
+  const unlocated = new Set(photos.filter(({ latitude }) => latitude === null).map(({ camera }) => camera));
+  for (const photo of photos.filter(({ clock }) => clock)) {
+    const { time, zoned } = photo.clock;
+    const seconds = unlocated.has(photo.camera) ? ahead : 0;
+    photo.captured_at = new Date((zoned ? time : toUtc(time, zone)) - 1000 * seconds).toISOString();
+    photo.time_zone_is_known = true;
+  }
+}
+
+/** The time at which clocks of the zone show `shown`; both in milliseconds, `shown` as if it were UTC. */
+function toUtc(shown, zone) {
+  const format = new Intl.DateTimeFormat("sv", { timeZone: zone, dateStyle: "short", timeStyle: "medium" });
+  const offset = (time) => Date.parse(`${format.format(time).replace(" ", "T")}Z`) - Math.floor(time / 1000) * 1000;
+  // The offset at the result, which may be another one where daylight saving time begins or ends.
+  return shown - offset(shown - offset(shown));
 }
 
 async function search(photo, map, signal) {
@@ -125,7 +147,7 @@ async function search(photo, map, signal) {
   if (first && first.latitude === null && first.place === null) found = await find({ box: WITH_COORDINATES });
   const { estimate, similar_images: similar } = found;
   photo.search = {
-    similar: similar.filter(({ latitude }) => latitude !== null).map(({ original_filename: name, latitude, longitude, similarity_score: score, weighted_score: weighted }) => ({ name, latitude, longitude, score: weighted ?? score })),
+    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.weighted_score ?? match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
     not_in_map: estimate.not_in_map_probability ?? 0.02,
   };
@@ -145,7 +167,7 @@ function readTrack(text, name) {
 }
 
 async function proposePositions(photos, track, options, signal) {
-  const sent = photos.map(({ file, error, ...photo }) => photo);
+  const sent = photos.map(({ file, error, clock, ...photo }) => photo);
   const located = sent.filter(({ latitude }) => latitude !== null);
   const others = sent.filter(({ latitude }) => latitude === null);
   const proposals = [];
@@ -177,7 +199,7 @@ async function drawResult(result, photos, proposals, least, signal) {
           accepted.length > 0 && button("Download CSV", () => download("placewise-locations.csv", "text/csv", csvOf(accepted)), "primary"),
           accepted.length > 0 && button("Download GPX", () => download("placewise-locations.gpx", "application/gpx+xml", gpxOf(accepted, photos))))),
       h("p", { class: "soft small" }, `${plural(located.length, "photo")} with coordinates. To write into photos or sidecars, run `, h("code", {}, "placewise locate"), "."),
-      h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", {},
+      h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", { class: "proposals" },
         h("thead", {}, h("tr", {}, ["Photo", "Position", "Probability", "", "Reason"].map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name || h("span", { class: "heard" }, "Accepted"))))),
         h("tbody", {}, proposals.map(row))))));
   say(words);

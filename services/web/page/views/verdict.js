@@ -13,7 +13,7 @@ export function verdict(found) {
   const [kind, title] = judge(estimate);
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
-    kind === "unknown" ? null : whereabouts(levels[estimate.answer_level ?? 0] ?? estimate),
+    kind === "unknown" ? null : whereabouts(estimate),
     h("p", { class: "reason" }, reason(estimate)),
     levels.length > 0 && levelBars(estimate),
     ringsInWords(estimate),
@@ -45,10 +45,15 @@ function judge({ levels, answer_level: answer, not_in_map_probability: outside, 
   return (levels.length ? outside > 0.5 : accepted === false) ? ["unknown", "Not in this map"] : ["open", "Best guess"];
 }
 
-function whereabouts({ place, latitude, longitude, radius_m: radius }) {
+/** The estimated place. Its error is the widest ring of the map that is known, so that both agree. */
+function whereabouts(estimate) {
+  const [share, ring] = RINGS.find(([, radius]) => estimate[radius] !== null) ?? [];
+  const level = estimate.levels[ring ? 0 : estimate.answer_level ?? 0] ?? estimate;
+  const { place, latitude, longitude } = level;
+  const error = ring ? `${metres(estimate[ring])} (${100 * share} %)` : metres(level.radius_m);
   return [
     place && h("p", { class: "place" }, place),
-    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${metres(radius)}`)),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${error}`)),
     latitude !== null && coordinateTools(latitude, longitude),
   ];
 }
