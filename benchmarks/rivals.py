@@ -335,8 +335,8 @@ def measure(
 ) -> Report:
     """Build each engine over `photos` rows, one after another, and search for revisited places.
 
-    Files are written to a temporary folder below `folder`: twice the rows at
-    once. An index of whole rows in memory takes as much, and twice as much while it is built.
+    Files are written to a temporary folder below `folder`: twice the rows at once. An index of
+    whole rows takes the memory of the rows, and twice as much while it is trained.
 
     Raises:
         Misconfigured: `no_benchmarks` if packages of the engines are not installed.

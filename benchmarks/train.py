@@ -47,7 +47,7 @@ from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.model import VprModel
 from shared.evaluation.bootstrap import cluster_queries, paired_differences
 from shared.evaluation.ranking import evaluate_recall
-from shared.evaluation.retrieval_metrics import compute_hits
+from shared.evaluation.recall import compute_hits
 from shared.synthetic_city.plan import CityOptions
 
 if TYPE_CHECKING:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import Callable
@@ -9,9 +10,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.http.problem_details import CLIENT_GONE, CLOSED_STATUS_SCOPE_KEY, REQUEST_ID_SCOPE_KEY
+from shared.errors import Unavailable
+from shared.http.problem_details import (
+    CLIENT_GONE,
+    CLOSED_STATUS_SCOPE_KEY,
+    REQUEST_ID_SCOPE_KEY,
+    problem_response,
+)
 from shared.telemetry.tracing import REQUEST_ID_HEADER, request_id_context, request_id_or_new, span
 
 log = logging.getLogger(__name__)
@@ -40,6 +48,9 @@ class RequestLogMiddleware:
 
     The request id is the client's `X-Request-ID` or a new one, and is returned in the response.
     Unsafe methods and 5xx responses are logged at INFO, other requests at DEBUG.
+
+    A request that is still in flight SHUTDOWN_GRACE_SECONDS after the server was stopped gets a 503
+    (`stopping`): uvicorn cancels it, and would respond with a 500, which clients don't retry.
     """
 
     def __init__(
@@ -100,6 +111,14 @@ class RequestLogMiddleware:
         ):
             try:
                 await self._app(scope, counted_receive, send_with_request_id)
+            except asyncio.CancelledError:
+                if record.first_byte_seconds is not None:
+                    raise
+                stopping = Unavailable(
+                    "stopping", "The server stopped before the request was complete. Repeat it."
+                )
+                response = problem_response(stopping, Request(scope))
+                await response(scope, receive, send_with_request_id)
             finally:
                 if disconnected or CLOSED_STATUS_SCOPE_KEY in scope:
                     record.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)

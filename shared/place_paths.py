@@ -9,7 +9,6 @@ def label_levels(label: str | None, is_path: bool) -> tuple[str, ...]:
     """Return the levels of a place label, finest first.
 
     Args:
-        label: The label, or None.
         is_path: Whether `/` separates levels. Otherwise the whole label is the only level.
 
     Returns:

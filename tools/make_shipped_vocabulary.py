@@ -111,7 +111,6 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
 
     Args:
         points: (n, D) patch features.
-        clusters: Number of centres.
 
     Returns:
         (clusters, D) centres and the number of iterations.

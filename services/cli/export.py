@@ -35,8 +35,9 @@ from services.cli.output import (
     print_result,
     printable_path,
     progress_bar,
+    refuse_unwritable,
 )
-from shared.errors import Conflict, InvalidRequest, Misconfigured
+from shared.errors import Conflict, InvalidRequest
 
 EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
 
@@ -67,7 +68,7 @@ def export_descriptors(
         else _parse_generation_id(generation_id)
     )
     receiving = progress.add_task("receiving (bytes)", total=None)
-    try:
+    with refuse_unwritable(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out) as received:
             client.export_descriptors(
@@ -80,10 +81,6 @@ def export_descriptors(
                     assert member is not None, "the archive contains regular files"
                     with member, atomic_write(out / name) as file:
                         shutil.copyfileobj(member, file)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't write to {printable_path(out)}: {error.strerror}."
-        ) from error
     rows = np.load(out / "descriptors.npy", mmap_mode="r")
     return {
         "file": printable_path(out / "descriptors.npy"),

@@ -253,6 +253,17 @@ def print_failures(report: dict[str, Any], *outcomes: str) -> None:
 
 
 @contextlib.contextmanager
+def refuse_unwritable(out: Path) -> Iterator[None]:
+    """Raise Misconfigured (`out_unwritable`) if the block fails to write to a file or folder."""
+    try:
+        yield
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"Can't write to {printable_path(out)}: {error.strerror or error}."
+        ) from error
+
+
+@contextlib.contextmanager
 def atomic_write(out: Path) -> Iterator[BinaryIO]:
     """Open a temporary file that replaces `out` if the block succeeds and is removed otherwise.
 
@@ -261,15 +272,12 @@ def atomic_write(out: Path) -> Iterator[BinaryIO]:
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     try:
-        with partial.open("w+b") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(out)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't write {printable_path(out)}: {error.strerror}."
-        ) from error
+        with refuse_unwritable(out):
+            with partial.open("w+b") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(out)
     finally:
         # Fails if the folder itself is missing: then there is no file to remove.
         with contextlib.suppress(OSError):

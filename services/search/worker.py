@@ -38,7 +38,13 @@ from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
 from shared.search_api.background import subtract_background
-from shared.search_api.protocol import RowReference, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    BACKGROUND_FEATURE,
+    RowReference,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
@@ -264,6 +270,7 @@ class SearchWorker:
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.replication_lag.current_lags(versions),
             devices=self._residency.status(snapshots.values()),
+            features=(BACKGROUND_FEATURE,),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:

@@ -38,6 +38,7 @@ from services.steward.tasks.model_changes import (
     QueuedChunks,
     advance_model_changes,
     auto_fit_vocabularies,
+    cancel_jobs_of_abandoned_generations,
     remove_dead_search_workers,
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
@@ -166,6 +167,11 @@ class Scheduler:
                 0.5,
                 lambda: advance_model_changes(catalog, wakeups, queued_chunks),
             ),
+            PeriodicTask(
+                "cancel jobs of ended model changes",
+                0.5,
+                lambda: cancel_jobs_of_abandoned_generations(catalog),
+            ),
             PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
             PeriodicTask(
@@ -192,10 +198,16 @@ class Scheduler:
             ),
             self._journal,
             PeriodicTask(
-                "delete maps", 1.0, lambda: purge_deleted_maps(catalog, counted("delete_maps"))
+                "delete maps",
+                1.0,
+                lambda: purge_deleted_maps(catalog, counted("delete_maps")),
+                own_thread=True,
             ),
             PeriodicTask(
-                "collect", 10.0, lambda: collect_garbage(catalog, counted("collect"), settings)
+                "collect",
+                10.0,
+                lambda: collect_garbage(catalog, counted("collect"), settings),
+                own_thread=True,
             ),
             PeriodicTask(
                 "forget old jobs",

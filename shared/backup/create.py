@@ -44,10 +44,6 @@ def create_backup(
     backup stays complete until the new one is finished.
 
     Args:
-        catalog: the catalog.
-        store: the object store.
-        installation_id: id of the catalog.
-        path: folder of the backup.
         import_prefix: key prefix of the operator's own objects, which are not backed up.
         progress: called after each object and for the rows.
 

@@ -61,9 +61,6 @@ def restore_backup(
     """Restore a backup into an empty catalog with the current schema, and an object store.
 
     Args:
-        folder: the backup.
-        about: its manifest.
-        catalog: the target catalog.
         open_store: opens the target store. It is called when the catalog has the backup's
             installation id, or has kept its own because the store is marked with that.
         import_prefix: key prefix of the operator's own objects.

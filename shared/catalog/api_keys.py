@@ -70,9 +70,6 @@ def create_api_key(
     """Create a key.
 
     Args:
-        session: The session.
-        name: Its owner or purpose.
-        scopes: What it may do.
         life_seconds: Time until it expires; None: never.
         limits: Its rate limit and quotas.
         maps: Names of the only maps that it may use; None: all maps.

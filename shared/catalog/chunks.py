@@ -120,6 +120,12 @@ def list_live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
     return [(row, values.photo_id) for row, values in list_live_filter_values(session, chunk_id)]
 
 
+def delete_chunk_rows(session: Session, chunk_id: UUID) -> None:
+    """Delete the chunk's row and its descriptors, of which there are up to SLOT_ROWS."""
+    session.execute(sa.delete(Descriptor).where(Descriptor.chunk_id == chunk_id))
+    session.execute(sa.delete(Chunk).where(Chunk.id == chunk_id))
+
+
 def list_live_filter_values(
     session: Session, chunk_id: UUID
 ) -> list[tuple[int, PhotoFilterValues]]:

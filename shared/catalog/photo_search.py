@@ -105,10 +105,6 @@ def search_photos(
     """Search the live photos of a map, newest first.
 
     Args:
-        session: The session.
-        map_id: The map.
-        metadata_filter: The conditions.
-        limit: Page size.
         after: Cursor: upload time and id of the last photo of the previous page.
 
     Returns:

@@ -46,7 +46,6 @@ def open_catalog(
     """Open the catalog of the settings.
 
     Args:
-        settings: The settings.
         service: Name of the service, for `pg_stat_activity`.
         limits: Timeouts; by default those of background work.
 

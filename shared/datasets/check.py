@@ -16,7 +16,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +114,6 @@ def inspect_dataset(
     """Open all sets at or below a folder and collect their problems.
 
     Args:
-        root: The folder.
         protocol: Protocol of the evaluation sets; None for their default.
         rule: Positive-match criterion of the evaluation sets; None for their own.
         min_photos: Training places with fewer photos are left out.
@@ -171,19 +170,14 @@ def _add_missing_files(report: DatasetReport) -> DatasetReport:
     if not missing:
         return report
     problem = _problem("missing_photo", missing, "listed photos do not exist")
-    return DatasetReport(
-        report.root,
-        report.training,
-        report.evaluation,
-        report.layouts,
-        (*report.problems, problem),
-    )
+    return replace(report, problems=(*report.problems, problem))
 
 
 def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
     name = evaluation.name
     for role, photos in (("database", evaluation.database), ("queries", evaluation.queries)):
-        duplicates = _duplicates(photo.name for photo in photos)
+        counts = Counter(photo.name for photo in photos)
+        duplicates = [name for name, count in counts.items() if count > 1]
         if duplicates:
             yield _problem(
                 "listed_twice", duplicates, f"photos are listed twice in {name}'s {role}"
@@ -215,10 +209,6 @@ def _differing_positives(evaluation: EvaluationSet) -> list[str]:
         )
         if given.tolist() != within_radius.tolist()
     ]
-
-
-def _duplicates(names: Iterable[str]) -> list[str]:
-    return [name for name, count in Counter(names).items() if count > 1]
 
 
 def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:
@@ -269,7 +259,6 @@ def find_suspect_labels(
     heading; 25 m if the rule is unknown or `place-label`.
 
     Args:
-        evaluation: The evaluation set.
         ranked: (queries, k) database indices, best first.
         scores: (queries, k) scores, higher is better; None treats every first match as confident.
         min_score: Minimum score of a confident match; None for the median score of the first

@@ -283,7 +283,6 @@ def write_ground_truth(
         positives: Database indices for each query.
         database: Names of the database photos, in order.
         queries: Names of the queries, in order.
-        rule: The positive-match criterion.
     """
     write_integer_lists(path, positives)
     sidecar = {

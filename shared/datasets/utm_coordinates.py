@@ -68,7 +68,6 @@ def group_by_utm_plane(
 
     Args:
         queries: (n, 2) UTM metres and grids, from `utm_positions`.
-        database: The same of the database.
 
     Returns:
         For each plane: query indices, database indices, (n, 2) metres of the queries and (m, 2)

@@ -57,7 +57,6 @@ def explain_similarities(
     """Split each candidate's similarity to the query into shares of patches and clusters.
 
     Args:
-        config: The extractor's configuration.
         features: (Q, D) local features of the query.
         centres: The vocabulary; required for VLAD.
         rows: (n, dimension) descriptors of the candidates, as they are stored.

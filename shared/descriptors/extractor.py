@@ -116,9 +116,6 @@ class Extractor:
         """Load the backbone's weights, unless `backbone` is given.
 
         Args:
-            config: The configuration of the extractor.
-            device: The device that the backbone runs on.
-            precision: The precision that the backbone computes in.
             dino_weights: The setting DINO_WEIGHTS, for DINOv2 backbones; None means timm's weights
                 from the Hugging Face hub.
             backbone: A loaded backbone with the same `config.local_features`. Required for a

@@ -92,7 +92,6 @@ def run_in_batches(
         run: Takes a (B, H, W, 3) batch of photos of one size. On a GPU it must not leave anything
             allocated but its return value.
         limit: The batch size limit; lowered when a batch runs out of memory.
-        device: Where `run` computes.
 
     Yields:
         The indices of the batch's photos in `photos`, and the result of `run`.

@@ -116,8 +116,6 @@ class StoredColumns:
         """Open the rows under `prefix`.
 
         Args:
-            store: The object store.
-            prefix: Key prefix of the objects.
             dimension: Number of columns.
             width: Number of columns of a block: `block_width` of the maximum number of rows.
             count: Number of rows stored already.

@@ -127,11 +127,9 @@ class VocabularyFit:
         """Prepare a fit.
 
         Args:
-            points: The points to fit on.
             clusters: Requested number of centres, reduced so that each has at least
                 PATCHES_PER_CLUSTER points.
             seed: Seed of k-means++ and of the batches' order.
-            effort: Numbers of passes.
 
         Raises:
             Unprocessable: `no_photos` if there are no points.

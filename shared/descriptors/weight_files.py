@@ -48,11 +48,9 @@ def download_file(
     """Download a file, resuming an earlier attempt.
 
     Args:
-        url: The file's address.
         target: Path of the downloaded file; its folder is created if necessary.
         sha256: The expected hexadecimal hash, or a prefix of it.
         headers: HTTP headers of the requests.
-        on_progress: Called after each block.
 
     Raises:
         Misconfigured: `download_corrupt` if the hash differs; the file is deleted.

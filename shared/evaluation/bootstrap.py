@@ -79,8 +79,6 @@ def bootstrap_intervals(
     Args:
         values: (queries, metrics) float64.
         clusters: (queries,) int64, the cluster label of each query.
-        resamples: number of bootstrap resamples.
-        seed: random seed.
 
     Returns:
         One interval per metric at `CONFIDENCE_LEVEL`; None with fewer than `MIN_CLUSTERS` clusters.
@@ -114,7 +112,6 @@ def paired_differences(
         first: (queries, metrics) float64.
         second: the same shape, in the same order.
         clusters: (queries,) int64, the cluster label of each query.
-        seed: random seed of the bootstrap.
 
     Raises:
         ValueError: the shapes differ.

@@ -51,8 +51,6 @@ def exact_knn(
     Args:
         queries: (n, D) float32, L2-normalised; may be memory-mapped.
         database: (m, D) float32, L2-normalised; may be memory-mapped.
-        k: number of neighbours; at most m are returned.
-        faiss_gpu: search on the GPU.
         block_bytes: size of the blocks of queries and of database rows.
         on_progress: called with the numbers of finished and of all query-row comparisons.
 

@@ -49,8 +49,6 @@ def describe_to_matrix(
     """Describe photos into a matrix that is valid inside the `with` block.
 
     Args:
-        describe: descriptor extraction.
-        photos: the photos.
         memory_bytes: larger matrices are memory-mapped.
         on_progress: called with the number of new rows after each batch.
 
@@ -161,12 +159,7 @@ def evaluate_recall(
     """Describe the database and the queries, rank them exactly, and compute recall@k.
 
     Args:
-        describe: descriptor extraction.
-        evaluation_set: database, queries and positives.
-        ks: the values of k.
-        faiss_gpu: search on the GPU.
         memory_bytes: larger descriptor matrices are memory-mapped.
-        block_bytes: block size of the search.
         on_progress: called with the stage (`database`, `queries`, `search`), done and total.
 
     Raises:
@@ -243,7 +236,6 @@ def compute_recalls(
     Args:
         ranked: (queries, depth) database indices, best first.
         positives: database indices of each query's positives.
-        ks: the values of k.
     """
     findable = [query for query, rows in enumerate(positives) if len(rows)]
     return Recalls(

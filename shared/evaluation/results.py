@@ -25,7 +25,8 @@ from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet
 from shared.errors import Conflict, InvalidRequest, NotFound
 from shared.evaluation.bootstrap import PairedDifference, paired_differences
 from shared.evaluation.exact_knn import Indices, Rankings, Scores
-from shared.evaluation.retrieval_metrics import RetrievalMetrics, compute_hits, hits_at_k
+from shared.evaluation.recall import compute_hits
+from shared.evaluation.retrieval_metrics import RetrievalMetrics, hits_at_k
 
 MAX_ENTRIES_SHOWN = 5  # invalid entries listed in an error message
 
@@ -146,7 +147,6 @@ def compare_with_run(
 
     Args:
         folder: the earlier run's output folder.
-        set_name: the evaluation set.
         fingerprint: the set's fingerprint in this run.
         measured: this run's metrics.
         positives: database indices of each query's positives.

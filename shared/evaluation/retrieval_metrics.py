@@ -32,14 +32,7 @@ from shared.evaluation.calibration import (
 from shared.evaluation.exact_knn import Indices, Scores
 from shared.evaluation.places.evidence import PlaceEvidence
 from shared.evaluation.ranking import DEFAULT_KS, Recalls, compute_recalls
-
-Hits = NDArray[np.bool_]
-
-
-def compute_hits(ranked: Indices, positives: Sequence[Indices]) -> Hits:
-    """Return a (queries, k) bool array: whether each ranked database index is a positive."""
-    hits = [np.isin(row, rows) for row, rows in zip(ranked, positives, strict=True)]
-    return np.array(hits, bool).reshape(ranked.shape)
+from shared.evaluation.recall import Hits, compute_hits
 
 
 def hits_at_k(hits: Hits, ks: Sequence[int]) -> NDArray[np.float64]:
@@ -125,8 +118,6 @@ def match_distances(
     """Compute the distance of each ranked photo from its query.
 
     Args:
-        queries: the queries.
-        database: the database photos.
         ranked: (queries, k) database indices.
 
     Returns:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shared.datasets.dataset import DatasetPhoto, EvaluationSet
 from shared.datasets.ground_truth import parse_rule
-from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.calibration import expected_calibration_error, recall_at_precision
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.seqslam import seqslam_matches
 from shared.search_api.background import background_frames, subtract_background
@@ -39,7 +39,6 @@ KIDNAPS = 6
 """of a sequence"""
 FOUND_FRAMES = 40
 """frames after which a track that was carried away must be right again"""
-MAX_PRECISION_ERROR = 0.01
 SEQSLAM_CELL_M = 12.0
 
 
@@ -123,11 +122,8 @@ def evaluate_sequence(
     """Follow one sequence.
 
     Args:
-        map_: The map.
-        evaluation_set: The set.
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        motion: The motion model.
 
     Returns:
         The frames, and the CPU seconds of the filter per frame.
@@ -179,13 +175,9 @@ def evaluate_kidnapped(
     The frames outside the map are left out; the sequence goes on from its beginning at its end.
 
     Args:
-        map_: The map.
-        evaluation_set: The set.
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        motion: The motion model.
         every: Number of frames between two kidnappings.
-        seed: Of the places.
 
     Returns:
         For each of KIDNAPS, the frames until the place is tracked and right; None if it is not
@@ -216,7 +208,6 @@ def frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[
     """Return the evidence of the frames of a sequence.
 
     Args:
-        map_: The map.
         times: (n,) when the frames were taken.
         rows: (n, D) their descriptors, of unit length.
     """
@@ -295,12 +286,20 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
             for name in ("single", "seqslam", "filter", "smoothed")
         },
         "recall_at_99_precision": {
-            "single": _recall_at_precision(
-                [(frame.single_score, frame.single_is_right) for frame in frames], len(inside)
-            ),
-            "filter": _recall_at_precision(
-                [(frame.probability, frame.filter_is_right) for frame in frames], len(inside)
-            ),
+            "single": recall_at_precision(
+                [frame.single_score for frame in frames],
+                [frame.single_is_right for frame in frames],
+                len(inside),
+            )
+            if inside
+            else None,
+            "filter": recall_at_precision(
+                [frame.probability for frame in frames],
+                [frame.filter_is_right for frame in frames],
+                len(inside),
+            )
+            if inside
+            else None,
         },
         "tracking": _share([frame.status == "tracking" for frame in inside]),
         "tracking_precision": _share([frame.filter_is_right for frame in tracked]),
@@ -340,19 +339,6 @@ def _frames_outside(sequence: Sequence[FrameResult]) -> list[tuple[int, int]]:
         if since:
             found.append((number, since - 1))
     return found
-
-
-def _recall_at_precision(answers: Sequence[tuple[float, bool]], inside: int) -> float | None:
-    """Return the largest share of frames found at a precision of 99 %."""
-    if not inside:
-        return None
-    ordered = sorted(answers, key=lambda answer: -answer[0])
-    right = np.cumsum([is_right for _, is_right in ordered])
-    precise = right >= (1 - MAX_PRECISION_ERROR) * np.arange(1, len(right) + 1)
-    # A score that several answers share can't separate them.
-    values = np.array([value for value, _ in ordered])
-    precise &= np.append(values[:-1] != values[1:], True)
-    return float(right[precise].max(initial=0)) / inside
 
 
 def _share(values: Sequence[bool]) -> float | None:

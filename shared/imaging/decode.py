@@ -81,7 +81,6 @@ def decode_photo(
     which bounds the memory; no preprocessing needs as many pixels.
 
     Args:
-        data: The file's bytes.
         preprocessing: Resizes the pixels for the backbone.
         max_pixels: Maximum of width x height.
         previews: Whether to make a preview, too, if the photo needs one.

@@ -94,10 +94,8 @@ def verify_chunk(
     """Compare a chunk with its hash, its manifest and the catalog.
 
     Args:
-        store: the object store.
         chunk_id, object_key, sha256, rows: the chunk in the catalog.
         catalog_rows: (row, photo id) of each of its photos in the catalog.
-        report: counts what is read.
 
     Yields:
         The first fault; nothing for an intact chunk.
@@ -162,10 +160,7 @@ def verify_store(
     """Verify every referenced object, and that every described photo has a descriptor.
 
     Args:
-        catalog: the catalog.
-        store: the object store.
         originals: read every original photo and verify its hash, instead of only its size.
-        progress: called after each object.
 
     Raises:
         Unavailable: the catalog or the store is unavailable.

@@ -146,12 +146,13 @@ def cancel_job(job: Job) -> None:
     _drop_lease(job)
 
 
-def cancel_jobs(session: Session, condition: Condition) -> None:
-    """Cancel every unfinished job that matches the condition."""
+def cancel_jobs(session: Session, condition: Condition, limit: int | None = None) -> None:
+    """Cancel the unfinished jobs that match the condition, at most `limit` of them."""
     unfinished = (
         select(Job.id)
         .where(condition, Job.state.in_(UNFINISHED_STATES))
         .order_by(Job.id)  # the lock order of `lock_leased_jobs`
+        .limit(limit)
         .with_for_update()
     )
     session.execute(

@@ -32,6 +32,7 @@ from shared.catalog.maps import (
 from shared.catalog.photos import Photo, get_live_photos
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
+from shared.extractor_config.configs import pooled_config
 from shared.ingest.store_photo import insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto, validate_photo
 from shared.rebuild.rows import ROWS_PER_STATEMENT, Progress
@@ -232,12 +233,9 @@ def recover_originals(
     They are stored like uploads. Originals with the bytes of a live photo are skipped.
 
     Args:
-        catalog: the catalog.
-        store: the object store.
         settings: limits and the extractor of new maps.
         unnamed: key, size in bytes and time (seconds since 1970) of the originals.
         extractor: extractor of the default map, if it is created now and may be loaded here.
-        progress: called for each original.
     """
     recovered = RecoveredOriginals()
     for done, (key, _, modified_at) in enumerate(unnamed, start=1):
@@ -285,11 +283,21 @@ def _default_map(session: Session, settings: Settings, extractor: str | None) ->
     if existing_id is not None:
         return existing_id
     name = settings.new_map_extractor
-    if extractor is not None:
+    if extractor is not None and not _is_pooled_start(settings, extractor):
         # The extractor may not be loadable here; the photos are then described with the default.
         with contextlib.suppress(Misconfigured):
             name = settings.extractor_config(extractor).name
     return get_or_create_default_map(session, name, RowType(settings.descriptor_rows)).id
+
+
+def _is_pooled_start(settings: Settings, extractor: str) -> bool:
+    """Return whether new maps begin with this extractor until they have a vocabulary."""
+    config = settings.extractor_config(settings.new_map_extractor)
+    return (
+        settings.pool_without_vocabulary
+        and config.needs_vocabulary
+        and pooled_config(config).name == extractor
+    )
 
 
 def _is_known(session: Session, key: str) -> bool:

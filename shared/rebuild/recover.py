@@ -127,12 +127,9 @@ def recover_catalog(
     """Recover maps, photos, generations with their descriptors, and vocabularies.
 
     Args:
-        catalog: the catalog.
-        store: the object store.
         settings: extractor of the default map, limits and slot size.
         unnamed_age_seconds: minimum age of originals that are not in the journal; newer ones may
             belong to uploads in progress.
-        progress: called after each item.
 
     Raises:
         Unavailable: as the store.

@@ -12,9 +12,8 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
-from types import TracebackType
 from typing import Self
 from uuid import UUID
 
@@ -24,6 +23,7 @@ from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.errors import Misconfigured, Unavailable
 from shared.search_api.protocol import (
+    BACKGROUND_FEATURE,
     CERTIFICATES,
     NONE,
     SearchHit,
@@ -178,12 +178,7 @@ class HttpSearchClient:
         self._refresh_thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._refresh_thread.join()
         self._call_executor.shutdown(cancel_futures=True)
@@ -201,11 +196,11 @@ class HttpSearchClient:
         if not layout:  # no worker has answered yet
             self._workers.refresh()
             layout = self._workers.layout(request.generation_id, request.min_version)
+        if request.background and not self._workers.all_know(BACKGROUND_FEATURE):
+            # All shards rank by the same query, so that their scores can be merged.
+            request = request.model_copy(update={"background": ()})
         calls = {
-            # In the request's context, so that its id and trace are propagated.
-            shard: self._call_executor.submit(
-                copy_context().run, self._search_shard, shard, urls, request, deadline
-            )
+            shard: self._submit_call(shard, urls, request, deadline)
             for shard, urls in layout.items()
         }
         wait(calls.values(), timeout=deadline + RESPONSE_MARGIN_SECONDS - time.monotonic())
@@ -228,6 +223,20 @@ class HttpSearchClient:
             raise Unavailable("search_unavailable", "No search worker answers.")
         return merge_statuses(statuses, unreachable)
 
+    def _submit_call(
+        self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
+    ) -> Future[SearchResponse]:
+        # In the request's context, so that its id and trace are propagated.
+        run = copy_context().run
+        try:
+            return self._call_executor.submit(
+                run, self._search_shard, shard, urls, request, deadline
+            )
+        except RuntimeError as error:  # the executor was shut down
+            raise Unavailable(
+                "search_unavailable", "The server is stopping. Retry in a moment."
+            ) from error
+
     def _search_shard(
         self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
     ) -> SearchResponse:
@@ -241,14 +250,12 @@ class HttpSearchClient:
             unreadable: Unavailable | None = None
             # A lone worker gets a second attempt: the kept-alive connection may have been stale.
             order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
-            for index, url in enumerate(order):
+            for url in order:
                 remaining = deadline - time.monotonic()
                 if remaining <= 0:
                     break
                 # Only the last worker may use up the whole remaining time.
-                seconds = (
-                    remaining if url == order[-1] or index == len(order) - 1 else remaining / 2
-                )
+                seconds = remaining if url == order[-1] else remaining / 2
                 try:
                     return call_search(self._http, url, request, seconds)
                 except WorkerUnavailable as error:
@@ -281,7 +288,7 @@ def _collect(
     for shard, call in calls.items():
         try:
             responses.append(call.result(timeout=0))
-        except (WorkerUnavailable, TimeoutError):
+        except (WorkerUnavailable, TimeoutError, CancelledError):  # cancelled: the client is closed
             call.cancel()
             unreachable.append(shard)
         except Unavailable as error:

@@ -92,7 +92,6 @@ def check_explainable(config: ExtractorConfig, spec: Mapping[str, Any] | None) -
     """Raise Unprocessable (`not_explainable`) if a similarity is not a sum over patches.
 
     Args:
-        config: The extractor's configuration.
         spec: Spec of the active generation; None if the map has none yet.
     """
     reason = None

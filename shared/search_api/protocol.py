@@ -6,7 +6,8 @@ vector passes through the gateway. `SearchBackend` is implemented in process by
 which spreads a map's slots over shards.
 
 Messages are serialised without fields that have their default value (`as_json`), so that a worker
-of the previous release accepts every request that uses none of the new fields.
+of the previous release accepts every request that uses none of the new fields. A field that the
+gateway uses on its own account is sent only to workers that list it in `SearchStatus.features`.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 BOUND = "bound"  # a proven bound excludes every row that was not compared exactly
 STATISTICAL = "statistical"  # the same, with a failure probability of about 1 in 10^8
 NONE = "none"  # stopped early, or a part of the map is missing: better rows may exist
+BACKGROUND_FEATURE = "background"
+"""Feature of workers that know `SearchRequest.background`."""
+
 CERTIFICATES = (EXHAUSTIVE, BOUND, STATISTICAL, NONE)
 """Guarantees of a result's completeness, strongest first."""
 
@@ -68,7 +72,8 @@ class SearchRequest(_Message):
 
     The mean of the rows of `background` is subtracted from the query first
     (`shared.search_api.background`); scores are the cosines to what is left. Rows that no longer
-    exist are left out of the mean.
+    exist are left out of the mean. While a worker of a release without BACKGROUND_FEATURE runs,
+    `HttpSearchClient` leaves the background out, as for the first frame of a track.
     """
 
     # Unknown fields of a request are refused: ignoring a filter would give a wrong result.
@@ -189,6 +194,8 @@ class SearchStatus(_Message):
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
     devices: tuple[DeviceStatus, ...] = ()
     """GPUs in use; empty where the CPU searches everything."""
+    features: tuple[str, ...] = ()
+    """Optional fields of a request that the worker knows; () for several workers together."""
     away: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 

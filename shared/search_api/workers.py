@@ -81,7 +81,7 @@ def _call(
     timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
     try:
         response = http.request(method, url, timeout=timeout, content=content, headers=headers)
-    except httpx2.TransportError as error:
+    except httpx2.RequestError as error:
         silent = isinstance(error, httpx2.ReadTimeout)
         raise WorkerUnavailable(url, type(error).__name__, silent=silent) from error
     if response.is_success:
@@ -186,6 +186,13 @@ class WorkerDirectory:
                 shard: [w.url for w in order if w.shard == shard and not w.silent]
                 for shard in _shards_of(best)
             }
+
+    def all_know(self, feature: str) -> bool:
+        """Return whether every worker that has ever answered lists the feature."""
+        with self._lock:
+            return all(
+                feature in worker.status.features for worker in self._workers if worker.status
+            )
 
     def statuses(self) -> tuple[dict[Shard, SearchStatus], list[Shard]]:
         """Return the state of each shard's most advanced worker, and the shards without one."""

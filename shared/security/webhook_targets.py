@@ -49,7 +49,6 @@ def parse_webhook_url(url: str, *, allow_private: bool) -> WebhookTarget:
     Args:
         url: must use HTTPS unless private addresses are allowed, and must not contain a user,
             password or fragment.
-        allow_private: allow private addresses and plain HTTP.
 
     Raises:
         Unprocessable: `invalid_field` for any other URL.

@@ -113,7 +113,6 @@ def cast_rays(
     behind.
 
     Args:
-        camera: The camera.
         slopes: (columns,) lateral metres per metre of depth of each ray.
         starts: (planes, 2) start points in metres.
         directions: (planes, 2) unit vectors.

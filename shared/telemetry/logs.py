@@ -128,8 +128,6 @@ def configure_logging(settings: Settings, service: str, *, to_file: bool = True)
     Replaces the existing handlers of the root logger.
 
     Args:
-        settings: The settings.
-        service: Name of the service, in each line.
         to_file: Write to LOG_FILE. Commands that may run beside a server do not, because only one
             process can rotate a file.
 

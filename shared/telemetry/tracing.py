@@ -49,7 +49,6 @@ def span(
     """Trace the block as a span; an exception of the block is recorded in it.
 
     Args:
-        name: name of the span.
         parents: `traceparent` values. With one, the span is its child; with several, as for a
             batch of several requests' jobs, it is linked to all. Without any it is a child of the
             current span. None values are ignored.
@@ -91,7 +90,6 @@ def configure_tracing(
 
     Args:
         settings: OTEL_EXPORTER_OTLP_ENDPOINT turns tracing on.
-        service: name of the service in the traces.
         exporter: replaces the OTLP exporter.
 
     Raises:

@@ -115,7 +115,6 @@ class TrackFilter:
     """Follows a camera through a map.
 
     Args:
-        graph: The photos of the map.
         motion: How fast the camera moves.
         scheme: The levels of the map, for the state.
     """

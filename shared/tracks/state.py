@@ -74,7 +74,6 @@ def track_state(
     """Compute the state of a belief.
 
     Args:
-        belief: The belief.
         photos: Those photos of the belief that are still in the map.
         scheme: The levels of the map.
         typical_speed_mps: For distances along the map's sequences.

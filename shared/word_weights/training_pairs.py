@@ -81,7 +81,6 @@ def sample_pairs(locations: Sequence[PhotoLocation], seed: int, batch_photos: in
 
     Args:
         locations: the locations of the map's photos.
-        seed: random seed.
         batch_photos: maximum number of photos in a batch.
     """
     candidates = []

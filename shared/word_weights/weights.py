@@ -33,7 +33,6 @@ def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Float64Ar
     Args:
         rows: (m, words * width) float32 L2-normalised descriptors.
         pairs: (n, 2) indices into `rows`.
-        words: number of words.
 
     Returns:
         (n, words) float64.

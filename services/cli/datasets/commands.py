@@ -33,6 +33,7 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
+    refuse_unwritable,
 )
 from shared.datasets.check import (
     MAX_RULE_MULTIPLE,
@@ -48,7 +49,7 @@ from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rul
 from shared.datasets.ground_truth_files import sidecar_path, write_ground_truth
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 
 
 def check(
@@ -223,7 +224,7 @@ def ground_truth(
     database_photos = read_photo_list(database, folder)
     query_photos = read_photo_list(queries, folder)
     positives = find_positives(criterion, query_photos, database_photos)
-    try:
+    with refuse_unwritable(out):
         write_ground_truth(
             out,
             positives,
@@ -231,8 +232,6 @@ def ground_truth(
             queries=[photo.name for photo in query_photos],
             rule=str(criterion),
         )
-    except OSError as error:
-        raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
     counts = [len(indices) for indices in positives]
     figures = {
         "out": printable_path(out),

@@ -27,6 +27,7 @@ from services.cli.output import (
     print_table,
     printable_path,
     progress_bar,
+    refuse_unwritable,
     stage_bars,
 )
 from shared.config.settings import Settings
@@ -34,7 +35,7 @@ from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import choose_device
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 from shared.evaluation.bootstrap import PairedDifference, cluster_queries, paired_differences
 from shared.evaluation.exact_knn import exact_knn
 from shared.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
@@ -179,7 +180,11 @@ def compare_extractors(
             compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
     report = _comparison_as_json(evaluation_set, compared)
     if out is not None:
-        _write_report(out, report, render_comparison(evaluation_set, compared))
+        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        with refuse_unwritable(out):
+            (out / "comparison.json").write_text(text, encoding="utf-8")
+            page = render_comparison(evaluation_set, compared)
+            (out / "report.html").write_text(page, encoding="utf-8")
     if as_json:
         print_json(report)
         return
@@ -209,12 +214,8 @@ def _validate_entries(
                 "bad_extractors", f"{entry.spec_text}: {config.name} uses no vocabulary."
             )
     if out is not None:
-        try:
+        with refuse_unwritable(out):
             out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Misconfigured(
-                "out_unwritable", f"Can't write to {out}: {error.strerror}."
-            ) from error
 
 
 def _evaluate_entry(
@@ -286,15 +287,6 @@ def _comparison_as_json(
             for result, size, duration in zip(compared, by_size, by_time, strict=True)
         ],
     }
-
-
-def _write_report(out: Path, report: dict[str, Any], page: str) -> None:
-    try:
-        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        (out / "comparison.json").write_text(text, encoding="utf-8")
-        (out / "report.html").write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise Misconfigured("out_unwritable", f"Can't write to {out}: {error.strerror}.") from error
 
 
 def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:

@@ -15,13 +15,21 @@ from rich.table import Column
 
 from services.cli.evaluation.commands import ReportOptions
 from services.cli.evaluation.live_map import answers_table
-from services.cli.output import Json, Table, print_json, print_message, print_table, printable_path
+from services.cli.output import (
+    Json,
+    Table,
+    print_json,
+    print_message,
+    print_table,
+    printable_path,
+    refuse_unwritable,
+)
 from shared.datasets.check import find_suspect_labels
 from shared.datasets.dataset import find_published_results
 from shared.datasets.ground_truth_files import read_ground_truth, read_integer_lists
 from shared.datasets.open_dataset import DatasetPhoto, EvaluationSet, open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 from shared.evaluation.bootstrap import ConfidenceInterval, cluster_queries, singleton_clusters
 from shared.evaluation.exact_knn import Indices, Rankings
 from shared.evaluation.ranking import DEFAULT_KS
@@ -45,13 +53,12 @@ def check_output_folders(options: ReportOptions) -> None:
     Raises:
         Misconfigured: `out_unwritable`.
     """
-    try:
-        if options.out is not None:
+    if options.out is not None:
+        with refuse_unwritable(options.out):
             options.out.mkdir(parents=True, exist_ok=True)
-        if options.pairs is not None:
+    if options.pairs is not None:
+        with refuse_unwritable(options.pairs):
             options.pairs.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable_error(options.out or options.pairs, error) from error
 
 
 def evaluate_rankings(
@@ -126,17 +133,16 @@ def output_results(
     Raises:
         Misconfigured: `out_unwritable`.
     """
-    try:
-        if options.out is not None:
+    if options.out is not None:
+        with refuse_unwritable(options.out):
             write_run_files(options.out, run, results)
             report = render_report(
                 run, results, grids_shown=options.grids, only_wrong=options.only_wrong
             )
             (options.out / "report.html").write_text(report, encoding="utf-8")
-        if options.pairs is not None:
+    if options.pairs is not None:
+        with refuse_unwritable(options.pairs):
             write_pairs(options.pairs, results)
-    except OSError as error:
-        raise _unwritable_error(options.out or options.pairs, error) from error
     if options.as_json:
         metrics = build_metrics(run, results)
         if len(results) == 1:  # also at the top level, so that scripts need not know the name
@@ -199,10 +205,6 @@ def _format_share(
     if intervals is None:
         return f"{100 * share:.1f} %"
     return f"{100 * share:.1f} % ({intervals[position].as_percent()})"
-
-
-def _unwritable_error(path: Path | None, error: OSError) -> Misconfigured:
-    return Misconfigured("out_unwritable", f"Can't write to {path}: {error.strerror}.")
 
 
 PREDICTIONS_PROTOCOL = "predictions file"

@@ -22,7 +22,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from services.cli.output import printable_path
-from shared.errors import Conflict, Misconfigured, NotFound
+from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
+from shared.ids import new_id
 
 FOLDER = ".placewise-locate"
 JOURNAL, BACKUPS, STAGED = "journal.jsonl", "before", "new"
@@ -67,14 +68,19 @@ class UndoJournal:
         return staged
 
     def install(self, path: Path, staged: Path) -> None:
-        """Replace `path`, which may not exist yet, by a staged file."""
+        """Replace `path`, which may not exist yet, by a staged file.
+
+        Raises:
+            Unprocessable: `outside_folder`, for a link to a file that is not below the folder.
+        """
         path = path.resolve()  # a link stays a link
-        _sync(staged)
         name = os.path.relpath(path, self._root)
+        _check_is_below(self._root, name)
+        _sync(staged)
         line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
         is_known = line["before"] in self._known.get(name, ())
         if not is_known and line["before"] is not None:  # new, or changed by something else since
-            line["backup"] = f"{len(list((self._folder / BACKUPS).iterdir())) + 1:06d}"
+            line["backup"] = str(new_id())  # a name that no earlier backup has
             _link_or_copy(path, self._folder / BACKUPS / str(line["backup"]))
             _sync(self._folder / BACKUPS)
         with self._journal.open("ab") as file:
@@ -111,6 +117,7 @@ def undo(root: Path) -> UndoReport:
         NotFound: `nothing_to_undo`.
         Conflict: `locate_in_progress`.
         Misconfigured: `out_unwritable`.
+        Unprocessable: `journal_damaged` or `outside_folder`; nothing is changed then.
     """
     folder = root / FOLDER
     if not (folder / JOURNAL).exists():
@@ -124,6 +131,8 @@ def undo(root: Path) -> UndoReport:
                 originals[line["path"]] = line
             originals.setdefault(line["path"], line)
             written.setdefault(line["path"], set()).add(line["after"])
+        for name in originals:
+            _check_is_below(root.resolve(), name)
         for name, line in originals.items():
             path = root.resolve() / name
             present = _sha256(path)
@@ -153,6 +162,8 @@ def _exclusive(root: Path) -> Iterator[None]:
     folder = root / FOLDER
     try:
         folder.mkdir(exist_ok=True)
+        if any(path.is_symlink() for path in (folder, *folder.iterdir())):
+            raise OSError(f"{FOLDER} is or contains a symbolic link")
         with FileLock(folder / "lock", timeout=0):
             yield
     except Timeout as error:
@@ -169,7 +180,29 @@ def _exclusive(root: Path) -> Iterator[None]:
 def _read_lines(journal: Path) -> list[dict[str, Any]]:
     """Return the lines of a journal; an incomplete last line stands for no change."""
     data = journal.read_bytes() if journal.exists() else b""
-    return [json.loads(line) for line in data.split(b"\n")[:-1]]
+    lines = []
+    for number, text in enumerate(data.split(b"\n")[:-1], start=1):
+        try:
+            line = json.loads(text)
+            paths = [line["path"], *([line["backup"]] if line["backup"] is not None else [])]
+            if not all(isinstance(path, str) for path in paths) or "/" in "".join(paths[1:]):
+                raise ValueError
+            lines.append({key: line[key] for key in ("path", "before", "after", "backup")})
+        except (ValueError, KeyError, TypeError) as error:
+            raise Unprocessable(
+                "journal_damaged", f"{printable_path(journal)}: line {number} can't be read."
+            ) from error
+    return lines
+
+
+def _check_is_below(root: Path, name: str) -> None:
+    """Refuse a path that leads out of the folder: its journal may come from somebody else."""
+    if not (root / name).resolve().is_relative_to(root):
+        raise Unprocessable(
+            "outside_folder",
+            f"{printable_path(Path(name))} is outside of the folder. Run the command in the folder "
+            "that the file is in.",
+        )
 
 
 def _to_line(line: dict[str, Any]) -> bytes:

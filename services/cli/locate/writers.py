@@ -84,6 +84,8 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
                     path = write_one(journal, location.path, proposal)
                 except PlacewiseError as error:
                     report.skipped[location.name] = error.detail
+                except PermissionError as error:  # of its folder; others may be writable
+                    report.skipped[location.name] = f"can't be written: {error.strerror}"
                 else:
                     report.written.append(printable_path(path.relative_to(folder)))
     return report

@@ -2,8 +2,8 @@
 
 Each check is a function of the settings that returns a summary, or raises a PlacewiseError whose
 `detail` says what is wrong and what to do. This module contains the checks of the embedded
-installation and of the extractor (device, memory, weights); `deployment_checks` contains those of
-separate services, `store_checks` those of the object store.
+installation, of stored files and of the extractor (device, memory, weights); `deployment_checks`
+contains those of separate services.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from uuid import UUID
 
 from sqlalchemy import func, select
 
@@ -32,15 +33,20 @@ from services.cli.operations.deployment_checks import (
     check_steward,
     open_for_check,
 )
-from services.cli.operations.store_checks import CHECK_FILE, collection_check, permissions_check
 from shared.catalog.database.schema import check_pages, check_schema
+from shared.catalog.installation import Installation
 from shared.catalog.photos import Photo
+from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import find_running_server
+from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, ExtractorConfig
 from shared.journal.outbox import catalog_lag
+from shared.storage import FolderStore, OwnedStore
 from shared.storage.open_store import open_store
+from shared.storage.ownership import read_owner, store_taken_error
+from shared.storage.trash import read_hold
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -48,6 +54,7 @@ BYTES_PER_PARAMETER = 4  # float32
 BYTES_PER_BATCH_PHOTO = 40_000_000
 PROCESS_OVERHEAD_BYTES = 1_000_000_000  # PyTorch or the CUDA context, without weights
 
+CHECK_FILE = "Check its permissions, or restore it from a backup."
 
 Check = Callable[[Settings], str]
 
@@ -63,12 +70,12 @@ def list_checks(settings: Settings, server: str | None, key: str | None) -> list
     ]
     if settings.s3_endpoint is None or settings.database_url is None:
         checks.append(("folder", _check_home))  # other services need no writable folder
-        checks.append(("permissions", permissions_check))
+        checks.append(("permissions", check_permissions))
     if settings.s3_endpoint is None:
         checks.append(("uploads", _check_upload_dir))
     else:
         checks.append(("objects", check_object_store))
-    checks += [("collection", collection_check), ("journal", _check_journal)]
+    checks += [("collection", check_collection), ("journal", _check_journal)]
     if settings.database_url is None:
         checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
@@ -301,3 +308,72 @@ def _check_server(settings: Settings) -> str:
         with catalog.read() as session:
             photos = session.scalar(select(func.count()).where(Photo.deleted_at.is_(None)))
     return f"not running; {photos} photos are stored (start it with make run)"
+
+
+def check_collection(settings: Settings) -> str:
+    """Check that this catalog owns the store and that orphans are collected.
+
+    Raises:
+        Misconfigured: Another catalog owns the store, or `collection_held`.
+    """
+    folder = settings.placewise_home / "objects"
+    store: OwnedStore
+    if settings.s3_endpoint is not None:
+        store = open_store(settings, exclusive=False)
+    elif folder.exists():
+        store = FolderStore(folder, exclusive=False)  # UPLOAD_DIR has no owner record
+    else:
+        return "nothing is stored yet"
+    owner = read_owner(store)
+    if owner is None:
+        return "the object store has no owner yet; the next start assigns it"
+    if str(_installation_id(settings)) != owner:
+        raise store_taken_error(store, "belongs to another catalog than this one")
+    hold = read_hold(store)
+    if hold is not None:
+        raise Misconfigured("collection_held", hold.describe())
+    return "the object store belongs to this catalog, and orphans are collected"
+
+
+def check_permissions(settings: Settings) -> str:
+    """Check that other users of this machine can't read stored files.
+
+    Raises:
+        Misconfigured: `readable_by_others`.
+    """
+    roots = [settings.placewise_home, settings.upload_dir, _sqlite_file(settings)]
+    existing = [root for root in roots if root is not None and root.exists()]
+    # Contents of a private folder are not accessible, whatever their own permissions.
+    accessible = [
+        root
+        for root in existing
+        if is_open_to_others(root)
+        and not any(_is_private_parent(parent, root) for parent in existing)
+    ]
+    if accessible:
+        paths = " ".join(f"'{root}'" for root in accessible)
+        raise Misconfigured(
+            "readable_by_others",
+            f"Other users of this machine have access to {paths}, which contain photos, key hashes "
+            f"and the catalog. Revoke it: chmod -R go-rwx {paths}",
+        )
+    return "only this user can read stored files" if existing else "nothing is stored yet"
+
+
+def _is_private_parent(parent: Path, path: Path) -> bool:
+    return path != parent and path.is_relative_to(parent) and not is_open_to_others(parent)
+
+
+def _sqlite_file(settings: Settings) -> Path | None:
+    catalog = open_catalog(settings, "doctor")  # opens no connection
+    catalog.close()
+    return Path(catalog.url.database) if catalog.is_sqlite and catalog.url.database else None
+
+
+def _installation_id(settings: Settings) -> UUID | None:
+    """None for a catalog that does not exist."""
+    file = _sqlite_file(settings)
+    if file is not None and not file.exists():
+        return None
+    with open_for_check(settings, CHECK_FILE) as catalog, catalog.read() as session:
+        return session.scalar(select(Installation.id))

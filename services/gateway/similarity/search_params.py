@@ -22,6 +22,7 @@ from shared.search_api.protocol import Mode
 
 TIME = "ISO 8601; no offset means UTC"
 MAX_IDS = 1000
+MAX_INTEGER = 2**53 - 1  # of JSON in all languages
 MAX_IDS_CHARACTERS = 40_000
 
 
@@ -186,10 +187,14 @@ class RankingParams(BaseModel):
     most_rows: int | None = Field(
         None,
         ge=0,
+        le=MAX_INTEGER,
         description="Stop the search after reading this many rows; `certificate` reports it.",
     )
     most_seconds: float | None = Field(
-        None, gt=0, description="Stop the search after this many seconds; `certificate` reports it."
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Stop the search after this many seconds; `certificate` reports it.",
     )
 
     @property

@@ -15,12 +15,13 @@ from uuid import UUID
 from sqlalchemy import delete, select
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
+from services.steward.tasks.maintenance import TRACKS_PER_TRANSACTION
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import Track, delete_tracks
@@ -58,14 +59,15 @@ def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
 
 def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Delete the next rows of the map with their objects; True when nothing is left to delete."""
-    with catalog.write() as session:
-        cancel_jobs(session, Job.map_id == map_id)
     for purge_rows in (
+        _cancel_jobs,
         _purge_chunks,
         _purge_queries,
         _purge_batches,
         _purge_photos,
         _purge_presigned_uploads,
+        _purge_searches,
+        _purge_tracks,
         _purge_local_features,  # last: it always lists the store
     ):
         if purge_rows(catalog, store, map_id):  # it deleted some; there may be more
@@ -74,8 +76,6 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.write() as session:
         session.execute(delete(CachedMapStatistics).where(CachedMapStatistics.map_id == map_id))
         session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
-        session.execute(delete(Search).where(Search.map_id == map_id))
-        delete_tracks(session, Track.map_id == map_id)
         session.execute(delete(Job).where(Job.map_id == map_id))
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
@@ -85,6 +85,19 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     if affected_rows(deleted):
         log.info("purged the deleted map %s", map_id)
     return True
+
+
+def _cancel_jobs(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(
+            select(Job.id)
+            .where(Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES))
+            .limit(ROWS_PER_TRANSACTION)
+        ).all()
+    if ids:
+        with catalog.write() as session:
+            cancel_jobs(session, Job.id.in_(ids))
+    return bool(ids)
 
 
 def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -97,12 +110,9 @@ def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         ).all()
     for chunk in chunks:
         delete_chunk(store, chunk.object_key)
-    ids = [chunk.id for chunk in chunks]
-    if ids:
         with catalog.write() as session:
-            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(ids)))
-            session.execute(delete(Chunk).where(Chunk.id.in_(ids)))
-    return bool(ids)
+            delete_chunk_rows(session, chunk.id)
+    return bool(chunks)
 
 
 def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -182,6 +192,20 @@ def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID)
     if ids:
         with catalog.write() as session:
             session.execute(delete(PresignedUpload).where(PresignedUpload.id.in_(ids)))
+    return bool(ids)
+
+
+def _purge_searches(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+    some = select(Search.id).where(Search.map_id == map_id).limit(ROWS_PER_TRANSACTION)
+    with catalog.write() as session:
+        return affected_rows(session.execute(delete(Search).where(Search.id.in_(some)))) > 0
+
+
+def _purge_tracks(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+    some = select(Track.id).where(Track.map_id == map_id).limit(TRACKS_PER_TRANSACTION)
+    with catalog.write() as session:
+        ids = session.scalars(some).all()
+        delete_tracks(session, Track.id.in_(ids))
     return bool(ids)
 
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
 from services.steward.tasks.model_changes import adopt_failed_reindex_jobs, delete_done_reindex_jobs
-from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
@@ -91,11 +91,8 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
             store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
-    if ended:
-        chunk_ids = [chunk.id for chunk in ended]
         with catalog.write() as session:
-            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(chunk_ids)))
-            session.execute(delete(Chunk).where(Chunk.id.in_(chunk_ids)))
+            delete_chunk_rows(session, chunk.id)
 
 
 def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:

@@ -38,8 +38,8 @@ from shared.errors import Conflict
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.model_changes import start_model_change
-from shared.jobs.transitions import succeed_job
+from shared.jobs.model_changes import CANCELLED_PER_TRANSACTION, start_model_change
+from shared.jobs.transitions import cancel_jobs, succeed_job
 
 log = logging.getLogger(__name__)
 
@@ -149,6 +149,31 @@ def _advance_model_change(
         _finish_model_change(session, job, generation)
     if switched:
         adopt_failed_reindex_jobs(catalog)
+
+
+def cancel_jobs_of_abandoned_generations(catalog: Catalog) -> None:
+    """Cancel the reindex jobs of model changes that were cancelled or failed.
+
+    Works for up to SLICE_SECONDS: a model change has as many jobs as its map has photos.
+    """
+    unfinished = (
+        select(Job.id)
+        .join(Generation, Generation.id == Job.generation_id)
+        .where(
+            Generation.state == GenerationState.ABANDONED,
+            Job.state.in_(UNFINISHED_STATES),
+            Job.kind == JobKind.REINDEX,
+        )
+        .limit(CANCELLED_PER_TRANSACTION)
+    )
+    deadline = time.monotonic() + SLICE_SECONDS
+    while time.monotonic() < deadline:
+        with catalog.read() as session:
+            job_ids = session.scalars(unfinished).all()
+        if not job_ids:
+            return
+        with catalog.write() as session:
+            cancel_jobs(session, Job.id.in_(job_ids))
 
 
 def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:

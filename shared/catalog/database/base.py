@@ -227,10 +227,8 @@ def page_newest_first(
     """Return up to `limit` rows by descending id (UUIDv7: newest first).
 
     Args:
-        session: The session.
         statement: SELECT of a table, with its conditions.
         id_column: The id column of the table.
-        limit: Page size.
         before: Cursor: the last id of the previous page, if any.
     """
     if before is not None:

@@ -57,7 +57,6 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
     after which it is retried, so that traffic continues.
 
     Args:
-        catalog: The catalog.
         timeout_seconds: Time after which a migration that can't get a lock is not retried.
 
     Raises:

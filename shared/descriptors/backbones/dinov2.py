@@ -84,7 +84,6 @@ class Dinov2:
             size: A key of SHAPES.
             layer: Number of the block, from 0.
             facet: query, key, value or token.
-            device: Where the network computes.
             weights: The setting DINO_WEIGHTS; None for timm's weights from the hub.
             shape: Overrides the shape of `size`, for tests.
 

@@ -43,10 +43,7 @@ class TrainedBackbone:
 
         Args:
             name: The extractor's name, as in `gsv:N`.
-            model: The model, with its weights.
             fingerprint: Hash of configuration and weights.
-            device: Where the model computes.
-            licence: Licence of the weights.
             card: Model card: where the weights come from.
         """
         self.name = name

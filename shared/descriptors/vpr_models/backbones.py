@@ -404,7 +404,6 @@ def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbo
     """Build the backbone of a config, cropped and frozen, in evaluation mode.
 
     Args:
-        config: The model's architecture.
         weights: A file of pretrained weights; None for those of the hub's cache.
 
     Raises:

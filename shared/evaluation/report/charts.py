@@ -34,7 +34,6 @@ def percent_chart(
     """Create a chart with a y axis from 0 to 100 %.
 
     Args:
-        x_label: label of the x axis.
         y_label: label of the y axis, whose values are from 0 to 1.
         x_ticks: ticks of the x axis, from its first to its last value. None: from 0 to 100 %.
         log: logarithmic x axis.

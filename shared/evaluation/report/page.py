@@ -32,8 +32,6 @@ def render_report(
     """Render the report of a run as one HTML document.
 
     Args:
-        run: metadata of the run.
-        results: the results by evaluation set.
         grids_shown: maximum number of queries per retrieval grid.
         only_wrong: omit the grid of correct queries.
     """

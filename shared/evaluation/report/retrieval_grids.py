@@ -32,11 +32,6 @@ def retrieval_grids(
     Wrong queries are sorted by descending score of the first match, correct ones by ascending
     score.
 
-    Args:
-        result: the evaluation result.
-        max_rows: maximum number of rows per grid.
-        only_wrong: omit the correct queries.
-
     Returns:
         (heading, HTML table) of each grid that has rows.
     """

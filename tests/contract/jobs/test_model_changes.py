@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
 from uuid import UUID
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import event, select
 
-from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import (
+    advance_model_changes,
+    cancel_jobs_of_abandoned_generations,
+)
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job
@@ -114,6 +120,41 @@ def test_a_cancelled_model_change_abandons_what_it_was_building(
     _begin(catalog, map_id)  # there is room for the next
 
 
+def test_the_jobs_of_a_cancelled_model_change_are_cancelled_in_small_transactions(
+    catalog: Catalog, map_id: UUID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("shared.jobs.model_changes", "services.steward.tasks.model_changes"):
+        monkeypatch.setattr(f"{module}.CANCELLED_PER_TRANSACTION", 2)
+    with catalog.write() as session:
+        add_generation(session, map_id)
+    job_id = _begin(catalog, map_id)
+    building = read_job(catalog, job_id).generation_id
+    reindex = queue(catalog, map_id, 7, kind=JobKind.REINDEX, generation_id=building)
+    uploads = queue(catalog, map_id)
+    with updated_rows(catalog) as updated:
+        with catalog.write() as session:
+            cancel_model_change(session, get_job(session, map_id, job_id, lock=True))
+        assert states(catalog, reindex).count(JobState.CANCELLED) == 2
+        cancel_jobs_of_abandoned_generations(catalog)
+    assert states(catalog, reindex) == [JobState.CANCELLED] * 7
+    assert states(catalog, uploads) == [JobState.QUEUED]
+    assert max(updated) == 2
+
+
+@contextmanager
+def updated_rows(catalog: Catalog) -> Iterator[list[int]]:
+    """Yield a list to which the number of rows of each UPDATE of the jobs is added."""
+    counts: list[int] = []
+
+    def count(_connection: Any, cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith("UPDATE jobs"):
+            counts.append(cursor.rowcount)
+
+    event.listen(catalog.engine, "after_cursor_execute", count)
+    yield counts
+    event.remove(catalog.engine, "after_cursor_execute", count)
+
+
 def test_cancelling_leaves_a_generation_that_already_answers(
     catalog: Catalog, map_id: UUID
 ) -> None:
@@ -124,7 +165,7 @@ def test_cancelling_leaves_a_generation_that_already_answers(
         assert session.scalars(select(Generation.state)).all() == [GenerationState.ACTIVE]
 
 
-@pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+@pytest.mark.databases("postgresql")
 def test_queueing_photos_locks_the_map_before_the_job_as_the_activation_does(
     catalog: Catalog, store: FolderStore, map_id: UUID
 ) -> None:

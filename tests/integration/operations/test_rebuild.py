@@ -23,11 +23,12 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation, get_or_create_installation
 from shared.catalog.jobs import Job
-from shared.catalog.maps import get_or_create_default_map
+from shared.catalog.maps import Map, get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.tables import SchemaCompatibility
 from shared.config.settings import Settings
 from shared.errors import Conflict, StorageFull
+from shared.ids import new_id
 from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.journal.outbox import catalog_lag, write_journal
@@ -35,7 +36,7 @@ from shared.journal.segments import list_segments
 from shared.rebuild import recover as recover_module
 from shared.rebuild.recover import RecoveryReport, begin_rebuild, recover_catalog
 from shared.storage import FolderStore
-from shared.storage.chunks import manifest_key
+from shared.storage.chunks import manifest_key, write_chunk
 from shared.storage.keys import JOURNAL, ORIGINALS
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import stored_rows
@@ -43,6 +44,9 @@ from tests.support.photos import photo_bytes
 
 # tests/faults/test_rebuild_catalog.py does the same on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
+
+VLAD = "test-tiny-vlad"
+POOLED = "test-tiny-vlad:aggregator=gem"
 
 SAID: dict[str, Any] = {
     "latitude": 45.5,
@@ -269,6 +273,26 @@ def test_a_home_of_before_the_journal_comes_back_with_what_exif_says(
     with service.catalog.read() as session:
         first = str(session.scalars(select(Photo.id)).first())
     assert len(answers(service, first)) == 1
+
+
+@pytest.mark.parametrize(("pools", "recovered"), [(True, VLAD), (False, POOLED)])
+def test_a_map_that_began_pooled_comes_back_with_the_extractor_that_waits_for_a_vocabulary(
+    catalog: Catalog, store: FolderStore, settings: Settings, pools: bool, recovered: str
+) -> None:
+    started = settings.model_copy(update={"extractor": VLAD, "pool_without_vocabulary": pools})
+    store.put(f"{ORIGINALS}{uuid4()}", photo_bytes(1))
+    chunk_id = new_id()
+    write_chunk(
+        store,
+        generation_id=new_id(),
+        chunk_id=chunk_id,
+        rows=np.eye(1, 4, dtype=np.float32),
+        photo_ids=[new_id()],
+        spec={"extractor": POOLED},
+    )
+    recover_catalog(catalog, store, started, unnamed_age_seconds=0)
+    with catalog.read() as session:
+        assert session.scalars(select(Map.extractor)).one() == recovered
 
 
 def test_a_photo_whose_original_is_gone_stays_away(

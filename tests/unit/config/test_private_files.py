@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.cli.operations.store_checks import permissions_check
+from services.cli.operations.installation_checks import check_permissions
 from services.search.chunk_loader import MappedFileCache
 from shared.backup.folder import BackedUpObject, BackupFolder, dump_rows
 from shared.catalog.database.schema import migrate
@@ -105,14 +105,14 @@ def test_folder_that_exists_keeps_its_mode_and_a_file_is_no_folder(tmp_path: Pat
 def test_doctor_names_what_others_can_read_and_how_to_change_it(tmp_path: Path) -> None:
     home, photos = tmp_path / "home", tmp_path / "photos"
     settings = Settings(placewise_home=home, upload_dir=photos)
-    assert "nothing" in permissions_check(settings)
+    assert "nothing" in check_permissions(settings)
     home.mkdir(0o755)
     photos.mkdir(0o750)
     (home / "catalog.sqlite").touch(0o644)
     with pytest.raises(Misconfigured) as caught:
-        permissions_check(settings)
+        check_permissions(settings)
     assert f"chmod -R go-rwx '{home}' '{photos}' '{home / 'catalog.sqlite'}'" in caught.value.detail
     assert stat.S_IMODE(home.stat().st_mode) == 0o755, "it changes nothing by itself"
     for folder in (home, photos):
         folder.chmod(0o700)
-    assert "only this user" in permissions_check(settings)
+    assert "only this user" in check_permissions(settings)

@@ -14,7 +14,6 @@ from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rule
 from shared.datasets.utm_coordinates import pairwise_distances_m
 from shared.errors import InvalidRequest
-from shared.evaluation import recall
 from shared.evaluation.recall import positives_within
 from shared.geodesy import distance_m
 
@@ -69,12 +68,9 @@ def test_positives_are_those_of_the_full_matrix(
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, within_m)
 
 
-def test_positives_are_the_same_however_few_pairs_are_measured_at_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_positives_of_many_photos_are_those_of_the_full_matrix() -> None:
     queries = np.random.default_rng(0).uniform(0, 300, (200, 2))
     database = np.random.default_rng(1).uniform(0, 300, (300, 2))
-    monkeypatch.setattr(recall, "MAX_CANDIDATES_PER_BLOCK", 7)
     found = positives_within(queries, database)
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, 25.0)
 

@@ -19,10 +19,10 @@ from shared.evaluation.bootstrap import (
     singleton_clusters,
 )
 from shared.evaluation.ranking import compute_recalls
+from shared.evaluation.recall import compute_hits
 from shared.evaluation.retrieval_metrics import (
     average_precisions,
     calibrate_scores,
-    compute_hits,
     compute_metrics,
     distance_error,
     hits_at_k,

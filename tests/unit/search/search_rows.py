@@ -64,6 +64,23 @@ def brute_force(
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 
 
+def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: int) -> None:
+    """Assert that these are the k best, ordered by score and then by id.
+
+    A score may differ by one in its last decimal: the order of a sum depends on the processor.
+    """
+    last_decimal = 1.5 * 10**-SCORE_DECIMALS
+    assert len(found) == min(k, len(exact))
+    assert found == sorted(found, key=lambda hit: (-hit[1], hit[0]))
+    assert all(abs(score - exact[photo_id]) < last_decimal for photo_id, score in found)
+    if not found:
+        return
+    last_id, lowest = found[-1]
+    for photo_id in exact.keys() - {photo_id for photo_id, _ in found}:
+        assert exact[photo_id] < lowest + last_decimal
+        assert exact[photo_id] != exact[last_id] or photo_id > last_id
+
+
 def answer(
     snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], question: SearchOptions
 ) -> SearchResponse:
@@ -97,9 +114,10 @@ class Case:
     min_score: float | None
 
     @property
-    def expected(self) -> list[tuple[UUID, float]]:
+    def exact(self) -> dict[UUID, float]:
+        """The scores of all rows that may be found."""
         least = -2.0 if self.min_score is None else self.min_score
-        return brute_force(self.rows, self.query, self.k, self.selected, least)
+        return dict(brute_force(self.rows, self.query, len(self.rows), self.selected, least))
 
 
 @st.composite

@@ -24,7 +24,7 @@ from shared.ids import new_id
 from shared.search_api.photo_filter import NO_FILTER
 from shared.search_api.protocol import SearchResponse
 from shared.storage.chunks import StoredRows
-from tests.unit.search.search_rows import facts_of
+from tests.unit.search.search_rows import assert_best, facts_of
 
 Rows = NDArray[np.float32]
 
@@ -75,21 +75,6 @@ def brute_force(
         if number not in dead
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
-
-
-def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: int) -> None:
-    """Assert that these are the k best, ordered by score and then by id.
-
-    A score may differ by one in its last decimal: the order of a sum depends on the processor.
-    """
-    last_decimal = 1.5 * 10**-SCORE_DECIMALS
-    assert len(found) == min(k, len(exact))
-    assert found == sorted(found, key=lambda hit: (-hit[1], hit[0]))
-    assert all(abs(score - exact[photo_id]) < last_decimal for photo_id, score in found)
-    last_id, lowest = found[-1] if found else (photo(0), 1.0)
-    for photo_id in exact.keys() - {photo_id for photo_id, _ in found}:
-        assert exact[photo_id] < lowest + last_decimal
-        assert exact[photo_id] != exact[last_id] or photo_id > last_id
 
 
 def hits_of(

@@ -12,7 +12,7 @@ import pytest
 from filelock import FileLock
 
 from services.cli.locate.undo_journal import FOLDER, JOURNAL, open_journal, undo
-from shared.errors import Conflict, NotFound
+from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 
 MOMENTS = 40
 """More than there are moments at which a call is killed below"""
@@ -122,6 +122,71 @@ def test_a_change_between_two_writes_is_not_lost_by_undo(folder: Path) -> None:
     assert (sorted(report.restored), report.removed) == (["new.xmp", "old.xmp"], [])
     for name in ("old.xmp", "new.xmp"):
         assert (folder / name).read_bytes() == b"edited by its owner"
+
+
+def test_a_deleted_backup_lets_no_other_be_overwritten(folder: Path) -> None:
+    write(folder, "old.xmp", b"ours")
+    write(folder, "sub/b.jpg", b"ours")
+    before, _ = sorted((folder / FOLDER / "before").iterdir())
+    before.unlink()
+    (folder / "third.xmp").write_bytes(b"third")
+    write(folder, "third.xmp", b"ours")
+    with pytest.raises(Misconfigured):
+        undo(folder)  # the backup of the first is missing
+    (folder / "old.xmp").write_bytes(b"old \xff bytes")
+    assert sorted(undo(folder).restored) == ["sub/b.jpg", "third.xmp"]
+    assert (folder / "sub" / "b.jpg").read_bytes() == b"photo"
+
+
+def test_a_link_to_a_file_outside_the_folder_is_not_written_to(
+    folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "outside.xmp").write_bytes(b"of somebody else")
+    (folder / "link.xmp").symlink_to(tmp_path / "outside.xmp")
+    with pytest.raises(Unprocessable) as refused:
+        write(folder, "link.xmp", b"ours")
+    assert refused.value.code == "outside_folder"
+    assert (tmp_path / "outside.xmp").read_bytes() == b"of somebody else"
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ('{"path": "../outside", "before": "0", "after": null, "backup": "1"}', "outside_folder"),
+        ('{"path": "/outside", "before": null, "after": null, "backup": null}', "outside_folder"),
+        ('{"path": "a", "before": "0", "after": null, "backup": "../1"}', "journal_damaged"),
+        ('{"path": "a"}', "journal_damaged"),
+        ("not JSON", "journal_damaged"),
+        ("[]", "journal_damaged"),
+    ],
+)
+def test_a_forged_or_damaged_journal_changes_nothing(
+    folder: Path, tmp_path: Path, line: str, code: str
+) -> None:
+    write(folder, "old.xmp", b"ours")
+    with (folder / FOLDER / JOURNAL).open("a") as journal:
+        journal.write(f"{line}\n")
+    (folder / FOLDER / "before" / "1").write_bytes(b"planted")
+    before = contents(tmp_path)
+    with pytest.raises(Unprocessable) as refused:
+        undo(folder)
+    assert refused.value.code == code
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", [".", "new", "before"])
+def test_a_journal_folder_that_is_a_link_is_refused(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "old.xmp").write_bytes(b"of somebody else")
+    link = folder / FOLDER / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(elsewhere)
+    with pytest.raises(Misconfigured, match="symbolic link"):
+        write(folder, "old.xmp", b"ours")
+    assert (elsewhere / "old.xmp").read_bytes() == b"of somebody else"
 
 
 def test_undo_finds_the_files_of_a_folder_behind_a_link(folder: Path, tmp_path: Path) -> None:

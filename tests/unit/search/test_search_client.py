@@ -1,0 +1,120 @@
+"""`HttpSearchClient` during a rolling upgrade and while its process stops."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from shared.errors import Unavailable
+from shared.ids import new_id
+from shared.search_api.client import HttpSearchClient
+from shared.search_api.protocol import (
+    BACKGROUND_FEATURE,
+    RowReference,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
+from tests.support.servers.handle import wait_until
+
+REQUEST = SearchRequest(
+    map_id=new_id(), generation_id=new_id(), object_key="queries/a.npy", row=0, min_version=0, k=1
+)
+RESPONSE = SearchResponse(
+    hits=(), certificate="exhaustive", rows_scanned=0, rows_reranked=0, snapshot_version=1
+)
+
+
+class FakeWorker(ThreadingHTTPServer):
+    """A search worker of one shard that records the requests and answers when `released`."""
+
+    def __init__(self, features: tuple[str, ...] = ()) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.status = SearchStatus(
+            rows=0, resident_bytes=0, versions={}, missing=(), features=features
+        )
+        self.received: list[dict[str, object]] = []
+        self.released = threading.Event()
+        self.released.set()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: FakeWorker
+
+    def do_GET(self) -> None:
+        self._respond(self.server.status.model_dump_json())
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.received.append(json.loads(body))
+        self.server.released.wait(30)
+        self._respond(RESPONSE.model_dump_json())
+
+    def _respond(self, body: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+    def log_message(self, *_: object) -> None:
+        """Write nothing to stderr."""
+
+
+@pytest.fixture
+def worker() -> Iterator[FakeWorker]:
+    with FakeWorker() as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.released.set()
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize("features", [(), (BACKGROUND_FEATURE,)])
+def test_the_background_is_sent_only_to_workers_that_know_it(
+    worker: FakeWorker, features: tuple[str, ...]
+) -> None:
+    worker.status = worker.status.model_copy(update={"features": features})
+    background = (RowReference(object_key="queries/b.npy", row=0),)
+    with HttpSearchClient([worker.url], 10.0) as client:
+        assert client.search(REQUEST.model_copy(update={"background": background})) == RESPONSE
+    (received,) = worker.received
+    assert ("background" in received) == bool(features)
+
+
+def test_a_search_of_a_closed_client_is_unavailable(worker: FakeWorker) -> None:
+    with HttpSearchClient([worker.url], 10.0) as client:
+        pass
+    with pytest.raises(Unavailable) as refused:
+        client.search(REQUEST)
+    assert refused.value.code == "search_unavailable"
+
+
+def test_a_queued_search_is_unavailable_when_the_client_is_closed(
+    worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared.search_api.client.MAX_CONCURRENT_CALLS", 1)
+    worker.released.clear()
+    with ThreadPoolExecutor(3) as pool:
+        client = HttpSearchClient([worker.url], 2.0)
+        with client:
+            first = pool.submit(client.search, REQUEST)
+            wait_until(lambda: len(worker.received) == 1, 30, lambda: None, "the first call")
+            queued = pool.submit(client.search, REQUEST)
+            queue = client._call_executor._work_queue
+            wait_until(lambda: queue.qsize() == 1, 30, lambda: None, "the queued call")
+            threading.Timer(0.2, worker.released.set).start()
+        assert first.result() == RESPONSE
+        with pytest.raises(Unavailable) as refused:
+            queued.result()
+    assert refused.value.code == "search_unavailable"
