@@ -39,6 +39,7 @@ TESTS = Path(__file__).parent
 # The kinds with the longest files first: a long file that starts last runs alone.
 WAITING = ("faults", "deploy", "e2e", "browser")  # for other processes
 COMPUTING = ("integration", "contract", "unit")
+collect_ignore = [] if os.environ.get(BROWSER) else ["browser"]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -53,7 +54,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mix files that wait with files that compute, and mark tests that need a server.
 
-    Tests on real photos and in a browser are deselected unless they are enabled.
+    Tests on real photos are deselected unless they are enabled.
     """
     places = {**_places(items, WAITING), **_places(items, COMPUTING)}
     items.sort(key=lambda item: places[item.path])
@@ -62,9 +63,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if _needs_server(item):
             item.add_marker("servers")
-        disabled = (item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS)) or (
-            _kind(item) == "browser" and not os.environ.get(BROWSER)
-        )
+        disabled = item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS)
         (deselected if disabled else selected).append(item)
     if deselected:
         config.hook.pytest_deselected(items=deselected)
@@ -73,9 +72,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run a test of the catalog on both databases, or on those that its nearest marker names."""
-    if "database" in metafunc.fixturenames:
+    if "catalog_kind" in metafunc.fixturenames:
         marker = metafunc.definition.get_closest_marker("databases")
-        metafunc.parametrize("database", marker.args if marker else ("sqlite", "postgresql"))
+        metafunc.parametrize("catalog_kind", marker.args if marker else ("sqlite", "postgresql"))
 
 
 def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
@@ -176,10 +175,10 @@ def spare_databases(postgres: PostgresServer, migrated_postgres: str) -> SpareDa
 
 
 @pytest.fixture
-def catalog(database: str, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
+def catalog(catalog_kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
     """An empty, migrated catalog: each test that takes it runs on the databases of its marker."""
     with contextlib.ExitStack() as stack:
-        if database == "sqlite":
+        if catalog_kind == "sqlite":
             copy = shutil.copy(request.getfixturevalue("migrated_sqlite"), tmp_path)
             url = f"sqlite:///{copy}"
         else:

@@ -111,6 +111,8 @@ class PeriodicTask:
     run: Callable[[], object]
     own_thread: bool = False
     """Whether it can take so long that the others must not wait for it."""
+    uses_catalog: bool = True
+    """Whether its success shows that the catalog can be reached."""
     next_run: float = field(default=0.0)
     """By `time.monotonic`."""
     commits_seen: int = field(default=-1)
@@ -247,6 +249,7 @@ class Scheduler:
                 lambda: metrics.objects_deleted.labels("free_trash").inc(
                     store.free_trash(FREE_TRASH_FACTOR * settings.min_free_bytes)
                 ),
+                uses_catalog=False,
             ),
         ]
 
@@ -284,7 +287,8 @@ class Scheduler:
         started, outcome = time.monotonic(), "done"
         try:
             task.run()
-            self._outage.record_success()
+            if task.uses_catalog:
+                self._outage.record_success()
         except SQLAlchemyError as error:
             outcome = "catalog_away"
             self._outage.record_error(error)

@@ -25,7 +25,7 @@ from shared.catalog.database.base import (
 )
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
-from shared.errors import Conflict, Misconfigured, NotFound
+from shared.errors import Conflict, Misconfigured, NotFound, PlacewiseError
 from shared.extractor_config.configs import ExtractorConfig
 from shared.extractor_config.names import TRAINED_MODEL_PREFIX
 from shared.ids import new_id
@@ -152,10 +152,7 @@ def list_registered_models(session: Session) -> list[Model]:
 
 def get_registered_model(session: Session, name: str) -> Model:
     """Return the added model of this name; NotFound (`model_missing`)."""
-    model = session.scalar(_select_model(name))
-    if model is None or model.object_key is None:
-        raise NotFound("model_missing", _model_missing_detail(name), model=name)
-    return model
+    return _get_model(session, name, NotFound)
 
 
 def check_model_registered(session: Session, config: ExtractorConfig) -> None:
@@ -173,10 +170,7 @@ def get_model_for_loading(session: Session, name: str, *, lock: bool = False) ->
     Raises:
         Misconfigured: `model_missing`, as for other missing weights.
     """
-    model = session.scalar(_select_model(name, lock=lock))
-    if model is None or model.object_key is None:
-        raise Misconfigured("model_missing", _model_missing_detail(name), model=name)
-    return model
+    return _get_model(session, name, Misconfigured, lock=lock)
 
 
 def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
@@ -187,9 +181,7 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
         Conflict: `model_in_use`: a map or a running model change uses it, or `new_map_extractor`,
             the extractor of new maps, does.
     """
-    row = session.scalar(_select_model(name, lock=True))
-    if row is None or row.object_key is None:
-        raise NotFound("model_missing", _model_missing_detail(name), model=name)
+    row = _get_model(session, name, NotFound, lock=True)
     maps = list_maps_using_model(session, row)
     if maps:
         raise Conflict(
@@ -234,11 +226,19 @@ def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:
     return for_update(statement) if lock else statement
 
 
-def _model_missing_detail(name: str) -> str:
-    return (
-        f"There is no model named {name!r}. Add it: `placewise models add CHECKPOINT --name "
-        f"{name}`, or POST /api/v1/models. GET /api/v1/models lists the added models."
-    )
+def _get_model(
+    session: Session, name: str, missing: type[PlacewiseError], *, lock: bool = False
+) -> Model:
+    """Return the added model of this name; raise `missing` if there is none."""
+    model = session.scalar(_select_model(name, lock=lock))
+    if model is None or model.object_key is None:
+        raise missing(
+            "model_missing",
+            f"There is no model named {name!r}. Add it: `placewise models add CHECKPOINT --name "
+            f"{name}`, or POST /api/v1/models. GET /api/v1/models lists the added models.",
+            model=name,
+        )
+    return model
 
 
 def _join_names(maps: list[str]) -> str:

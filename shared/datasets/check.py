@@ -16,7 +16,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -170,19 +170,14 @@ def _add_missing_files(report: DatasetReport) -> DatasetReport:
     if not missing:
         return report
     problem = _problem("missing_photo", missing, "listed photos do not exist")
-    return DatasetReport(
-        report.root,
-        report.training,
-        report.evaluation,
-        report.layouts,
-        (*report.problems, problem),
-    )
+    return replace(report, problems=(*report.problems, problem))
 
 
 def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
     name = evaluation.name
     for role, photos in (("database", evaluation.database), ("queries", evaluation.queries)):
-        duplicates = _duplicates(photo.name for photo in photos)
+        counts = Counter(photo.name for photo in photos)
+        duplicates = [name for name, count in counts.items() if count > 1]
         if duplicates:
             yield _problem(
                 "listed_twice", duplicates, f"photos are listed twice in {name}'s {role}"
@@ -214,10 +209,6 @@ def _differing_positives(evaluation: EvaluationSet) -> list[str]:
         )
         if given.tolist() != within_radius.tolist()
     ]
-
-
-def _duplicates(names: Iterable[str]) -> list[str]:
-    return [name for name, count in Counter(names).items() if count > 1]
 
 
 def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from shared.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto
@@ -68,15 +69,12 @@ def _add_exif_position(photo: DatasetPhoto) -> DatasetPhoto:
     except (OSError, Unprocessable):
         # Reported when the photo is decoded; here its position is unknown.
         return photo
-    return DatasetPhoto(
-        photo.path,
-        photo.name,
+    return replace(
+        photo,
+        zone=None,
         latitude=header.latitude,
         longitude=header.longitude,
         heading=header.heading,
-        place=photo.place,
-        frame=photo.frame,
-        sequence=photo.sequence,
     )
 
 

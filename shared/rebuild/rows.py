@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Any, Self
 from uuid import UUID
 
@@ -30,7 +29,7 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import NotFound, Unavailable
 from shared.journal.outbox import unknown_lines
 from shared.journal.segments import Line, columns_of, list_segments, read_segment, table_of
-from shared.storage import ObjectInfo, ObjectStore
+from shared.storage import ObjectStore
 from shared.storage.keys import ORIGINALS, is_original_key
 
 ROWS_PER_STATEMENT = 500
@@ -78,12 +77,7 @@ class LatestStates:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._database.close()
         self._folder.cleanup()
 
@@ -96,15 +90,16 @@ class LatestStates:
             except NotFound:
                 if attempt == MAX_READ_ATTEMPTS - 1:
                     raise
-        for batch in _batches(store.list(ORIGINALS)):
-            self._database.executemany(
-                "INSERT OR REPLACE INTO originals VALUES (?, ?, ?)",
-                (
-                    (info.key, info.size_bytes, info.modified_at.timestamp())
-                    for info in batch
-                    if is_original_key(info.key)
-                ),
-            )
+        self._database.execute("BEGIN")
+        self._database.executemany(
+            "INSERT OR REPLACE INTO originals VALUES (?, ?, ?)",
+            (
+                (info.key, info.size_bytes, info.modified_at.timestamp())
+                for info in store.list(ORIGINALS)
+                if is_original_key(info.key)
+            ),
+        )
+        self._database.execute("COMMIT")
 
     def _read_journal(self, store: ObjectStore, progress: Progress) -> None:
         self.damaged = []
@@ -176,16 +171,6 @@ class LatestStates:
             (before,),
         ).fetchall()
         return originals
-
-
-def _batches(infos: Iterator[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
-    batch: list[ObjectInfo] = []
-    for info in infos:
-        batch.append(info)
-        if len(batch) == ROWS_PER_STATEMENT:
-            yield batch
-            batch = []
-    yield batch
 
 
 Columns = dict[str, Any]

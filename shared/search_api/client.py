@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
-from types import TracebackType
 from typing import Self
 from uuid import UUID
 
@@ -179,12 +178,7 @@ class HttpSearchClient:
         self._refresh_thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._refresh_thread.join()
         self._call_executor.shutdown(cancel_futures=True)
@@ -256,14 +250,12 @@ class HttpSearchClient:
             unreadable: Unavailable | None = None
             # A lone worker gets a second attempt: the kept-alive connection may have been stale.
             order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
-            for index, url in enumerate(order):
+            for url in order:
                 remaining = deadline - time.monotonic()
                 if remaining <= 0:
                     break
                 # Only the last worker may use up the whole remaining time.
-                seconds = (
-                    remaining if url == order[-1] or index == len(order) - 1 else remaining / 2
-                )
+                seconds = remaining if url == order[-1] else remaining / 2
                 try:
                     return call_search(self._http, url, request, seconds)
                 except WorkerUnavailable as error:

@@ -50,16 +50,9 @@ class Belief:
         """Serialise: compressed JSON with a format version."""
         content = {
             "version": FORMAT_VERSION,
+            **{name: getattr(self, name) for name in self.__slots__},
             "time": self.time.isoformat(),
-            "photos": self.photos,
             "probabilities": self.probabilities.tolist(),
-            "elsewhere": self.elsewhere,
-            "outside": self.outside,
-            "seen": self.seen,
-            "gain": self.gain,
-            "gain_weight": self.gain_weight,
-            "status": self.status,
-            "frames": self.frames,
         }
         return zlib.compress(json.dumps(content, separators=(",", ":")).encode())
 

@@ -71,15 +71,7 @@ class PhotoTable:
 
     def take(self, rows: NDArray[Any]) -> PhotoTable:
         """Return the rows at indices, or under a mask."""
-        return PhotoTable(
-            self.ids[rows],
-            self.latitudes[rows],
-            self.longitudes[rows],
-            self.headings[rows],
-            self.places[rows],
-            self.sequences[rows],
-            self.seconds[rows],
-        )
+        return PhotoTable(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def union(self, *others: PhotoTable) -> PhotoTable:
         """Return the rows of this table, followed by those of the others that it lacks."""

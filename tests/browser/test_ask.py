@@ -156,6 +156,17 @@ def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
     expect(page.locator("path.ring-95, path.estimate")).to_have_count(0)
 
 
+def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> None:
+    found = town.ask(town.queries[0])
+    nowhere: dict[str, Any] = {"in_map": None, "levels": [], "latitude": None, "longitude": None, "place": None}
+    found["estimate"] |= {**nowhere, "reason": "The most similar photo has no place."}
+    found["estimate"] |= {"radius_m": None, "radius_68_m": None, "radius_95_m": None}
+    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
+    page = ask(visitor, town.queries[0])
+    expect(page.locator(".badge")).to_have_text("No estimate")
+    expect(page.locator(".reason")).to_have_text("The most similar photo has no place.")
+
+
 def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
     visitor: Visitor, town: Town, tmp_path: Path
 ) -> None:

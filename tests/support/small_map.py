@@ -9,6 +9,7 @@ from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import select
 
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
@@ -106,10 +107,18 @@ class SmallMap:
         with self.catalog.read() as session:
             return [chunk.object_key for chunk in list_live_chunks(session, self.generation_id)]
 
-    def reference(self, photo_id: UUID) -> Reference:
+    def references(self) -> dict[UUID, Reference]:
+        """The row of each photo in the generation."""
         with self.catalog.read() as session:
-            descriptor = session.get_one(Descriptor, (self.generation_id, photo_id))
-            return session.get_one(Chunk, descriptor.chunk_id).object_key, descriptor.row
+            found = session.execute(
+                select(Descriptor.photo_id, Chunk.object_key, Descriptor.row)
+                .join(Chunk, Chunk.id == Descriptor.chunk_id)
+                .where(Descriptor.generation_id == self.generation_id)
+            )
+            return {photo_id: (key, row) for photo_id, key, row in found}
+
+    def reference(self, photo_id: UUID) -> Reference:
+        return self.references()[photo_id]
 
     def query(self, vector: Rows) -> Reference:
         """Store a query's descriptor, as a `describe` job does."""

@@ -8,6 +8,7 @@ const STREETS = "placewise-streets"; // the origin of the tiles that this device
 const MOST_ZOOM = 21;
 const LINES = 9; // about so many across the map
 const POINTS_DRAWN = 5000;
+const LABEL_PIXELS = 20; // height of a label of the graticule
 
 let loaded = null;
 
@@ -45,7 +46,8 @@ function drawGraticule(map, layer) {
   const { x: width, y: height } = map.getSize();
   const corner = map.containerPointToLatLng([4, height - 6]);
   for (let lat = Math.ceil(bounds.getSouth() / step) * step; lat < bounds.getNorth(); lat += step) {
-    if (Math.abs(lat) > 85) continue;
+    // Labels of the meridians are at the top.
+    if (Math.abs(lat) > 85 || map.latLngToContainerPoint([lat, corner.lng]).y < LABEL_PIXELS) continue;
     line([lat, bounds.getWest()], [lat, bounds.getEast()], `${lat.toFixed(digits)}°`, [lat, corner.lng]);
   }
   const top = map.containerPointToLatLng([width, 4]);

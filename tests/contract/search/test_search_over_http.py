@@ -19,9 +19,9 @@ class TestSearchOverHttp(SearchPortContract):
     """The same promises, with HTTP between and the map's slots spread over workers."""
 
     @pytest.fixture
-    def replicas(self, database: str) -> tuple[int, ...]:
+    def replicas(self, catalog_kind: str) -> tuple[int, ...]:
         """Of each shard: one shard on SQLite, three on PostgreSQL, the first of them twice."""
-        return (1,) if database == "sqlite" else (2, 1, 1)
+        return (1,) if catalog_kind == "sqlite" else (2, 1, 1)
 
     @pytest.fixture
     def port(

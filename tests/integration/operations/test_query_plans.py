@@ -16,7 +16,7 @@ from shared.catalog.database.session import Catalog, PoolConfig, TransactionTime
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.
-PHOTOS = 40_000
+PHOTOS = 60_000
 
 Filled = tuple[Catalog, SyntheticCatalog]
 

@@ -161,7 +161,7 @@ def test_ground_truth_comes_back_for_its_own_lists(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("database", "queries"),
+    ("database_names", "query_names"),
     [
         (["a", "c", "b"], ["x", "y"]),
         (["a", "b", "c"], ["y", "x"]),
@@ -170,10 +170,10 @@ def test_ground_truth_comes_back_for_its_own_lists(tmp_path: Path) -> None:
     ],
 )
 def test_ground_truth_of_other_lists_is_refused(
-    tmp_path: Path, database: list[str], queries: list[str]
+    tmp_path: Path, database_names: list[str], query_names: list[str]
 ) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        read_ground_truth(written(tmp_path), database=database, queries=queries)
+        read_ground_truth(written(tmp_path), database=database_names, queries=query_names)
     assert caught.value.code == "ground_truth_of_other_lists"
 
 

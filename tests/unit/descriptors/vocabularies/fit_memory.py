@@ -23,7 +23,7 @@ from tests.unit.descriptors.vocabularies.points import clustered_points
 WIDTH = 384
 PATCHES = 256
 BATCH_PHOTOS = 16
-CLUSTERS = 16
+CLUSTERS = 4
 
 
 class ManyPatches:

@@ -335,6 +335,16 @@ def test_a_map_of_few_photos_keeps_the_prior_and_a_small_one_stays_near_it() -> 
     assert sources == ("own_photos", "prior", "own_photos")
 
 
+def test_the_calibration_source_is_the_prior_below_two_hundred_own_photos() -> None:
+    for own_photos, expected in ((199, "prior"), (200, "own_photos")):
+        model = PlaceModel(source="own_photos", own_photos=own_photos)
+        assert model.calibration_source == expected
+        assert model.is_fitted, "a small map answers with its own thresholds"
+    labelled = PlaceModel(source="labelled_queries", own_photos=30, labelled_queries=40)
+    assert labelled.calibration_source == "labelled_queries"
+    assert PlaceModel().calibration_source == "prior"
+
+
 def test_labelled_queries_refine_the_model() -> None:
     """Half of the queries that look certain are wrong: the own photos did not say so."""
     samples = own_samples(noise=0.3)
