@@ -158,7 +158,13 @@ def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
 
 def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> None:
     found = town.ask(town.queries[0])
-    nowhere: dict[str, Any] = {"in_map": None, "levels": [], "latitude": None, "longitude": None, "place": None}
+    nowhere: dict[str, Any] = {
+        "in_map": None,
+        "levels": [],
+        "latitude": None,
+        "longitude": None,
+        "place": None,
+    }
     found["estimate"] |= {**nowhere, "reason": "The most similar photo has no place."}
     found["estimate"] |= {"radius_m": None, "radius_68_m": None, "radius_95_m": None}
     visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
