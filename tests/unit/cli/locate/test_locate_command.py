@@ -301,7 +301,7 @@ def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others() -> No
     assert boxes == [None, command.WITH_COORDINATES]
     evidence = command.picture_evidence(found, 1000)
     assert [circle.radius_m for circle in evidence.circles] == [25.0, 100.0]
-    assert evidence.similar[0].name == "street.jpg"
+    assert evidence.similar[0].name == "Day 2/street.jpg"
     assert search(answer())[1] == [None]
 
 
