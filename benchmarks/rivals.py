@@ -336,7 +336,7 @@ def measure(
     """Build each engine over `photos` rows, one after another, and search for revisited places.
 
     Files are written to a temporary folder below `folder`: twice the rows at once. An index of
-    whole rows takes the memory of the rows, and twice as much while it is trained.
+    whole rows takes as much memory, and twice as much while it is built.
 
     Raises:
         Misconfigured: `no_benchmarks` if packages of the engines are not installed.

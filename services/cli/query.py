@@ -133,7 +133,7 @@ def query(
             *([_format_percent(match.match_probability)] if levels else []),
             *([_format_score(match.weighted_score)] if weighted else []),
             *([_format_score(match.rerank_score)] if rerank else []),
-            escape(match.original_filename),
+            escape(match.relative_path or match.original_filename),
             _format_degrees(match.latitude),
             _format_degrees(match.longitude),
             escape(match.place or ""),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -227,7 +228,7 @@ def _train(
             ) from None
         raise RunStopped(
             f"Stopped. {checkpoints.last_path} holds the full training state; resume with\n"
-            f"  placewise train --resume {shlex.quote(str(folder))}"
+            f"  {sys.argv[0]} train --resume {shlex.quote(str(folder))}"
         ) from None
     report = build_summary(arguments, folder, prepared.history, checkpoints, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")

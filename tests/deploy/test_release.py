@@ -68,10 +68,21 @@ def test_every_image_is_built_tested_and_signed_before_it_can_be_used() -> None:
     assert release["client"]["needs"] == "test"
 
 
+def test_the_chart_is_published_signed_and_names_published_images() -> None:
+    chart = jobs(ROOT / ".github" / "workflows" / "release.yml")["chart"]
+    assert chart["needs"] == "images"
+    commands = " ".join(step.get("run", "") for step in chart["steps"])
+    order = [commands.index(f"helm {verb}") for verb in ("package", "lint", "push")]
+    assert sorted(order) == order
+    assert "cosign sign" in chart["steps"][-1]["run"]
+
+
 def test_all_files_name_one_version_and_the_changelog_has_it() -> None:
     version = PROJECT["version"]
     assert CLIENT["project"]["version"] == version
     assert f"\n## {version}" in (ROOT / "CHANGELOG.md").read_text()
+    chart = yaml.safe_load((ROOT / "deploy" / "helm" / "Chart.yaml").read_text())
+    assert (chart["version"], chart["appVersion"]) == (version, version)
     compose = (ROOT / "docker-compose.yml").read_text()
     assert set(re.findall(r"PLACEWISE_VERSION:-([\d.]+)", compose)) == {version}
 

@@ -187,7 +187,7 @@ def test_index_reads_places_from_exif_and_from_names(
     paths = {image["original_filename"]: image["relative_path"] for image in named}
     assert paths["3.JPG"] == "below/3.JPG"  # 13.JPG is found, too
     assert (
-        f"1 other file skipped, {PHOTOS - 3} photos without coordinates."
+        f"1 other file skipped (1 .txt), {PHOTOS - 3} photos without coordinates."
         in indexed.without_the_broken.stderr
     )
     headed = server.client.get("/api/v1/search", params={"filename": UTM_FULL}).json()["images"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import glob
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,13 +57,17 @@ def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
     return None
 
 
-def count_other_files(source: Path) -> int:
-    """Count the files below a folder that are no photos; hidden files are left out."""
-    return sum(
-        path.is_file()
-        and path.suffix.lower() not in PHOTO_SUFFIXES
-        and not path.name.startswith(".")
+def count_other_files(source: Path) -> Counter[str]:
+    """Count the files below a folder that are no photos by their suffix, such as `.mov`.
+
+    Hidden files are left out.
+    """
+    return Counter(
+        path.suffix.lower()
         for path in source.rglob("*")
+        if path.suffix.lower() not in PHOTO_SUFFIXES
+        and not path.name.startswith(".")
+        and path.is_file()
     )
 
 

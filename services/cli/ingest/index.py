@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,8 @@ from services.cli.output import (
 )
 from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest
+
+MAX_LISTED_SUFFIXES = 5
 
 
 def index(
@@ -133,7 +136,9 @@ def index(
         # Vocabularies are fitted on database photos only.
         fit_after_upload = fit and role == PhotoRole.DATABASE
         report = _upload_photos(photos, fit_after_upload, update, journal, server, map_name, key)
-        report["other_files"] = sum(map(count_other_files, local))
+        suffixes = sum(map(count_other_files, local), Counter[str]())
+        report["other_files"] = suffixes.total()
+        report["other_suffixes"] = dict(suffixes.most_common())
         report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
     elif len(sources) > 1:
         raise InvalidRequest(
@@ -231,6 +236,16 @@ def _finish_command(
         raise typer.Exit(1)
 
 
+def _list_suffixes(report: Json) -> str:
+    """Name the most frequent kinds of skipped files: ` (12 .mov, 3 .dng)`."""
+    kinds = [
+        f"{number} {suffix or 'without an ending'}"
+        for suffix, number in report["other_suffixes"].items()
+    ]
+    shown = kinds[:MAX_LISTED_SUFFIXES] + ["..."] * (len(kinds) > MAX_LISTED_SUFFIXES)
+    return f" ({', '.join(shown)})" if kinds else ""
+
+
 def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
     print_note(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
@@ -239,7 +254,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     )
     if report.get("other_files") or report.get("without_coordinates"):
         print_note(
-            f"{_count(report['other_files'], 'other file')} skipped, "
+            f"{_count(report['other_files'], 'other file')} skipped{_list_suffixes(report)}, "
             f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
     print_failures(report, "refused", "failed")

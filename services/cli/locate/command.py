@@ -256,7 +256,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
                 photo.latitude,
                 photo.longitude,
                 photo.similarity_score if photo.weighted_score is None else photo.weighted_score,
-                photo.original_filename,
+                photo.relative_path or photo.original_filename,
             )
             for photo in answer.similar_images
             if photo.latitude is not None and photo.longitude is not None
@@ -340,8 +340,10 @@ def _print_proposals(
             escape(each.error or (found.reason if found else "nothing is known about its place")),
             style=None if each in accepted else "dim",
         )
-    if located:
-        print_table(table)
+    if not located:
+        print_message(f"All {len(photos)} photos have coordinates: there is nothing to locate.")
+        return
+    print_table(table)
     print_message(
         f"{len(photos) - len(located)} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "

@@ -106,7 +106,9 @@ def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
             return TimeoutConnection.connect(autocommit=True, prepare_threshold=None, **arguments)
         except psycopg.OperationalError as error:
             # libpq names neither the database nor, for some failures, the host.
-            target = f"database {url.database} at {url.host}:{url.port or DEFAULT_PORT}"
+            local = url.query.get("host", "the local socket")
+            address = f"{url.host}:{url.port or DEFAULT_PORT}" if url.host else local
+            target = f"database {url.database or 'of the user'} at {address}"
             raise type(error)(f"{target}: {error}") from error
 
     return connect

@@ -122,7 +122,7 @@ def test_photos_folders_and_patterns_can_be_combined(tmp_path: Path) -> None:
     sources = [str(tmp_path / name) for name in ("a.jpg", "trip", "x/*.*[gG]")]
     found = find_local_sources(sources)
     assert found == [tmp_path / name for name in ("a.jpg", "trip", "x/1.JPG", "x/2.jpg")]
-    assert [count_other_files(path) for path in found] == [0, 1, 0, 0]
+    assert [count_other_files(path) for path in found] == [{}, {".txt": 1}, {}, {}]
     assert find_local_sources([str(tmp_path / "trip" / "notes.txt")]) is None
     assert find_local_sources(["s3://bucket/imports"]) is None
     with pytest.raises(InvalidRequest, match="pattern"):

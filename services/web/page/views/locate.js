@@ -3,7 +3,7 @@
 import { ask, currentMap, get } from "../api.js";
 import { bar, button, field, fill, h, note, noteError, say } from "../dom.js";
 import { takesDrops } from "../drop.js";
-import { count, degrees, metres, percent, plural } from "../format.js";
+import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
 import { findSimilar } from "./ask.js";
 
@@ -147,7 +147,7 @@ async function search(photo, map, signal) {
   if (first && first.latitude === null && first.place === null) found = await find({ box: WITH_COORDINATES });
   const { estimate, similar_images: similar } = found;
   photo.search = {
-    similar: similar.filter(({ latitude }) => latitude !== null).map(({ original_filename: name, latitude, longitude, similarity_score: score, weighted_score: weighted }) => ({ name, latitude, longitude, score: weighted ?? score })),
+    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.weighted_score ?? match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
     not_in_map: estimate.not_in_map_probability ?? 0.02,
   };
