@@ -67,7 +67,7 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
         tmp_path,
         estimate(PLACES, answer_level=1),
         match_probability=0.614,
-        original_filename="a[/b].jpg",
+        relative_path="Day 2/a[/b].jpg",
     )
     lines = shown.splitlines()
     assert (
@@ -83,7 +83,7 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
         )
     assert "fitted on photos of this map" in " ".join(shown.split())
     assert bars(shown)[-4:] == [12, 19, 20, 0]
-    match = next(row for row in lines if "a[/b].jpg" in row)
+    match = next(row for row in lines if "Day 2/a[/b].jpg" in row)
     assert "0.8000" in match
     assert "61.4 %" in match
     tables = [row for row in lines if not row.endswith(".")]
