@@ -65,6 +65,9 @@ class TestSearchWorker(SearchPortContract):
         settings: Settings,
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setattr(
+            read_retries, "FIRST_RETRY_SECONDS", read_retries.MAX_DAMAGED_RETRY_SECONDS
+        )
         places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         (key,) = places.chunk_keys()
