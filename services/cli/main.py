@@ -108,8 +108,11 @@ def run() -> None:
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = build_overview()
     else:
+        from services.cli.imports import collection_paused
+
         # The suggestion of a similar name, for a typo, needs every command.
-        app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
+        with collection_paused():
+            app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
     app()
 
 

@@ -15,6 +15,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
+from services.cli.imports import collection_paused
 from services.cli.output import err_console, print_note
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
@@ -31,8 +32,9 @@ def serve() -> None:
     repository, the server restarts when its code changes.
     """
     changed = threading.Event()
-    from services.code_reload import can_reload, restart_process, watch_code
-    from services.standalone import serve_standalone
+    with collection_paused():
+        from services.code_reload import can_reload, restart_process, watch_code
+        from services.standalone import serve_standalone
 
     settings = read_settings()
     is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
@@ -116,7 +118,8 @@ def search() -> None:
     The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
     gateway and the steward, which find it through SEARCH_URLS.
     """
-    from services.search.service import serve_search
+    with collection_paused():
+        from services.search.service import serve_search
 
     serve_search(read_settings(), print_note)
 
@@ -126,7 +129,8 @@ def gateway() -> None:
 
     Every call requires an API key: ADMIN_KEY, or one created with `placewise keys`.
     """
-    from services.gateway.service import serve_gateway
+    with collection_paused():
+        from services.gateway.service import serve_gateway
 
     serve_gateway(read_settings(), print_note)
 
@@ -136,7 +140,8 @@ def extractor() -> None:
 
     It is a Celery worker on REDIS_URL, DATABASE_URL and the object store.
     """
-    from services.extractor.service import serve_extractor
+    with collection_paused():
+        from services.extractor.service import serve_extractor
 
     serve_extractor(read_settings(), print_note)
 
@@ -146,7 +151,8 @@ def steward() -> None:
 
     Any number of stewards can run at the same time.
     """
-    from services.steward.service import serve_steward
+    with collection_paused():
+        from services.steward.service import serve_steward
 
     serve_steward(read_settings(), print_note)
 
