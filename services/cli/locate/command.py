@@ -35,7 +35,7 @@ from services.cli.output import (
     printable_path,
     progress_bar,
 )
-from shared.errors import InvalidRequest, PlacewiseError
+from shared.errors import PlacewiseError
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geotagging.evidence import (
     KnownPosition,
@@ -46,7 +46,7 @@ from shared.geotagging.evidence import (
     interpolate_position,
 )
 from shared.geotagging.fusion import Proposal, propose_position
-from shared.tracks.motion import MOTION_MODELS, MotionModel, motion_model
+from shared.tracks.motion import MOTION_MODELS, MotionModel, parse_motion
 
 SIMILAR_PHOTOS = 50
 SEARCHES_AT_ONCE = 4
@@ -153,7 +153,7 @@ def locate(
     if undo_changes:
         _report_undo(undo(folder), as_json)
         return
-    moves = _parse_motion(motion)
+    moves = parse_motion(motion)
     photos = read_folder(folder, time_zone, clock_offset)
     if together:
         check_time_zones(photos, "--together")
@@ -183,13 +183,6 @@ def locate(
         _print_proposals(folder, photos, located, accepted, accept, written)
     if any(each.error for each in located) or (written is not None and written.skipped):
         raise typer.Exit(1)
-
-
-def _parse_motion(text: str) -> MotionModel:
-    try:
-        return motion_model(text)
-    except ValueError as error:
-        raise InvalidRequest("bad_motion", str(error)) from error
 
 
 def _search_photos(client: Client, photos: Sequence[FolderPhoto]) -> list[Similar | str]:

@@ -25,7 +25,8 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from services.steward.archives import Archive, ArchiveLimits, open_archive
+from services.steward.archives.archive import Archive, ArchiveLimits
+from services.steward.archives.readers import open_archive
 from services.steward.batches.listing import (
     list_archive_photos,
     list_prefix_photos,

@@ -26,8 +26,12 @@ from services.cli.track.frame_sources import (
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import COLUMNS, check_track_files, write_track_file
-from services.cli.track.track_picture import located_segments
+from services.cli.track.track_files import (
+    COLUMNS,
+    check_track_files,
+    located_segments,
+    write_track_file,
+)
 from shared.errors import InvalidRequest, Misconfigured
 from tests.support.api_responses import PHOTO
 from tests.support.photos import photo_bytes, photo_image

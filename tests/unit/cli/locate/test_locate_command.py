@@ -15,7 +15,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
 from placewise.answers import Similar
-from services.cli.locate import command, exif_writers
+from services.cli.locate import command, writers
 from services.cli.locate.folder import FolderPhoto, read_folder, read_gpx
 from services.cli.locate.sidecars import add_position, read_position
 from services.cli.main import build_app
@@ -225,7 +225,7 @@ def test_a_missing_exif_writer_is_named_with_the_ways_to_get_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
-    monkeypatch.setattr(exif_writers, "find_spec", lambda name: None)
+    monkeypatch.setattr(writers, "find_spec", lambda name: None)
     result = run(folder, "--write", "exif")
     assert result.exit_code == 1
     for words in ("no_exif_writer", "exiftool", "uv pip install '.[exif]'", "--write sidecar"):
