@@ -30,7 +30,7 @@ from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu, choose_precision
-from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
+from shared.descriptors.pca_whitening import PcaProjection, Rows, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vocabulary_file import (
     VocabularyFile,
@@ -96,7 +96,7 @@ def _added_backbone(
 DecodeOutcome = DecodedPhoto | PlacewiseError
 
 
-def decode_batches(
+def _decode_batches(
     photos: Sequence[Path],
     preprocessing: Preprocessing,
     settings: Settings,
@@ -134,7 +134,7 @@ def decode_batches(
         yield prefetched.result()
 
 
-def split_outcomes(
+def _split_outcomes(
     batch: Sequence[tuple[Path, DecodeOutcome]], refused: list[tuple[Path, PlacewiseError]]
 ) -> list[Pixels]:
     """Return the (height, width, 3) pixels of a batch; its other photos are added to `refused`."""
@@ -153,10 +153,46 @@ def decode_pixels(
     settings: Settings,
     refused: list[tuple[Path, PlacewiseError]],
 ) -> Iterator[list[Pixels]]:
-    """Decode photos to batches of pixels as `split_outcomes` does, in the order of the photos."""
-    for batch in decode_batches(photos, preprocessing, settings, defaultdict(float)):
-        if pixels := split_outcomes(batch, refused):
+    """Decode photos to batches of pixels as `_split_outcomes` does, in the order of the photos."""
+    for batch in _decode_batches(photos, preprocessing, settings, defaultdict(float)):
+        if pixels := _split_outcomes(batch, refused):
             yield pixels
+
+
+def describe_photos(
+    photos: Sequence[Path],
+    extractor: Extractor,
+    centres: ClusterCentres | None,
+    settings: Settings,
+    refused: list[tuple[Path, PlacewiseError]],
+    seconds: defaultdict[str, float],
+    projection: PcaProjection | None = None,
+) -> Iterator[Rows]:
+    """Describe photos batch by batch.
+
+    After the first photo that can't be described, the others are only decoded, so that all failures
+    can be reported: they are added to `refused`. The times of the stages are added to
+    `seconds["decode"]` and `seconds["describe"]`.
+
+    Yields:
+        (b, D) float32 rows in the order of the photos.
+    """
+    for batch in _decode_batches(photos, extractor.preprocessing, settings, seconds):
+        pixels = _split_outcomes(batch, refused)
+        if refused or not pixels:
+            continue
+        started = time.perf_counter()
+        try:
+            rows = extractor.describe(pixels, centres, projection)
+        except PhotoTooLargeForGpu as error:
+            refused.append((batch[error.place][0], error))
+            continue
+        seconds["describe"] += time.perf_counter() - started
+        for (photo, _), row in zip(batch, rows, strict=True):
+            if not np.isfinite(row).all():
+                refused.append((photo, not_finite_error()))
+        if not refused:
+            yield rows
 
 
 def _read_photo(photo: Path) -> bytes | PlacewiseError:
@@ -263,21 +299,11 @@ def describe_files(
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
     with atomic_write(out) as file, _open_descriptor_writer(file, shape, names) as write:
-        for batch in decode_batches(photos, extractor.preprocessing, settings, result.seconds):
-            pixels = split_outcomes(batch, refused)
-            if not refused:  # after a failure, the rest is only decoded, to report all failures
-                batch_started = time.perf_counter()
-                try:
-                    rows = extractor.describe(pixels, centres, projection)
-                except PhotoTooLargeForGpu as error:
-                    refused.append((batch[error.place][0], error))
-                else:
-                    for (photo, _), row in zip(batch, rows, strict=True):
-                        if not np.isfinite(row).all():
-                            refused.append((photo, not_finite_error()))
-                    write(rows)
-                result.seconds["describe"] += time.perf_counter() - batch_started
-            advance(len(batch))
+        for rows in describe_photos(
+            photos, extractor, centres, settings, refused, result.seconds, projection
+        ):
+            write(rows)
+            advance(len(rows))
         if refused:
             raise _refused_photos_error(refused, len(photos))
     result.seconds["total"] = time.perf_counter() - started
