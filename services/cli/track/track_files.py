@@ -16,6 +16,7 @@ from placewise.answers import OneTrack, Photo, TrackFrame
 from services.cli.output import Json, atomic_write, check_output_path, printable_path
 from services.cli.track.track_picture import draw_track, located_segments
 from shared.errors import InvalidRequest, Misconfigured
+from shared.ingest.photo_metadata import escape_csv_text
 
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
 COLUMNS = (
@@ -33,6 +34,7 @@ COLUMNS = (
     "image_id",
 )
 STATE_COLUMNS = COLUMNS[3:]
+TEXT_COLUMNS = ("filename", "place")
 PICTURE_SUFFIXES = (".png", ".jpg")
 
 
@@ -89,7 +91,10 @@ def _to_csv(track: OneTrack, photos: Sequence[Photo]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(track_row(frame) for frame in track.frames)
+    for frame in track.frames:
+        row = track_row(frame)
+        texts = {name: escape_csv_text(row[name]) for name in TEXT_COLUMNS if row[name]}
+        writer.writerow(row | texts)
     return text.getvalue().encode()
 
 
