@@ -56,7 +56,7 @@ from shared.telemetry.heartbeat import Heartbeat
 log = logging.getLogger(__name__)
 
 
-class DeletionCountingStore:
+class _DeletionCountingStore:
     """Wraps an object store and calls `on_delete` after each deletion."""
 
     def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:
@@ -141,8 +141,8 @@ class Scheduler:
         merge_retries = ReadRetries()
         queued_chunks: QueuedChunks = {}
 
-        def counted(task: str) -> DeletionCountingStore:
-            return DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
+        def counted(task: str) -> _DeletionCountingStore:
+            return _DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
 
         # On the disk of the SQLite file; PostgreSQL reserves its own space.
         catalog_file = sqlite_file(catalog)

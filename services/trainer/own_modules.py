@@ -29,10 +29,12 @@ def register_own_modules(arguments: TrainingArguments) -> None:
         InvalidRequest: `own_module_unfit`, if one cannot be imported or is not what it should be.
     """
     if is_own_module(arguments.backbone_arch):
-        build: Callable[[bool], nn.Module] = import_object("backbone_arch", arguments.backbone_arch)
+        build: Callable[[bool], nn.Module] = _import_object(
+            "backbone_arch", arguments.backbone_arch
+        )
         register_backbone(arguments.backbone_arch, build)
     if is_own_module(arguments.agg_arch):
-        aggregator = import_object("agg_arch", arguments.agg_arch)
+        aggregator = _import_object("agg_arch", arguments.agg_arch)
         if not (isinstance(aggregator, type) and issubclass(aggregator, Aggregator)):
             raise _unfit_error(
                 "agg_arch",
@@ -51,7 +53,7 @@ def make_own_module(argument: str, path: str) -> nn.Module:
             trains those of the network only.
     """
     try:
-        made = import_object(argument, path)()
+        made = _import_object(argument, path)()
     except TypeError as error:
         raise _unfit_error(argument, path, str(error)) from error
     if not isinstance(made, nn.Module):
@@ -61,7 +63,7 @@ def make_own_module(argument: str, path: str) -> nn.Module:
     return made
 
 
-def import_object(argument: str, path: str) -> Any:
+def _import_object(argument: str, path: str) -> Any:
     """Import `package.module:Name`; modules in the working directory are found, too.
 
     Raises:

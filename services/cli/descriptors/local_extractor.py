@@ -170,7 +170,7 @@ HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
 
 
 @contextlib.contextmanager
-def open_descriptor_writer(
+def _open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
 ) -> Iterator[Callable[[Any], object]]:
     """Open a writer for descriptors; call it with successive (b, D) float32 batches.
@@ -202,7 +202,7 @@ def open_descriptor_writer(
 
 
 @dataclass(slots=True)
-class DescriptorFile:
+class _DescriptorFile:
     """A written file of descriptors, with the extractor spec and timings."""
 
     out: Path
@@ -231,7 +231,7 @@ def describe_files(
     advance: Callable[[int], None],
     *,
     names: Sequence[str] | None = None,
-) -> DescriptorFile:
+) -> _DescriptorFile:
     """Describe photos and write (photos, dimension) float32 rows to a file atomically.
 
     Args:
@@ -258,11 +258,11 @@ def describe_files(
     if whitening is not None:
         whitening.check_compatible(extractor.spec(centres))
         projection = PcaProjection(whitening.whitening, extractor.backbone.device)
-    result = DescriptorFile(out, extractor.spec(centres, projection), len(photos))
+    result = _DescriptorFile(out, extractor.spec(centres, projection), len(photos))
     result.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
-    with atomic_write(out) as file, open_descriptor_writer(file, shape, names) as write:
+    with atomic_write(out) as file, _open_descriptor_writer(file, shape, names) as write:
         for batch in decode_batches(photos, extractor.preprocessing, settings, result.seconds):
             pixels = split_outcomes(batch, refused)
             if not refused:  # after a failure, the rest is only decoded, to report all failures

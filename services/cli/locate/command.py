@@ -54,7 +54,7 @@ WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have
 
 
 @dataclass(frozen=True, slots=True)
-class LocatedPhoto:
+class _LocatedPhoto:
     """What is proposed for a photo without coordinates."""
 
     photo: FolderPhoto
@@ -226,13 +226,13 @@ def _locate_photo(
     track: Sequence[KnownPosition],
     moves: MotionModel,
     radius_m: float,
-) -> LocatedPhoto:
+) -> _LocatedPhoto:
     speed = moves.max_speed_mps
     on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
     answer = search if isinstance(search, Similar) else None
     evidence = None if answer is None else picture_evidence(answer, photo_count)
     label = next((each for each in answer.estimate.levels if each.place), None) if answer else None
-    return LocatedPhoto(
+    return _LocatedPhoto(
         photo,
         propose_position(evidence, neighbours.position_of(photo, speed), on_track, radius_m),
         label.place if label else None,
@@ -273,7 +273,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
     )
 
 
-def _location(located: LocatedPhoto) -> Location:
+def _location(located: _LocatedPhoto) -> Location:
     photo = located.photo
     return Location(
         photo.path,
@@ -286,7 +286,7 @@ def _location(located: LocatedPhoto) -> Location:
 
 def _to_json(
     photos: Sequence[FolderPhoto],
-    located: Sequence[LocatedPhoto],
+    located: Sequence[_LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> Json:
@@ -314,8 +314,8 @@ def _to_json(
 def _print_proposals(
     folder: Path,
     photos: Sequence[FolderPhoto],
-    located: Sequence[LocatedPhoto],
-    accepted: Sequence[LocatedPhoto],
+    located: Sequence[_LocatedPhoto],
+    accepted: Sequence[_LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> None:

@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class RankingWeights:
+class _RankingWeights:
     """Word weights of a search, and the calibration that belongs to them."""
 
     generation: Generation
@@ -79,11 +79,11 @@ class RankingWeights:
 
 def select_ranking_weights(
     generation: Generation, enabled: bool, settings: Settings
-) -> RankingWeights:
+) -> _RankingWeights:
     """Select the word weights of the generation, unless the request or a setting disables them."""
     record = parse_word_weights(generation.word_weights)
     enabled = enabled and settings.word_weights
-    return RankingWeights(generation, record, record.applied if record and enabled else ())
+    return _RankingWeights(generation, record, record.applied if record and enabled else ())
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,7 @@ OBJECT_READ_BYTES = 256 * 1024
 MAX_OPEN_ARCHIVES = 4  # reopening a gzipped archive decompresses it from its beginning
 
 
-class BatchItemImporter:
+class _BatchItemImporter:
     """Imports batch items; caches the open archives."""
 
     def __init__(
@@ -278,7 +278,7 @@ class BatchWorker:
         self._store = store
         self._settings = settings
         self._disk = DiskSpace(settings)
-        self._importer = BatchItemImporter(catalog, store, wakeups, settings)
+        self._importer = _BatchItemImporter(catalog, store, wakeups, settings)
         metrics = metrics or StewardMetrics(CollectorRegistry())
         self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics.count_jobs)
 

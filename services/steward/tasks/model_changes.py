@@ -55,7 +55,7 @@ def remove_dead_search_workers(catalog: Catalog) -> None:
         log.warning("removed %d search workers without a recent heartbeat", removed)
 
 
-def search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
+def _search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
     """Return whether every live search worker has loaded the complete generation.
 
     If not, the job is set to wait for them, for as long as they live: without a worker, the photos
@@ -289,7 +289,7 @@ def _finish_model_change(session: Session, job: Job, generation: Generation) -> 
     """Activate the complete generation, unless search workers have yet to load it."""
     failed = _count_jobs(session, _open_jobs(job, generation) & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
-        if not search_workers_have_loaded(session, job, generation):
+        if not _search_workers_have_loaded(session, job, generation):
             return
         _activate_generation(session, job, generation)
     job.progress_failed = failed
