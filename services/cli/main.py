@@ -57,6 +57,13 @@ COMMANDS = {
 class _PlacewiseGroup(TyperGroup):
     """Reports the error of a command in one line, as JSON with `--json`, and exits with code 1."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if "--help" in args[1:]:
+            from services.cli.help_layout import prepare_help  # only the help needs it
+
+            prepare_help(self)
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)

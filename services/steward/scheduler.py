@@ -15,7 +15,7 @@ from typing import Any, cast
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.steward.batches.worker import resume_batches
+from services.steward.batches.worker import cancel_items_of_ended_batches, resume_batches
 from services.steward.metrics import StewardMetrics
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_small_chunks
@@ -146,6 +146,11 @@ class Scheduler:
                 "cancel jobs of ended model changes",
                 0.5,
                 lambda: cancel_jobs_of_abandoned_generations(catalog),
+            ),
+            PeriodicTask(
+                "cancel photos of ended batches",
+                1.0,
+                lambda: cancel_items_of_ended_batches(catalog),
             ),
             PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),

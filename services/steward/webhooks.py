@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 from uuid import UUID
 
 import httpcore2
-from sqlalchemy import ColumnElement, select, update
+from sqlalchemy import ColumnElement, exists, select, update
 from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database.base import db_now, db_now_plus
@@ -200,11 +200,13 @@ class WebhookDispatcher:
         stopped = _in_daemon_thread(stop.wait)
         tasks: dict[UUID, asyncio.Task[None]] = {}
         poll = ChangePoll(self._catalog)
+        has_pending = True
         while not stopped.done():
             due: list[UUID] = []
             try:
-                if tasks or poll.is_due(RETRY_DELAYS_SECONDS[0]):
+                if poll.is_due() or tasks or has_pending:
                     due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                    has_pending = bool(due) or await asyncio.to_thread(self._has_pending)
                     if not due:
                         self._outage.record_success()
             except SQLAlchemyError as error:
@@ -232,6 +234,12 @@ class WebhookDispatcher:
         due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(excluded))
         with self._catalog.read() as session:
             return list(session.scalars(due.distinct()))
+
+    def _has_pending(self) -> bool:
+        """Return whether a delivery waits for its next attempt."""
+        pending = exists().where(Delivery.state == DeliveryState.PENDING)
+        with self._catalog.read() as session:
+            return bool(session.scalar(select(pending)))
 
     async def deliver_due(self, webhook_id: UUID) -> int:
         """Attempt the due deliveries of one webhook, up to MAX_IN_FLIGHT; return their number."""

@@ -24,6 +24,7 @@ from services.cli.output import printable_path
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.geotagging.fusion import Proposal
 from shared.imaging.photo_header import read_photo_header
+from shared.ingest.photo_metadata import escape_csv_text
 
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
 CSV_NAME, GPX_NAME = "placewise-locations.csv", "placewise-locations.gpx"
@@ -135,7 +136,8 @@ def _to_csv(locations: Sequence[Location]) -> bytes:
     writer.writerow(("filename", "latitude", "longitude", "place"))
     for each in locations:
         position = (each.proposal.latitude, each.proposal.longitude) if each.proposal else ("", "")
-        writer.writerow((each.name, *position, each.place or ""))
+        texts = escape_csv_text(each.name), escape_csv_text(each.place or "")
+        writer.writerow((texts[0], *position, texts[1]))
     return text.getvalue().encode()
 
 

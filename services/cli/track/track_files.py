@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 from placewise.answers import OneTrack, Photo, TrackFrame, TrackState
 from services.cli.output import Json, atomic_write, check_output_path, printable_path
 from shared.errors import InvalidRequest, Misconfigured
+from shared.ingest.photo_metadata import escape_csv_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +39,7 @@ COLUMNS = (
     "image_id",
 )
 STATE_COLUMNS = COLUMNS[3:]
+TEXT_COLUMNS = ("filename", "place")
 PICTURE_SUFFIXES = (".png", ".jpg")
 INCHES = (8.0, 8.0)
 DPI = 150
@@ -108,7 +110,10 @@ def _to_csv(track: OneTrack, photos: Sequence[Photo]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(track_row(frame) for frame in track.frames)
+    for frame in track.frames:
+        row = track_row(frame)
+        texts = {name: escape_csv_text(row[name]) for name in TEXT_COLUMNS if row[name]}
+        writer.writerow(row | texts)
     return text.getvalue().encode()
 
 

@@ -42,7 +42,7 @@ from shared.errors import InvalidRequest
 
 LOG_INTERVAL_SECONDS = 60.0
 """Interval of progress lines if stderr is not a terminal, where bars would not be visible."""
-SHOWN_KS = ("1", "5", "10", "20")
+SHOWN_KS = ("1", "5", "10", "15", "20")
 
 
 class _TerminalDisplay:
@@ -58,6 +58,7 @@ class _TerminalDisplay:
             TextColumn("{task.fields[note]}"),
             console=err_console,
             transient=True,
+            disable=not err_console.is_terminal,  # it would print an empty line at its end
         )
         self._tasks: dict[str, TaskID] = {}
         self._line_at = time.monotonic() + LOG_INTERVAL_SECONDS

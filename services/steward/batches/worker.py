@@ -45,8 +45,9 @@ from shared.catalog.batch_items import (
     sync_item_states,
     update_batch_progress,
 )
+from shared.catalog.database.base import for_update
 from shared.catalog.database.session import Catalog, ChangePoll
-from shared.catalog.jobs import WaitingFor, claimable_condition
+from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
@@ -64,7 +65,12 @@ from shared.ingest.validation import (
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner
-from shared.jobs.transitions import make_waiting_jobs_claimable, release_job, succeed_job
+from shared.jobs.transitions import (
+    cancel_batch_items,
+    make_waiting_jobs_claimable,
+    release_job,
+    succeed_job,
+)
 from shared.storage import ObjectStore
 from shared.storage.keys import new_original_key
 
@@ -241,6 +247,20 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
         return
     with catalog.write() as session:
         make_waiting_jobs_claimable(session, waits)
+
+
+def cancel_items_of_ended_batches(catalog: Catalog) -> None:
+    """Cancel the photos of cancelled and failed batches that are still being indexed."""
+    is_ended = (Job.kind == JobKind.BATCH) & Job.state.in_((JobState.CANCELLED, JobState.FAILED))
+    unfinished = exists().where(BatchItem.job_id == Job.id, BatchItem.state.in_(UNFINISHED_STATES))
+    with catalog.read() as session:
+        batch_ids = session.scalars(select(Job.id).where(is_ended, unfinished)).all()
+    for batch_id in batch_ids:
+        with catalog.write() as session:
+            # Unless it was retried or deleted since.
+            batch = session.scalar(for_update(select(Job).where(Job.id == batch_id, is_ended)))
+            if batch is not None:
+                cancel_batch_items(session, batch)
 
 
 class BatchWorker:

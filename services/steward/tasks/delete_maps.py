@@ -24,7 +24,7 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import Track, delete_tracks
@@ -91,16 +91,8 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _cancel_jobs(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        ids = session.scalars(
-            select(Job.id)
-            .where(Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES))
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    if ids:
-        with catalog.write() as session:
-            cancel_jobs(session, Job.id.in_(ids))
-    return bool(ids)
+    with catalog.write() as session:
+        return cancel_jobs(session, Job.map_id == map_id) > 0
 
 
 def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:

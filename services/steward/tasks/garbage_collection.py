@@ -9,6 +9,7 @@ the opposite order would leave objects that no row refers to. Objects without ro
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import TypeVar
 from uuid import UUID
 
@@ -114,8 +115,11 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(abandoned_job_ids)))
     for generation_id in {chunk.generation_id for chunk in ended}:
-        for info in list(store.list(local_features_prefix(generation_id))):
-            store.delete(info.key)
+        prefix = local_features_prefix(generation_id)
+        # Listed again after some were deleted: a listing that goes on may skip others.
+        while infos := list(islice(store.list(prefix), ROWS_PER_TRANSACTION)):
+            for info in infos:
+                store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
         with catalog.write() as session:

@@ -38,8 +38,8 @@ from shared.errors import Conflict
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.model_changes import CANCELLED_PER_TRANSACTION, start_model_change
-from shared.jobs.transitions import cancel_jobs, succeed_job
+from shared.jobs.model_changes import start_model_change
+from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs, succeed_job
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from rich.progress_bar import ProgressBar
 
-from services.cli.output import Table, print_table
+from services.cli.output import Table, print_table, progress_bar
+from services.cli.training.commands import _TerminalDisplay
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
 MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"
@@ -96,3 +97,13 @@ def test_tab_separated_cells_hold_no_markup_tabs_or_line_breaks(
         "\t",
         "a caption",
     ]
+
+
+def test_progress_leaves_no_trace_where_stderr_is_not_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with progress_bar() as progress:
+        progress.add_task("scanning the folder", total=None)
+    with _TerminalDisplay():
+        pass
+    assert capsys.readouterr().err == ""

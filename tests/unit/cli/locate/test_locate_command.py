@@ -265,6 +265,14 @@ def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path)
     assert not list(folder.glob("placewise-locations*"))
 
 
+def test_a_name_in_a_table_is_no_formula_for_a_spreadsheet(folder: Path) -> None:
+    (folder / "day 1" / "2.jpg").rename(folder / "=2.jpg")
+    assert run(folder, "--write", "csv").exit_code == 0
+    table = (folder / "placewise-locations.csv").read_bytes()
+    assert b"\n'=2.jpg," in table
+    assert [entry.name for entry in read_csv_manifest(table, "table")] == ["=2.jpg"]
+
+
 def answer(**changes: Any) -> Similar:
     similar = {**PHOTO, "latitude": LATITUDE, "longitude": LONGITUDE, "similarity_score": 0.9}
     levels = [
