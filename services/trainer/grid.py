@@ -285,9 +285,12 @@ _HARMLESS_ARGUMENTS = {"loss_name", "miner_name", "miner_margin", "lr", "max_epo
 
 
 def find_grid_obstacles(plan: GridPlan) -> dict[str, list[str]]:
-    """Return what keeps runs from starting on this machine: code and detail -> names of the runs.
+    """Check whether each run of a grid could start on this machine.
 
     Runs that differ only in their training settings are checked once.
+
+    Returns:
+        Names of the runs that can't start, by error ("code: detail").
     """
     checked: dict[str, list[PlacewiseError]] = {}
     blocked: dict[str, list[str]] = {}

@@ -54,6 +54,12 @@ def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool
         if checkpoint is not None and not resuming:
             initial = load_checkpoint(checkpoint).model
             _check_same_network(checkpoint, initial.config, model.config)
+            if initial.config.interpolation != config.interpolation:
+                display.warn(
+                    f"The weights of {checkpoint} belong to photos that are resized with "
+                    f"--interpolation {initial.config.interpolation}; this run resizes them with "
+                    f"{config.interpolation}."
+                )
             model.load_state_dict(initial.state_dict())
         return model
     if not config.pretrained and config.layers_to_freeze >= 0:

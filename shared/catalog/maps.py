@@ -257,7 +257,7 @@ def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, d
         cached = session.get(CachedMapStatistics, map_id)
         if cached is not None:
             return MapStatistics(**cached.figures), cached.counted_at
-    return compute_map_statistics(session, map_id), session.execute(
+    return _compute_map_statistics(session, map_id), session.execute(
         sa.select(db_now())
     ).scalar_one()
 
@@ -271,7 +271,7 @@ def is_large_map(session: Session, map_id: UUID) -> bool:
     )
 
 
-def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
+def _compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     """Count the map's rows; this takes seconds on a map with a million photos."""
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
@@ -320,7 +320,7 @@ def cache_map_statistics(session: Session, map_id: UUID) -> None:
     """Count the map's rows and cache the statistics."""
     started = time.perf_counter()
     now = session.execute(sa.select(db_now())).scalar_one()
-    figures = asdict(compute_map_statistics(session, map_id))
+    figures = asdict(_compute_map_statistics(session, map_id))
     took = time.perf_counter() - started
     session.merge(
         CachedMapStatistics(map_id=map_id, figures=figures, counted_at=now, took_seconds=took)

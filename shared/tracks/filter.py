@@ -63,7 +63,7 @@ ENTERING = 0.005
 OUTSIDE_GAIN = 0.7
 """Share of the track's gain above CHANCE_GAIN that a frame outside the map must fall below"""
 CHANCE_GAIN = 0.45
-"""A track that gains no more than this by its frames cannot be told from one outside the map"""
+"""A track that gains no more than this by its frames is not distinguishable from one outside"""
 MAX_GAIN_WEIGHT = 200.0
 """Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
 NEWS_WEIGHT = 1.5

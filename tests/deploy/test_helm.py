@@ -380,12 +380,12 @@ def test_backups_go_to_a_volume_that_outlives_the_release() -> None:
     assert folder.startswith(mounts["backups"])
     volumes = {one["name"]: one for one in pod(backup)["spec"]["volumes"]}
     claim = volumes["backups"]["persistentVolumeClaim"]["claimName"]
-    (kept,) = (
+    (volume_claim,) = (
         one
         for one in of_kind("production", "PersistentVolumeClaim")
         if one["metadata"]["name"] == claim
     )
-    assert kept["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
+    assert volume_claim["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
 
 
 def test_the_page_is_reached_over_tls() -> None:

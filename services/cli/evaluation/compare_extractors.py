@@ -82,7 +82,7 @@ def _whiten_set(
 
 
 def _project(rows: Rows, projection: PcaProjection, block_rows: int) -> Rows:
-    reduced = np.empty((len(rows), projection.kept), np.float32)
+    reduced = np.empty((len(rows), projection.components), np.float32)
     for begin in range(0, len(rows), block_rows):
         block = slice(begin, begin + block_rows)
         reduced[block] = projection.project(np.array(rows[block]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -46,6 +45,7 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
+    program,
     progress_bar,
 )
 from shared.catalog.photo_role import PhotoRole
@@ -263,7 +263,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     options = f" --map {map_name}" if map_name else ""
     options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    print_note(f"Next: {sys.argv[0]} {command}{options}")
+    print_note(f"Next: {program()} {command}{options}")
 
 
 def _count(number: int, noun: str) -> str:

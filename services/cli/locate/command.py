@@ -55,7 +55,7 @@ WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have
 
 @dataclass(frozen=True, slots=True)
 class _LocatedPhoto:
-    """What is proposed for a photo without coordinates."""
+    """The proposal for a photo without coordinates."""
 
     photo: FolderPhoto
     proposal: Proposal | None
@@ -205,7 +205,7 @@ def _search_photo(client: Client, photo: FolderPhoto) -> Similar | str:
             # Photos of the map without coordinates, such as this one, hide those that have some.
             return client.similar(photo.path, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES)
     except PlacewiseError as error:
-        if error.status not in (413, 415, 422):
+        if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
         return error.detail
     return answer

@@ -70,9 +70,9 @@ export function note(text, kind = "") {
   setTimeout(() => line.remove(), kind === "bad" ? 12000 : 5000);
 }
 
-/** Have screen readers say what the eye sees anyway. */
-export function say(text) {
-  document.getElementById("said").textContent = text;
+/** Announce to screen readers what has changed on the screen. */
+export function announce(text) {
+  document.getElementById("announcement").textContent = text;
 }
 
 /** What went wrong, unless the view was only left. */

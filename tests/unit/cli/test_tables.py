@@ -53,6 +53,21 @@ def test_long_names_are_shortened_in_the_middle_to_fit_80_columns(
 
 
 @pytest.mark.usefixtures("terminal")
+def test_a_name_beside_many_columns_keeps_its_ends_and_the_other_columns_their_numbers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = Table("places", "R@1", "R@5", "R@10", "R@20", "R@1 95 % CI", "ms", "bytes", "vs. first")
+    figures = ("56.7", "73.3", "76.7", "86.7", "37.5 to 77.8", "222.4", "57,344")
+    table.add_row("efficientnet-lite0-vlad128+fit", *figures, "+16.7 (+3.3 to +32.4)")
+    print_table(table)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    row = next(line for line in lines if "222.4" in line)
+    assert row.startswith("effic")
+    assert "+fit  56.7  73.3  76.7  86.7  37.5 to 77.8  222.4  57,344  +16.7" in row
+
+
+@pytest.mark.usefixtures("terminal")
 def test_names_that_fit_are_shown_in_full(capsys: pytest.CaptureFixture[str]) -> None:
     table = Table("photo", "place")
     table.add_row("queries/frame_000123.jpg", "tower/floor7/elevator")

@@ -1,4 +1,4 @@
-// One photo: large, where it is, what is said of it, and changing that.
+// One photo: large, where it is, its metadata, and changing them.
 
 import { ask, currentMap, get } from "../api.js";
 import { button, confirmed, field, fill, h, note, time } from "../dom.js";
@@ -10,11 +10,12 @@ import { readTags } from "./photos.js";
 
 export async function showPhoto(view, { signal, id }) {
   const photo = await get(`/uploads/${id}`, { signal });
+  const job = photo.searchable || !photo.job_id ? null : await get(`/jobs/${photo.job_id}`, { signal });
   document.title = `${nameOf(photo)} · ${currentMap()} · Placewise`;
   const ground = h("div", { class: "ground" });
   const form = editForm(photo);
   const remove = async () => {
-    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} is gone from every answer at once, and can’t be brought back.`, "Delete"))) return;
+    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} disappears from all answers at once. This can’t be undone.`, "Delete"))) return;
     await ask(`/uploads/${id}`, { method: "DELETE" });
     note(`${nameOf(photo)} is deleted.`);
     location.hash = "#/photos";
@@ -30,7 +31,7 @@ export async function showPhoto(view, { signal, id }) {
       h("div", { class: "beside" },
         h("section", { class: "card" }, form.element),
         h("section", { class: "card" }, ground, h("p", { class: "soft small" }, "Click into the map to move the photo there, then save.")),
-        h("section", { class: "card" }, facts(photo)))));
+        h("section", { class: "card" }, facts(photo, job)))));
   const map = await openMap(ground, "Where this photo was taken; click to move it", { onpick: (latitude, longitude) => {
     form.setPoint(latitude, longitude);
     draw();
@@ -49,10 +50,11 @@ export async function showPhoto(view, { signal, id }) {
   draw(true);
 }
 
-function facts(photo) {
+function facts(photo, job) {
+  const state = photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet";
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
-    line("Searchable", photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet"),
+    line("Searchable", job?.state === "failed" ? h("span", { class: "bad" }, `no. ${job.error.detail}`) : state),
     photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
@@ -81,7 +83,7 @@ function editForm(photo) {
     saving.click();
   } },
     h("div", { class: "pair" }, field("Latitude", latitude), field("Longitude", longitude)),
-    field("Place", place, "A label, where coordinates say little: a room, a shelf"),
+    field("Place", place, "A label, such as a room or a shelf"),
     field("Tags", tags, "Separated by commas"),
     field("Use", role, "A test photo is never found: the map is measured with it"));
   const saving = button("Save", save, "primary");
