@@ -40,7 +40,6 @@ from rich.progress import Progress
 
 from benchmarks.report import Report
 from benchmarks.search.comparison import load_worker
-from benchmarks.search.memory_traffic import private_bytes
 from benchmarks.search.methods import BruteForce, PlacewiseSearch
 from benchmarks.search.synthetic_map import (
     CHUNK_ROWS,
@@ -53,6 +52,7 @@ from services.search.executor import SearchOptions
 from shared.catalog.generations import RowType
 from shared.errors import Misconfigured
 from shared.storage.chunks import Rows
+from tests.support.memory import memory_bytes
 from tests.support.servers.postgres import start_postgres
 
 SEED = 20_261_122
@@ -431,7 +431,7 @@ def _held_bytes() -> int:
     """Return the private memory of this process, without what its allocator has free."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    return private_bytes()
+    return memory_bytes("RssAnon")
 
 
 def _as_indexed(rival: type[Rival], town: Town, query: Rows) -> tuple[Rows, float]:
