@@ -56,7 +56,7 @@ class QueryOutcome:
         return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
 
 
-def query_with_photo(
+def _query_with_photo(
     client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
 ) -> QueryOutcome:
     """Query with a photo that is not stored, and compare the result with its ground truth."""
@@ -73,7 +73,7 @@ def query_with_photo(
     )
 
 
-def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
+def _summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
     """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
     inside = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
@@ -125,7 +125,7 @@ GAP = 16
 CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), (150, 150, 150)
 
 
-def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
+def _draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
     """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
 
     The frame is green for a correct match, red for a wrong one, grey for "not in this map".
@@ -210,7 +210,7 @@ def main() -> None:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
         if options.picture:
-            draw_outcomes(outcomes, city / "database", options.picture)
+            _draw_outcomes(outcomes, city / "database", options.picture)
             print(f"Queries and their matches: {options.picture}")
 
 
@@ -252,13 +252,13 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     bar = progress.add_task("querying", total=len(queries[1::2]))
     outcomes = []
     for query in queries[1::2]:
-        outcomes.append(query_with_photo(client, query, database))
+        outcomes.append(_query_with_photo(client, query, database))
         progress.advance(bar)
     return outcomes
 
 
 def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
-    summary = summarise_outcomes(outcomes)
+    summary = _summarise_outcomes(outcomes)
     print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
     for name, label, style in (
         ("R@1", "R@1 of queries in the map", ".1%"),

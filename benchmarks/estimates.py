@@ -149,10 +149,10 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
     )
     with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
         matrix = np.array(rows)
-    return described_photos(dataset.name, photos, matrix, len(dataset.database))
+    return _described_photos(dataset.name, photos, matrix, len(dataset.database))
 
 
-def described_photos(
+def _described_photos(
     name: str, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32], database: int
 ) -> DescribedPhotos:
     """Join photos, of which the first `database` are no queries, with their descriptors."""

@@ -117,17 +117,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--share", type=float, default=0.15, help="frames that are photos")
     arguments = parser.parse_args()
-    map_, rides = describe_rides(arguments.city)
+    map_, rides = _describe_rides(arguments.city)
     for name, frames, scores in rides:
-        pictures = [picture_of(map_, row) for row in scores]
+        pictures = [_picture_of(map_, row) for row in scores]
         judged: dict[str, list[Judged]] = {}
         for seed in range(arguments.seeds):
-            for source, proposals in locate_walk(frames, pictures, seed, arguments.share).items():
+            for source, proposals in _locate_walk(frames, pictures, seed, arguments.share).items():
                 judged.setdefault(source, []).extend(proposals)
-        print_table(figures_table(name, judged))
+        print_table(_figures_table(name, judged))
 
 
-def describe_rides(
+def _describe_rides(
     city: Path,
 ) -> tuple[DescribedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
     """Describe a city as a new map would be, and return its rides with their (frames, n) scores."""
@@ -148,7 +148,7 @@ def describe_rides(
     return map_, rides
 
 
-def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEvidence:
+def _picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEvidence:
     """Return what the search of the map says about a frame, as `placewise locate` reads it."""
     order = map_.rank(scores)
     ranking = [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
@@ -173,12 +173,12 @@ def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEviden
     )
 
 
-def locate_walk(
+def _locate_walk(
     frames: Sequence[DatasetPhoto], pictures: Sequence[PictureEvidence], seed: int, share: float
 ) -> dict[str, list[Judged]]:
     """Draw photos of a walk, and judge what is proposed for those without coordinates."""
     rng = np.random.default_rng(seed)
-    times = walk_times(frames)
+    times = _walk_times(frames)
     ahead = timedelta(seconds=CLOCK_ERROR_SECONDS)
     known = [
         KnownPosition(time, *degrees(frame)) for time, frame in zip(times, frames, strict=True)
@@ -219,7 +219,7 @@ def locate_walk(
     return judged
 
 
-def walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
+def _walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
     """Return the times of the frames, with half an hour before each jump."""
     seconds = [0.0]
     for before, after in pairwise(frames):
@@ -228,7 +228,7 @@ def walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
     return [START + timedelta(seconds=each) for each in seconds]
 
 
-def figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
+def _figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
     """Return a table of shares in %."""
     table = Table(
         "sources", "photos", "proposed at 0.95", "right", "most at 95 % right", "ECE", title=name
@@ -243,13 +243,13 @@ def figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
             str(len(proposals)),
             f"{100 * len(accepted) / len(proposals):.1f}",
             f"{100 * np.mean(accepted):.1f}" if accepted else "-",
-            f"{100 * most_proposed(proposals):.1f}",
+            f"{100 * _most_proposed(proposals):.1f}",
             f"{error:.3f}",
         )
     return table
 
 
-def most_proposed(proposals: Sequence[Judged]) -> float:
+def _most_proposed(proposals: Sequence[Judged]) -> float:
     """Return the largest share of photos that any threshold proposes with 95 % of them right."""
     ordered = sorted(proposals, key=lambda each: -each.probability)
     right = np.cumsum([each.is_right for each in ordered])

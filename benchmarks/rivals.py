@@ -193,7 +193,7 @@ class FaissFlat(FaissIndex):
     uses_pca = False
 
 
-class FaissIvf(FaissIndex):
+class _FaissIvf(FaissIndex):
     """The index that autofaiss selects; `nprobe` is tuned on other queries."""
 
     name = "faiss IVF, Flat (clip-retrieval)"
@@ -218,7 +218,7 @@ class FaissFlatPca(FaissIndex):
     factory = "Flat"
 
 
-class FaissHnswPca(FaissIndex):
+class _FaissHnswPca(FaissIndex):
     """HNSW graph over descriptors projected by PCA."""
 
     name = "faiss HNSW32, PCA"
@@ -250,7 +250,7 @@ class Qdrant(Rival):
         return [int(point.id) for point in found.points]
 
 
-class LanceDb(Rival):
+class _LanceDb(Rival):
     """LanceDB, embedded, with its default index."""
 
     name = "LanceDB, IVF_PQ, PCA"
@@ -276,7 +276,7 @@ class LanceDb(Rival):
         return [int(number) for number in found["id"].to_pylist()]
 
 
-class Pgvector(Rival):
+class _Pgvector(Rival):
     """PostgreSQL with pgvector: `halfvec` and an HNSW index."""
 
     name = "pgvector halfvec, HNSW, PCA"
@@ -318,8 +318,8 @@ class Pgvector(Rival):
 
 
 RIVALS: tuple[type[Rival], ...] = (
-    *(Placewise, PlacewiseFloat16, FaissFlat, FaissIvf, FaissFlatPca, FaissHnswPca),
-    *(Qdrant, LanceDb, Pgvector),
+    *(Placewise, PlacewiseFloat16, FaissFlat, _FaissIvf, FaissFlatPca, _FaissHnswPca),
+    *(Qdrant, _LanceDb, _Pgvector),
 )
 
 

@@ -78,7 +78,7 @@ def measure(
     report = Report(f"training on {chosen.torch_device.type}")
     with tempfile.TemporaryDirectory(prefix="placewise-bench-") as folder:
         out = Path(folder)
-        pace = measure_throughput(progress, out / "pace", photos, workers, chosen)
+        pace = _measure_throughput(progress, out / "pace", photos, workers, chosen)
         for what, rate in pace.reading.items():
             report.add(f"photos read to 224 pixels: {what}", rate, "photos/s")
         report.add("photos that the network learns from", pace.network, "photos/s")
@@ -93,7 +93,7 @@ def measure(
             pace.reading["with its workers"] / pace.network,
             at_least=1.0,
         )
-        learnt = measure_learning(progress, out, places, epochs, image_size, workers, chosen, seed)
+        learnt = _measure_learning(progress, out, places, epochs, image_size, workers, chosen, seed)
         for where, gain in learnt.items():
             report.add(f"R@1 untrained, {where}", 100 * gain.untrained, "%")
             report.add(f"R@1 trained, {where}", 100 * gain.trained, "%")
@@ -126,7 +126,7 @@ class RecallGain:
     fingerprint: str
 
 
-def measure_learning(
+def _measure_learning(
     progress: Progress,
     folder: Path,
     places: int,
@@ -253,7 +253,7 @@ class TrainingThroughput:
     """share of the training time spent waiting for photos"""
 
 
-def measure_throughput(
+def _measure_throughput(
     progress: Progress, folder: Path, photos: int, workers: int, device: Device
 ) -> TrainingThroughput:
     """Measure over this number of photos, without the first batches, in which workers start."""

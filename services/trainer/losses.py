@@ -17,7 +17,7 @@ from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 from torch.nn.functional import softplus
 
-from services.trainer.own_modules import make_own_module
+from services.trainer.model_factory import make_own_module
 from shared.descriptors.vpr_models.config import is_own_module
 from shared.errors import Unprocessable
 

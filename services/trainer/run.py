@@ -18,8 +18,7 @@ from services.trainer.dataset_selection import (
     select_training_set,
     summarise_training_set,
 )
-from services.trainer.model_factory import make_model
-from services.trainer.own_modules import register_own_modules
+from services.trainer.model_factory import make_model, register_own_modules
 from services.trainer.resolve import (
     check_environment,
     check_loggers,

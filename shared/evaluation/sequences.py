@@ -130,7 +130,7 @@ def evaluate_sequence(
     """
     queries = [evaluation_set.queries[index] for index in members]
     scores = rows @ map_.rows.T
-    evidence = frames_of(map_, _times(queries), rows)
+    evidence = _frames_of(map_, _times(queries), rows)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     states = []
@@ -190,7 +190,7 @@ def evaluate_kidnapped(
     frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
     times = _times([evaluation_set.queries[index] for index in members])
     interval = (times[-1] - times[0]) / (len(times) - 1)
-    evidence = frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
+    evidence = _frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     found: list[int | None] = [None] * (KIDNAPS + 1)
@@ -204,7 +204,7 @@ def evaluate_kidnapped(
     return found[1:]  # before the first jump
 
 
-def frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
+def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
     """Return the evidence of the frames of a sequence.
 
     Args:

@@ -82,7 +82,7 @@ class IntegrityReport:
     trash_bytes: int = 0
 
 
-def verify_chunk(
+def _verify_chunk(
     store: ObjectStore,
     chunk_id: UUID,
     object_key: str,
@@ -200,7 +200,7 @@ def _verify_object(
                 select(Descriptor.row, Descriptor.photo_id).where(Descriptor.chunk_id == chunk.id)
             ).all()
         rows = [(row, photo_id) for row, photo_id in catalog_rows]
-        yield from verify_chunk(
+        yield from _verify_chunk(
             store, chunk.id, chunk.object_key, chunk.sha256, chunk.rows, rows, report
         )
         return

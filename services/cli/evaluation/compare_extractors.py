@@ -49,7 +49,7 @@ SEED = 0
 CHECKPOINT_SUFFIXES = (".ckpt", ".pth")
 
 
-def whiten_set(
+def _whiten_set(
     database: Rows,
     queries: Rows,
     components: int,
@@ -242,7 +242,7 @@ def _evaluate_entry(
     ):
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            database, queries, projection_ms = whiten_set(
+            database, queries, projection_ms = _whiten_set(
                 database, queries, entry.pca, choose_device(settings.device), on_progress
             )
             if milliseconds is not None:

@@ -15,13 +15,6 @@ import typer
 from placewise.client import Client
 from services.cli.client import connect, describe_target
 from services.cli.environment import read_settings
-from services.cli.ingest.batches import (
-    check_archive,
-    import_keys,
-    import_prefix,
-    manifest_has_keys,
-    upload_archive,
-)
 from services.cli.ingest.geotags import (
     LocalPhoto,
     count_other_files,
@@ -30,7 +23,16 @@ from services.cli.ingest.geotags import (
     has_coordinates,
     read_photo_manifest,
 )
-from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
+from services.cli.ingest.upload import (
+    FitOption,
+    UpdateOption,
+    check_archive,
+    import_keys,
+    import_prefix,
+    manifest_has_keys,
+    upload_archive,
+    upload_photos,
+)
 from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
     Json,

@@ -46,7 +46,7 @@ def hub_repository(size: str) -> str:
     return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
 
 
-def weights_help(size: str) -> str:
+def _weights_help(size: str) -> str:
     """Return the three ways to get the weights; the end of each error message."""
     repository = hub_repository(size)
     cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
@@ -87,13 +87,13 @@ def find_or_download_weights(
             what = "is not a file" if given.exists() else "does not exist"
             raise _weights_missing_error(f"DINO_WEIGHTS={given} {what}.", size)
         return given
-    return cached_weights(size) or _download(size, on_progress)
+    return _cached_weights(size) or _download(size, on_progress)
 
 
 def find_local_weights(size: str, given: Path | None) -> Path:
     """As `find_or_download_weights`, without downloading: raises `weights_missing` instead."""
     if given is None:
-        cached = cached_weights(size)
+        cached = _cached_weights(size)
         if cached is None:
             raise _weights_missing_error(
                 f"DINO_WEIGHTS is not set, and {hub_repository(size)} is not in the Hugging Face "
@@ -104,7 +104,7 @@ def find_local_weights(size: str, given: Path | None) -> Path:
     return find_or_download_weights(size, given)
 
 
-def cached_weights(size: str) -> Path | None:
+def _cached_weights(size: str) -> Path | None:
     """Return timm's file in the local Hugging Face cache, or None; uses no network."""
     import huggingface_hub
 
@@ -147,7 +147,7 @@ def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
     """Return the error for a weights file that can't be used."""
     return Misconfigured(
         "weights_unfit",
-        f"The weights {path} can't be used for dinov2-{size}: {reason}. {weights_help(size)}",
+        f"The weights {path} can't be used for dinov2-{size}: {reason}. {_weights_help(size)}",
     )
 
 
@@ -236,7 +236,7 @@ def _timms_name(name: str) -> str:
 
 
 def _weights_missing_error(reason: str, size: str) -> Misconfigured:
-    return Misconfigured("weights_missing", f"{reason} {weights_help(size)}")
+    return Misconfigured("weights_missing", f"{reason} {_weights_help(size)}")
 
 
 def _join_some(faults: list[str]) -> str:

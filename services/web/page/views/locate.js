@@ -221,7 +221,8 @@ async function drawResult(result, photos, proposals, least, signal) {
   map.fit();
 }
 
-const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+// An apostrophe before what a spreadsheet would run as a formula: `placewise index --csv` removes it.
+const quoted = (text) => `"${text.replace(/^(?='*[=+@\t\r-])/, "'").replaceAll('"', '""')}"`;
 const csvOf = (accepted) => ["filename,latitude,longitude", ...accepted.map(({ name, latitude, longitude }) => `${quoted(name)},${latitude},${longitude}`), ""].join("\n");
 
 function gpxOf(accepted, photos) {
