@@ -66,7 +66,7 @@ def read_stored_rows(
     return rows
 
 
-def read_reusable_rows(
+def _read_reusable_rows(
     catalog: Catalog, store: ObjectStore, jobs: list[Job], target: ResolvedGeneration
 ) -> tuple[list[Job], Rows, PcaProjection | None] | None:
     """Return REINDEX jobs, their stored (jobs, dimension) rows, and the projection that they need.
@@ -162,11 +162,11 @@ def prepare_batch(
 
     Query photos get a preview if their format is one that not all browsers show.
 
-    Where possible, stored rows are read instead (`read_reusable_rows`).
+    Where possible, stored rows are read instead (`_read_reusable_rows`).
     """
     batch = DescribeBatch(jobs=jobs, target=target)
     started = time.perf_counter()
-    reusable = read_reusable_rows(catalog, store, jobs, target)
+    reusable = _read_reusable_rows(catalog, store, jobs, target)
     if reusable is not None:
         batch.ready, batch.stored_rows, batch.projection = reusable
         batch.deleted = [job for job in jobs if job not in batch.ready]
