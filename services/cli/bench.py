@@ -98,7 +98,7 @@ def extract(
     _check_choice(device, "--device", "auto", "cpu", "cuda")
     _check_choice(precision, "--precision", "auto", "float32", "bfloat16")
     _run_benchmark(
-        "extract",
+        "descriptors.extract",
         as_json,
         extractor=extractor,
         photos=photos,
@@ -125,7 +125,7 @@ def precision(
     """Compare patches, descriptors and recall in bfloat16 with those in float32."""
     _check_choice(device, "--device", "auto", "cpu", "cuda")
     _run_benchmark(
-        "precision",
+        "descriptors.precision",
         as_json,
         extractor=extractor,
         places=places,
@@ -157,7 +157,7 @@ def train(
     """Measure training throughput, data loading stalls and the recall that training achieves."""
     _check_choice(device, "--device", "auto", "cpu", "gpu", "mps")
     _run_benchmark(
-        "train",
+        "descriptors.train",
         as_json,
         places=places,
         epochs=epochs,
@@ -183,7 +183,7 @@ def estimates(
     as_json: JsonOption = False,
 ) -> None:
     """Measure how often place estimates answer, how often they are right, and their calibration."""
-    _run_benchmark("estimates", as_json, folders=folders, splits=splits)
+    _run_benchmark("places.estimates", as_json, folders=folders, splits=splits)
 
 
 @app.command("query-latency")
@@ -217,7 +217,7 @@ def rerank(
 
     With PLACEWISE_TEST_DATA, also report the ranks of true places for real photos.
     """
-    _run_benchmark("rerank", as_json, places=places, seed=seed)
+    _run_benchmark("descriptors.rerank", as_json, places=places, seed=seed)
 
 
 @app.command("search")
@@ -289,7 +289,7 @@ def rivals(
     Requires more packages: uv pip install --group rivals
     """
     _run_benchmark(
-        "rivals",
+        "search.rivals",
         as_json,
         photos=photos,
         dimension=dimension,
@@ -409,7 +409,7 @@ def _load_benchmark(name: str) -> Any:
             raise
         raise Misconfigured(
             "no_benchmarks",
-            f"`placewise bench {name}` requires a checkout of Placewise with the dev extra: "
+            "`placewise bench` requires a checkout of Placewise with the dev extra: "
             f"{error}. In the checkout, run make setup, then .venv/bin/placewise bench.",
         ) from error
 
