@@ -179,7 +179,7 @@ class FaissIndex(Rival):
 
 
 class FaissFlat(FaissIndex):
-    """Exact, over whole rows."""
+    """Exact search over whole descriptors."""
 
     name = "faiss Flat (clip-retrieval, small sets)"
     factory = "Flat"
@@ -187,7 +187,7 @@ class FaissFlat(FaissIndex):
 
 
 class _FaissIvf(FaissIndex):
-    """What autofaiss chooses, over whole rows; `nprobe` is tuned with other queries."""
+    """The index that autofaiss selects; `nprobe` is tuned on other queries."""
 
     name = "faiss IVF, Flat (clip-retrieval)"
     factory = "IVF{lists},Flat"
@@ -205,14 +205,14 @@ class _FaissIvf(FaissIndex):
 
 
 class FaissFlatPca(FaissIndex):
-    """Exact, over projected rows."""
+    """Exact search over descriptors projected by PCA."""
 
     name = "faiss Flat, PCA"
     factory = "Flat"
 
 
 class _FaissHnswPca(FaissIndex):
-    """Graph over projected rows."""
+    """HNSW graph over descriptors projected by PCA."""
 
     name = "faiss HNSW32, PCA"
     factory = "HNSW32"

@@ -143,13 +143,18 @@ def get_map(session: Session, name: str) -> Map:
     """Return the live map of this name; NotFound (`map_not_found`)."""
     map_ = session.scalar(sa.select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
     if map_ is None:
-        raise NotFound(
-            "map_not_found",
-            f"There is no map named {name!r}. Create it: POST /api/v1/maps, or "
-            f"`placewise maps create {name}`.",
-            map=name,
-        )
+        raise map_not_found_error(name)
     return map_
+
+
+def map_not_found_error(name: str) -> NotFound:
+    """The error of a call about a map that does not exist."""
+    return NotFound(
+        "map_not_found",
+        f"There is no map named {name!r}. Create it: POST /api/v1/maps, or "
+        f"`placewise maps create {name}`.",
+        map=name,
+    )
 
 
 def lock_map(session: Session, map_id: UUID) -> Map:

@@ -169,18 +169,18 @@ def evaluate_kidnapped(
     motion: MotionModel,
     every: int,
 ) -> list[int | None]:
-    """Carry the camera of a sequence to another place of it after every so many frames.
+    """Evaluate relocalisation after jumps of the camera to random frames of its sequence.
 
-    The frames outside the map are left out; the sequence goes on from its beginning at its end.
+    Frames outside the map are left out. After its last frame, the sequence begins again.
 
     Args:
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        every: Number of frames between two kidnappings.
+        every: Number of frames between two jumps.
 
     Returns:
-        For each of KIDNAPS, the frames until the place is tracked and right; None if it is not
-        before the next one.
+        For each of KIDNAPS jumps, the number of frames until the track has the status `tracking` at
+        a correct photo; None if that does not happen before the next jump.
     """
     inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
     if len(inside) < 2:
@@ -200,7 +200,7 @@ def evaluate_kidnapped(
             photo = _photo(track_filter.state(belief).photo)
             if photo in evaluation_set.positives[members[frames[number]]]:
                 found[segment] = since
-    return found[1:]  # the first is no kidnapping
+    return found[1:]  # before the first jump
 
 
 def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
