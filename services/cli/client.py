@@ -15,7 +15,7 @@ from services.cli.environment import read_settings
 from services.cli.imports import collection_paused
 from services.cli.output import print_note
 from shared.config.embedded_home import RunningServer, find_running_server
-from shared.errors import Unavailable
+from shared.errors import Misconfigured, Unavailable
 
 START_TIMEOUT_SECONDS = 30.0
 
@@ -31,6 +31,7 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         key: API key. The server on PLACEWISE_HOME stores one there for the local user.
 
     Raises:
+        Misconfigured: `separate_services` if SEARCH_URLS is set and no server is named.
         Unavailable: `server_unreachable` if the embedded server does not start in time.
     """
     settings = read_settings()
@@ -41,6 +42,12 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
+    if settings.search_worker_urls:
+        raise Misconfigured(
+            "separate_services",
+            "SEARCH_URLS is set, so the command starts no server of its own. Name the gateway: "
+            "--server URL, or for example PLACEWISE_SERVER=http://127.0.0.1:8000.",
+        )
     print_note(
         f"No server runs on {settings.placewise_home}: starting one for this command. "
         "--server URL or PLACEWISE_HOME selects another."

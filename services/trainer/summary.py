@@ -32,9 +32,11 @@ def print_data_sets(
 ) -> None:
     """Show the size of the training set and of each evaluation set."""
     if training_set is not None:
+        cities = len(training_set.cities)
         display.info(
             f"Training set: {len(training_set.places)} places, {training_set.photo_count} photos, "
-            f"{len(training_set.cities)} cities ({training_set.layout} in {training_set.root})"
+            f"{cities} {'city' if cities == 1 else 'cities'} "
+            f"({training_set.layout} in {training_set.root})"
         )
     for each in {each.name: each for each in (*sets.validation, *sets.test)}.values():
         display.info(

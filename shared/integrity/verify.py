@@ -34,6 +34,7 @@ from shared.integrity.referenced_objects import (
     ObjectKind,
     ReferencedObject,
     list_referenced_objects,
+    plural,
 )
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import Wakeups
@@ -176,7 +177,7 @@ def verify_store(
         if faults and _is_still_referenced(catalog, one):
             report.faults += faults
         done[one.what] += 1
-        progress(f"{one.what}s", done[one.what], total[one.what])
+        progress(plural(one.what), done[one.what], total[one.what])
     with catalog.read() as session:
         report.faults += _find_missing_descriptors(session)
     return report
