@@ -8,9 +8,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from operator import methodcaller
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -90,6 +92,12 @@ def print_message(message: str) -> None:
     console.print(message, soft_wrap=True, markup=False)
 
 
+def program() -> str:
+    """Return how to run this program from any shell: with the PLACEWISE_HOME of this one."""
+    home = os.environ.get("PLACEWISE_HOME")
+    return f"PLACEWISE_HOME={shlex.quote(home)} {sys.argv[0]}" if home else sys.argv[0]
+
+
 def print_note(message: str) -> None:
     """As `print_message`, to stderr: about the command, not a part of its answer."""
     err_console.print(message, soft_wrap=True, markup=False)
@@ -160,23 +168,30 @@ class Table(rich.table.Table):
 
 def print_table(table: Table) -> None:
     """Print a table; unless stdout is a terminal, as tab-separated values without shortening."""
-    columns = [
-        (column, [_plain_text(cell) for cell in (column.header, *column.cells)])
-        for column in table.columns
-    ]
     if console.is_terminal:
-        for column, cells in columns:
-            column.overflow = "fold"
-            # Wide columns give way, narrow ones keep their width.
-            column.no_wrap = column.no_wrap or max(map(len, cells)) <= MIN_NAME_WIDTH
+        _fit_columns(table, console.width)
         console.print(table)
         return
     if table.title:
         typer.echo(_plain_text(table.title))
-    for row in zip(*(cells for column, cells in columns if column.header), strict=True):
+    columns = (map(_plain_text, (c.header, *c.cells)) for c in table.columns if c.header)
+    for row in zip(*columns, strict=True):
         typer.echo("\t".join(row))
     if table.caption:
         typer.echo(_plain_text(table.caption))
+
+
+def _fit_columns(table: Table, width: int) -> None:
+    """Narrow the widest columns until the table fits; rich would narrow names to a character."""
+    measure = partial(Measurement.get, console, console.options)
+    columns = table.columns
+    widths = [max(measure(cell).maximum for cell in (c.header, *c.cells)) for c in columns]
+    padding_and_dividers = 2 * len(columns) - 1
+    while sum(widths) + padding_and_dividers > width and max(widths) > MIN_NAME_WIDTH:
+        widths[widths.index(max(widths))] -= 1
+    for column, fitted in zip(columns, widths, strict=True):
+        column.width = fitted
+        column.overflow = "fold"
 
 
 def _shorten_name(cell: RenderableType | None) -> RenderableType | None:
@@ -224,6 +239,7 @@ def progress_bar() -> Progress:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         console=err_console,
+        disable=not err_console.is_terminal,  # it would print an empty line at its end
     )
 
 

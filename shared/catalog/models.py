@@ -104,7 +104,7 @@ def register_model(session: Session, registration: ModelRegistration) -> tuple[M
         id=new_id(),
         name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
         fingerprint=registration.fingerprint,
-        licence=registration.licence or "not said",
+        licence=registration.licence or "not stated",
         card=registration.card,
         added_name=registration.name,
         added_at=db_now(),

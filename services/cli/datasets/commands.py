@@ -160,9 +160,10 @@ def _print_check(report: DatasetReport, problems: list[DatasetProblem], decoded:
 
 def _print_training(figures: Json) -> None:
     sizes = figures["photos_per_place"]
+    cities = "1 city" if len(figures["cities"]) == 1 else f"{len(figures['cities'])} cities"
     print_message(
         f"Training set: {figures['photos']} photos of {figures['places']} places in "
-        f"{len(figures['cities'])} cities ({figures['layout']}), {sizes['least']} to "
+        f"{cities} ({figures['layout']}), {sizes['least']} to "
         f"{sizes['most']} photos per place (median {sizes['median']:g}); fingerprint "
         f"{figures['fingerprint'][:12]}."
     )

@@ -8,6 +8,7 @@ boolean option is written alone (`--pretrained`), negated (`--no-pretrained`) or
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
@@ -36,7 +37,7 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
     decorated.__signature__ = inspect.Signature(parameters)
     decorated.__annotations__ = {p.name: p.annotation for p in parameters}
     decorated.command_settings = {
-        "cls": TrainingCommand,
+        "cls": _TrainingCommand,
         "context_settings": {"token_normalize_func": normalise_name},
     }
     return command
@@ -68,34 +69,17 @@ def _make_option(name: str) -> inspect.Parameter:
 
 
 def _format_default(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"({', '.join(str(item) for item in value)})"
-    return str(value)
+    return json.dumps(value) if isinstance(value, tuple) else str(value)
 
 
-class TrainingCommand(TyperCommand):
-    """Accepts booleans and sizes as GSV-Cities scripts write them; its help cuts no name."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        from rich.table import Table
-        from typer import rich_utils
-
-        class OptionsTable(Table):
-            """Wraps descriptions, but not the names in the first or second column."""
-
-            def add_row(self, *cells: Any, **styles: Any) -> None:
-                super().add_row(*cells, **styles)
-                for column in self.columns[:2]:
-                    column.no_wrap = True
-
-        rich_utils.Table = OptionsTable  # type: ignore[attr-defined]
-        super().format_help(ctx, formatter)
+class _TrainingCommand(TyperCommand):
+    """Accepts booleans and sizes as GSV-Cities scripts write them."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, add_values(args))
+        return super().parse_args(ctx, _add_values(args))
 
 
-def add_values(tokens: Sequence[str]) -> list[str]:
+def _add_values(tokens: Sequence[str]) -> list[str]:
     """Write a boolean option without a value, and the two numbers of a size, as `--name=value`."""
     remaining, rewritten = list(tokens), []
     while remaining:

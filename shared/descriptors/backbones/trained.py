@@ -65,7 +65,7 @@ class TrainedBackbone:
             checkpoint.model,
             checkpoint.fingerprint,
             device,
-            licence="not said",
+            licence="not stated",
             card=card,
         )
         backbone.check()

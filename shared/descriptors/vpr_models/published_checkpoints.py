@@ -11,7 +11,8 @@ gsv_xs and OpenVPRLab write checkpoints of PyTorch Lightning with `hyper_paramet
 publish the tensors alone.
 
 Files of tensors do not describe their network. It is inferred from the tensors' names and shapes;
-the size of photos is that of the published results, and Conv-AP has 2 x 2 cells.
+the size of photos is that of the published results, and Conv-AP has 2 x 2 cells. BoQ and
+OpenVPRLab resize photos with bicubic interpolation, the others with bilinear.
 """
 
 from __future__ import annotations
@@ -217,6 +218,7 @@ def _infer_config(
             "agg_arch": aggregator,
             "agg_config": arguments,
             "image_size": size,
+            "interpolation": "bicubic" if parameters or aggregator == "BoQ" else "bilinear",
         }
     )
 

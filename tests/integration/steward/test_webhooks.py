@@ -131,6 +131,30 @@ def hooks(
     return WebhookSetup(door, settings, receiver, make_worker)
 
 
+@pytest.mark.databases("sqlite")
+def test_a_retry_is_sent_when_it_is_due_though_nothing_else_happens(
+    hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(send_module, "RETRY_DELAYS_SECONDS", (2.0, 3600.0))
+    hooks.receiver.status = 500
+    hooks.announce(EventKind.JOB_SUCCEEDED)
+    stop = threading.Event()
+    thread = threading.Thread(target=hooks.sender.run, args=(stop,))
+    thread.start()
+    try:
+        deadline = time.monotonic() + 60
+        times: list[float] = []
+        while len(times) < 2:
+            assert time.monotonic() < deadline
+            if len(hooks.receiver.messages) > len(times):
+                times.append(time.monotonic())
+            time.sleep(0.05)
+    finally:
+        stop.set()
+        thread.join(timeout=60)
+    assert times[1] - times[0] < 8, "less than IDLE_SECONDS"
+
+
 @pytest.fixture
 def localhost_tls(hooks: WebhookSetup, tmp_path: Path) -> ssl.SSLContext:
     return hooks.trust(tmp_path, "localhost")

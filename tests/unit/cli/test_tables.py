@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from rich.progress_bar import ProgressBar
 
-from services.cli.output import Table, print_table
+from services.cli.output import Table, print_table, progress_bar
+from services.cli.training.commands import _TerminalDisplay
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
 MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"
@@ -49,6 +50,21 @@ def test_long_names_are_shortened_in_the_middle_to_fit_80_columns(
         assert name.endswith(end), shown
     assert " foreign " in row
     assert "(PCA" in " ".join(lines), "text with spaces wraps"
+
+
+@pytest.mark.usefixtures("terminal")
+def test_a_name_beside_many_columns_keeps_its_ends_and_the_other_columns_their_numbers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = Table("places", "R@1", "R@5", "R@10", "R@20", "R@1 95 % CI", "ms", "bytes", "vs. first")
+    figures = ("56.7", "73.3", "76.7", "86.7", "37.5 to 77.8", "222.4", "57,344")
+    table.add_row("efficientnet-lite0-vlad128+fit", *figures, "+16.7 (+3.3 to +32.4)")
+    print_table(table)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    row = next(line for line in lines if "222.4" in line)
+    assert row.startswith("effic")
+    assert "+fit  56.7  73.3  76.7  86.7  37.5 to 77.8  222.4  57,344  +16.7" in row
 
 
 @pytest.mark.usefixtures("terminal")
@@ -96,3 +112,13 @@ def test_tab_separated_cells_hold_no_markup_tabs_or_line_breaks(
         "\t",
         "a caption",
     ]
+
+
+def test_progress_leaves_no_trace_where_stderr_is_not_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with progress_bar() as progress:
+        progress.add_task("scanning the folder", total=None)
+    with _TerminalDisplay():
+        pass
+    assert capsys.readouterr().err == ""

@@ -71,6 +71,27 @@ def test_a_checkpoint_of_another_network_names_the_arguments_to_pass(published: 
     assert '"out_channels": 8' in refused.value.detail
 
 
+class WarningDisplay(NullDisplay):
+    """Records warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+def test_weights_of_photos_that_are_resized_otherwise_are_a_warning(
+    interpolation: str, published: Path
+) -> None:
+    display = WarningDisplay()
+    arguments = {"weights": str(published), "interpolation": interpolation}
+    make_model(build_arguments(NETWORK | arguments), display, resuming=False)
+    assert len(display.warnings) == (interpolation != "bilinear")
+    assert all("--interpolation bilinear" in warning for warning in display.warnings)
+
+
 def test_the_size_of_photos_is_a_difference_for_mixvpr_only(tmp_path: Path) -> None:
     for aggregator in ("MixVPR", "GeM"):
         arguments = build_arguments(

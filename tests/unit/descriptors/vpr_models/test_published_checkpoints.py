@@ -110,12 +110,16 @@ def rename(model: VprModel, names: dict[str, str]) -> dict[str, torch.Tensor]:
     return renamed
 
 
-def assert_loads_as(path: Path, state: Any, model: VprModel, size: int) -> None:
+def assert_loads_as(
+    path: Path, state: Any, model: VprModel, size: int, interpolation: str = "bilinear"
+) -> None:
     torch.save(state, path)
     loaded = load_checkpoint(path)
-    expected = model.config.model_dump(exclude={"image_size", "layers_to_freeze"})
-    assert loaded.config.model_dump(exclude={"image_size", "layers_to_freeze"}) == expected
+    photos_only = {"image_size", "interpolation", "layers_to_freeze"}
+    expected = model.config.model_dump(exclude=photos_only)
+    assert loaded.config.model_dump(exclude=photos_only) == expected
     assert loaded.config.image_size == (size, size)
+    assert loaded.config.interpolation == interpolation
     photos = torch.randn(2, 3, *model.config.image_size)
     with torch.inference_mode():
         torch.testing.assert_close(loaded.model(photos), model(photos))
@@ -147,7 +151,8 @@ def test_published_tensors_of_a_resnet_are_loaded_as_the_network_that_they_belon
     model = make_model("resnet18", aggregator, arguments, 64)
     tensors = rename(model, names)
     assert published_name in tensors
-    assert_loads_as(tmp_path / "published.pth", tensors, model, size)
+    interpolation = "bicubic" if aggregator == "BoQ" else "bilinear"
+    assert_loads_as(tmp_path / "published.pth", tensors, model, size, interpolation)
 
 
 @pytest.mark.parametrize(
@@ -167,11 +172,12 @@ def test_published_tensors_of_dinov2_are_loaded_as_the_network_that_they_belong_
     tensors[f"backbone.{attribute}.mask_token"] = torch.zeros(1, 384)
     for part in ("weight", "bias"):  # in the file of BoQ, too, although its network skips the norm
         tensors.setdefault(f"backbone.{attribute}.norm.{part}", torch.zeros(384))
-    assert_loads_as(tmp_path / "published.pth", tensors, model, 322)
+    interpolation = "bicubic" if aggregator == "BoQ" else "bilinear"
+    assert_loads_as(tmp_path / "published.pth", tensors, model, 322, interpolation)
 
 
 @pytest.mark.parametrize("names", [RESNET_OF_OPENVPRLAB, UNFROZEN_RESNET_OF_OPENVPRLAB])
-def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size(
+def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size_and_interpolation(
     names: dict[str, str], tmp_path: Path
 ) -> None:
     model = make_model("resnet18", "ConvAP", {"out_channels": 8, "s1": 3, "s2": 1}, 64)
@@ -184,7 +190,7 @@ def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size(
         },
         "epoch": 3,
     }
-    assert_loads_as(tmp_path / "epoch.ckpt", state, model, 288)
+    assert_loads_as(tmp_path / "epoch.ckpt", state, model, 288, "bicubic")
 
 
 @pytest.mark.parametrize(
