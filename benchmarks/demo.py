@@ -24,7 +24,11 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.generated_city import generate_city
 from placewise.answers import Estimate
 from placewise.client import Client
-from services.cli.ingest.geotags import LocalPhoto
+from services.cli.client import connect, wait_for_job
+from services.cli.descriptors.vocabulary import fit_and_wait
+from services.cli.ingest.geotags import LocalPhoto, find_photos
+from services.cli.ingest.upload import upload_photos
+from services.cli.output import progress_bar
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 from shared.synthetic_city.plan import CityOptions
@@ -184,9 +188,6 @@ def main() -> None:
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = _parse_arguments()
-    from services.cli.client import connect
-    from services.cli.output import progress_bar
-
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
@@ -231,11 +232,6 @@ def _parse_arguments() -> argparse.Namespace:
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
     """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
-    from services.cli.client import wait_for_job
-    from services.cli.descriptors.vocabulary import fit_and_wait
-    from services.cli.ingest.geotags import find_photos
-    from services.cli.ingest.upload import upload_photos
-
     database = find_photos(city / "database", None, None)
     queries = find_photos(city / "queries", None, None)
     labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]

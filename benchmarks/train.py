@@ -34,8 +34,7 @@ from services.trainer.data import (
     load_batches,
     to_tensor,
 )
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.losses import make_loss, make_miner
 from services.trainer.model_describer import ModelDescriber
 from services.trainer.model_factory import make_model
 from services.trainer.resolve import Device, resolve_device

@@ -12,6 +12,7 @@ from rich.progress import Progress
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
 from services.cli.environment import read_settings
+from services.cli.imports import collection_paused
 from services.cli.output import print_note
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Misconfigured, Unavailable
@@ -51,7 +52,8 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         f"No server runs on {settings.placewise_home}: starting one for this command. "
         "--server URL or PLACEWISE_HOME selects another."
     )
-    from services.standalone import run_standalone  # clients of a running server don't need it
+    with collection_paused():
+        from services.standalone import run_standalone  # clients of a running server don't need it
 
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
     with run_standalone(embedded_settings, lazy_extractor=True) as running:

@@ -195,7 +195,8 @@ def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Pr
     Returns:
         Counts: `photos`, `estimates`, and `passed_over` (queries without a descriptor).
     """
-    writing = progress.add_task("photos", total=client.stats().total_images)
+    stats = client.stats()
+    writing = progress.add_task("photos", total=stats.total_images + stats.labelled_queries)
     photos = 0
     queries: list[Photo] = []
     out = _FeatureWriter(file)

@@ -115,8 +115,11 @@ def run() -> None:
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = _build_overview()
     else:
+        from services.cli.imports import collection_paused
+
         # The suggestion of a similar name, for a typo, needs every command.
-        app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
+        with collection_paused():
+            app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
     app()
 
 

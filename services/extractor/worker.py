@@ -47,8 +47,7 @@ from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind, Wait
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
-from shared.jobs.runner import ClaimedJobs, JobRunner
-from shared.jobs.trace_context import job_trace_context
+from shared.jobs.runner import ClaimedJobs, JobRunner, job_trace_context
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows

@@ -38,8 +38,7 @@ from services.trainer.arguments import (
     to_plain_dict,
 )
 from services.trainer.checkpointing import LAST_CHECKPOINT, safe_filename
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.losses import make_loss, make_miner
 from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
 from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE, lock_folder

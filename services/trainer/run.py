@@ -12,7 +12,7 @@ from typing import Any
 
 from services.trainer.arguments import TrainingArguments, save_yaml, to_plain_dict
 from services.trainer.checkpointing import seed_everything
-from services.trainer.dataset_selection import (
+from services.trainer.data import (
     EvaluationSets,
     select_evaluation_sets,
     select_training_set,

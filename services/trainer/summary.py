@@ -15,7 +15,7 @@ import torch
 
 from services.trainer.arguments import TrainingArguments, to_plain_dict
 from services.trainer.checkpointing import TopKCheckpoints
-from services.trainer.dataset_selection import EvaluationSets, summarise_evaluation_set
+from services.trainer.data import EvaluationSets, summarise_evaluation_set
 from services.trainer.run_control import Display
 from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
 from shared.datasets.dataset import TrainingSet
@@ -32,9 +32,11 @@ def print_data_sets(
 ) -> None:
     """Show the size of the training set and of each evaluation set."""
     if training_set is not None:
+        cities = len(training_set.cities)
         display.info(
             f"Training set: {len(training_set.places)} places, {training_set.photo_count} photos, "
-            f"{len(training_set.cities)} cities ({training_set.layout} in {training_set.root})"
+            f"{cities} {'city' if cities == 1 else 'cities'} "
+            f"({training_set.layout} in {training_set.root})"
         )
     for each in {each.name: each for each in (*sets.validation, *sets.test)}.values():
         display.info(

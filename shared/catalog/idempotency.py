@@ -62,7 +62,7 @@ class IdempotencyRecord(Base):
 
 @dataclass(frozen=True, slots=True)
 class RequestIdentity:
-    """Identifies a request, to tell a repetition from another request with the same key."""
+    """Identifies a request: distinguishes a repetition from another request with the same key."""
 
     scope: str
     key: str

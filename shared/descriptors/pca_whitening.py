@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 from torch.nn.functional import normalize
 
 from shared.errors import Unprocessable
@@ -113,8 +115,6 @@ class PcaWhiteningFile:
 
     def encode(self) -> bytes:
         """Encode as a `.safetensors` file."""
-        from safetensors.numpy import save
-
         whitening = self.whitening
         return save(
             {
@@ -156,9 +156,6 @@ def decode_whitening(data: bytes) -> PcaWhiteningFile:
 
     Raises Unprocessable (`pca_unfit`) with the reason.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
     try:
         stored = load(data)
     except SafetensorError as error:

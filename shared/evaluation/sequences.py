@@ -168,7 +168,6 @@ def evaluate_kidnapped(
     rows: Rows,
     motion: MotionModel,
     every: int,
-    seed: int = 0,
 ) -> list[int | None]:
     """Evaluate relocalisation after jumps of the camera to random frames of its sequence.
 
@@ -186,7 +185,7 @@ def evaluate_kidnapped(
     inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
     if len(inside) < 2:
         return []
-    starts = np.random.default_rng(seed).integers(len(inside), size=KIDNAPS + 1).tolist()
+    starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
     frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
     times = _times([evaluation_set.queries[index] for index in members])
     interval = (times[-1] - times[0]) / (len(times) - 1)

@@ -65,7 +65,7 @@ def propose_position(
         text = f"taken {_after(neighbours.seconds)} {neighbours.nearest.name}"
         sources.append((position_mixture(neighbours, plane), text, f"not where it was {text}"))
     if track is not None:
-        text = f"GPX track, {_after(track.seconds)} one of its points"
+        text = f"GPX track, {_duration(track.seconds)} from its nearest point"
         sources.append((position_mixture(track, plane), text, "not on the GPX track"))
     product = reduce(Mixture.times, (mixture for mixture, _, _ in sources))
     if not len(product.weights):
@@ -117,8 +117,11 @@ def _looks_like(
 
 
 def _after(seconds: float) -> str:
-    length = abs(seconds)
-    if length < 0.5:
+    if abs(seconds) < 0.5:
         return "at the same time as"
-    text = f"{length:.0f} s" if length < 99.5 else f"{length / 60:.0f} min"
-    return f"{text} {'before' if seconds < 0 else 'after'}"
+    return f"{_duration(seconds)} {'before' if seconds < 0 else 'after'}"
+
+
+def _duration(seconds: float) -> str:
+    length = abs(seconds)
+    return f"{length:.0f} s" if length < 99.5 else f"{length / 60:.0f} min"

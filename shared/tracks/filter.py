@@ -71,7 +71,7 @@ NEWS_WEIGHT = 1.5
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
-"""A camera that may have moved farther is carried away as far as the filter knows"""
+"""A camera that may have moved farther may be anywhere in the map, as if carried away"""
 MAX_PHOTOS = 300
 """of a belief; the least probable ones beyond go back to `elsewhere`"""
 MOVING_PHOTOS = 100

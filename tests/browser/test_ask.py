@@ -183,6 +183,18 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     expect(page.locator(".badge")).not_to_have_text("No estimate")
 
 
+def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, town: Town) -> None:
+    found = town.ask(town.queries[0])
+    for photo in found["similar_images"]:
+        name = {"original_filename": "a_name_without_a_space_" * 4 + ".jpg", "relative_path": None}
+        photo |= {**name, "latitude": None, "place": "building/floor_7/" * 4}
+    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
+    visitor.page.set_viewport_size({"width": 320, "height": 640})
+    page = ask(visitor, town.queries[0])
+    page.locator(".figures summary").click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 320
+
+
 def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
     visitor: Visitor, town: Town, tmp_path: Path
 ) -> None:

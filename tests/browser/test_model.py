@@ -15,7 +15,7 @@ def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
     page = visitor.visit("model")
     expect(page.locator(".standing .chip")).to_have_text("Foreign")
     page.get_by_role("button", name="Fit a vocabulary…").click()
-    page.get_by_label("Photos to learn from, at most").fill("60")
+    page.get_by_label("Photos to fit on, at most").fill("60")
     page.get_by_role("button", name="Fit it", exact=True).click()
     expect(page.get_by_role("progressbar", name="Fitting a vocabulary")).to_be_visible()
     expect(page.locator(".standing .chip")).to_have_text("Its own")

@@ -8,6 +8,7 @@ import errno
 import functools
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -97,6 +98,19 @@ def start(
     return subprocess.Popen(
         words, env=env, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr
     )
+
+
+def forked_program(path: Path, prefix: str = "") -> Path:
+    """Write an executable that runs PLACEWISE as a fork, for scripts that start it themselves.
+
+    `prefix` is a shell command that runs first.
+    """
+    _fork_server()
+    client = Path(__file__).with_name("forked_placewise.py")
+    words = [sys.executable, "-IS", str(client), ADDRESS[1:], PLACEWISE]
+    path.write_text(f'#!/bin/sh\n{prefix}\nexec {shlex.join(words)} "$@"\n')
+    path.chmod(0o755)
+    return path
 
 
 class ForkedProcess:

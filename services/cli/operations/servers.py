@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
+from services.cli.imports import collection_paused
 from services.cli.output import err_console, print_note
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
@@ -41,7 +42,8 @@ def serve() -> None:
     prints an admin key; `placewise keys` creates others. With DEBUG, in a checkout of the
     repository, the server restarts when its code changes.
     """
-    from services.standalone import serve_standalone
+    with collection_paused():
+        from services.standalone import serve_standalone
 
     changed = threading.Event()
     settings = read_settings()
@@ -171,7 +173,8 @@ def search() -> None:
     The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
     gateway and the steward, which find it through SEARCH_URLS.
     """
-    from services.search.service import serve_search
+    with collection_paused():
+        from services.search.service import serve_search
 
     serve_search(read_settings(), print_note)
 
@@ -181,7 +184,8 @@ def gateway() -> None:
 
     Every call requires an API key: ADMIN_KEY, or one created with `placewise keys`.
     """
-    from services.gateway.service import serve_gateway
+    with collection_paused():
+        from services.gateway.service import serve_gateway
 
     serve_gateway(read_settings(), print_note)
 
@@ -191,7 +195,8 @@ def extractor() -> None:
 
     It is a Celery worker on REDIS_URL, DATABASE_URL and the object store.
     """
-    from services.extractor.service import serve_extractor
+    with collection_paused():
+        from services.extractor.service import serve_extractor
 
     serve_extractor(read_settings(), print_note)
 
@@ -201,7 +206,8 @@ def steward() -> None:
 
     Any number of stewards can run at the same time.
     """
-    from services.steward.service import serve_steward
+    with collection_paused():
+        from services.steward.service import serve_steward
 
     serve_steward(read_settings(), print_note)
 

@@ -15,7 +15,7 @@ export function h(name, attributes = {}, ...children) {
   return element;
 }
 
-/** A time as people say it; the exact one as its title. */
+/** A relative time; the exact one is its title. */
 export const time = (text) => h("time", { datetime: text, title: when(text) }, ago(text));
 
 /** Put these in the place of all that is in the element. */

@@ -21,11 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import torch
+from safetensors import safe_open
 
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     OnProgress,
+    download_hub_file,
     first_error_line,
     load_tensors,
 )
@@ -113,10 +116,6 @@ def _cached_weights(size: str) -> Path | None:
 
 
 def _download(size: str, on_progress: OnProgress) -> Path:
-    import httpx2
-
-    from shared.descriptors.weight_files import download_hub_file
-
     try:
         return download_hub_file(hub_repository(size), HUB_FILE, on_progress)
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
@@ -184,8 +183,6 @@ def _guess_size(file: DinoWeightsFile, size: str) -> str:
 
 
 def _open_safetensors(path: Path) -> DinoWeightsFile:
-    from safetensors import safe_open
-
     stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
     names: list[str] = stored.keys()
     shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}

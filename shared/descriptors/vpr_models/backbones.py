@@ -24,6 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import httpx2
 import torch
+from safetensors.torch import load_file
 from torch import nn
 
 from shared.descriptors.backbones.dinov2 import MEAN as IMAGENET_MEAN
@@ -230,8 +231,6 @@ def _read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
 
     Raises Misconfigured (`weights_unfit`) for other files.
     """
-    from safetensors.torch import load_file
-
     try:
         with path.open("rb") as file:
             begin = file.read(9)

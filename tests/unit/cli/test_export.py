@@ -126,7 +126,9 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     )
     will_find(server, "a.jpg", latitude=45.5, longitude=7.25, in_map=True)
     file = io.BytesIO()
-    report = export_geojson(client, file, True, Progress(disable=True))
+    progress = Progress(disable=True)
+    report = export_geojson(client, file, True, progress)
+    assert progress.tasks[0].total == STATS["total_images"] + STATS["labelled_queries"]
     found = json.loads(file.getvalue())
     assert found["type"] == "FeatureCollection"
     one, query, estimate = found["features"]

@@ -147,7 +147,12 @@ def test_between_two_positions_the_photo_is_where_the_walk_was_at_that_time() ->
     proposal = proposed(None, None, sides)
     assert metres_from(proposal, 10, 0) < 3
     assert proposal.probability > 0.95
-    assert proposal.reason == "GPX track, 10 s after one of its points"
+    assert proposal.reason == "GPX track, 10 s from its nearest point"
+
+
+def test_a_photo_of_the_same_second_is_taken_at_the_same_time() -> None:
+    proposal = proposed(None, [known(0, 0, 0, "other.jpg")])
+    assert proposal.reason == "taken at the same time as other.jpg"
 
 
 def test_the_farther_the_known_times_the_less_probable_is_the_position() -> None:

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from services.trainer.arguments import TrainingArguments, build_arguments
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.losses import make_loss, make_miner
 from services.trainer.model_factory import make_model, register_own_modules
 from services.trainer.run_control import NullDisplay
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS

@@ -62,11 +62,15 @@ function facts(photo, job) {
     Object.entries(photo.metadata).map(([name, value]) => line(name, typeof value === "string" ? value : JSON.stringify(value))));
 }
 
+// A centimetre: more digits are rounding errors of the EXIF's degrees, minutes and seconds.
+const DIGITS = 7;
+const rounded = (degrees) => (degrees === null ? "" : String(Number(degrees.toFixed(DIGITS))));
+
 const numberOf = (input) => (input.value.trim() === "" ? null : Number(input.value));
 
 function editForm(photo) {
-  const latitude = h("input", { type: "number", min: -90, max: 90, step: "any", value: photo.latitude ?? "" });
-  const longitude = h("input", { type: "number", min: -180, max: 180, step: "any", value: photo.longitude ?? "" });
+  const latitude = h("input", { type: "number", min: -90, max: 90, step: "any", value: rounded(photo.latitude) });
+  const longitude = h("input", { type: "number", min: -180, max: 180, step: "any", value: rounded(photo.longitude) });
   const place = h("input", { maxlength: 500, value: photo.place ?? "", autocomplete: "off" });
   const tags = h("input", { value: photo.tags.join(", "), autocomplete: "off" });
   const role = h("select", {}, h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photo"));
