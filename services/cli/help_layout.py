@@ -27,7 +27,7 @@ class OptionsTable(Table):
 
 def prepare_help(command: Any) -> None:
     """Lay out the help of a command and of all commands below it."""
-    rich_utils.Table = OptionsTable  # type: ignore[misc]
+    rich_utils.Table = OptionsTable  # type: ignore[attr-defined]
     command.help = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.cleandoc(command.help or ""))
     for subcommand in getattr(command, "commands", {}).values():
         prepare_help(subcommand)
