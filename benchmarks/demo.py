@@ -24,7 +24,11 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.generated_city import generate_city
 from placewise.answers import Estimate
 from placewise.client import Client
-from services.cli.ingest.geotags import LocalPhoto
+from services.cli.client import connect, wait_for_job
+from services.cli.descriptors.vocabulary import fit_and_wait
+from services.cli.ingest.geotags import LocalPhoto, find_photos
+from services.cli.ingest.upload import upload_photos
+from services.cli.output import progress_bar
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 from shared.synthetic_city.plan import CityOptions
@@ -56,7 +60,7 @@ class QueryOutcome:
         return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
 
 
-def query_with_photo(
+def _query_with_photo(
     client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
 ) -> QueryOutcome:
     """Query with a photo that is not stored, and compare the result with its ground truth."""
@@ -73,7 +77,7 @@ def query_with_photo(
     )
 
 
-def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
+def _summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
     """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
     inside = [a for a in outcomes if a.in_map]
     outside = [a for a in outcomes if not a.in_map]
@@ -125,7 +129,7 @@ GAP = 16
 CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), (150, 150, 150)
 
 
-def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
+def _draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
     """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
 
     The frame is green for a correct match, red for a wrong one, grey for "not in this map".
@@ -184,9 +188,6 @@ def main() -> None:
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = _parse_arguments()
-    from services.cli.client import connect
-    from services.cli.output import progress_bar
-
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
@@ -210,7 +211,7 @@ def main() -> None:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
         if options.picture:
-            draw_outcomes(outcomes, city / "database", options.picture)
+            _draw_outcomes(outcomes, city / "database", options.picture)
             print(f"Queries and their matches: {options.picture}")
 
 
@@ -231,11 +232,6 @@ def _parse_arguments() -> argparse.Namespace:
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
     """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
-    from services.cli.client import wait_for_job
-    from services.cli.descriptors.vocabulary import fit_and_wait
-    from services.cli.ingest.geotags import find_photos
-    from services.cli.ingest.upload import upload_photos
-
     database = find_photos(city / "database", None, None)
     queries = find_photos(city / "queries", None, None)
     labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]
@@ -252,13 +248,13 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     bar = progress.add_task("querying", total=len(queries[1::2]))
     outcomes = []
     for query in queries[1::2]:
-        outcomes.append(query_with_photo(client, query, database))
+        outcomes.append(_query_with_photo(client, query, database))
         progress.advance(bar)
     return outcomes
 
 
 def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
-    summary = summarise_outcomes(outcomes)
+    summary = _summarise_outcomes(outcomes)
     print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
     for name, label, style in (
         ("R@1", "R@1 of queries in the map", ".1%"),

@@ -40,7 +40,7 @@ from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
 from shared.evaluation.places.fit import PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import PlaceEstimate
+from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.place_paths import label_levels
 
@@ -135,24 +135,24 @@ def measure(progress: Progress, *, folders: Sequence[Path] | None, splits: int) 
     return report
 
 
-def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
-    """Describe an evaluation set as a new map would be."""
+def describe_set(folder: Path, progress: Progress, name: str | None = None) -> DescribedPhotos:
+    """Describe an evaluation set, which `name` selects among several, as a new map would be."""
     # Decoder processes import the program, and their memory limit leaves no room for torch.
     from services.cli.evaluation.describers import extractor_describer
     from shared.evaluation.ranking import describe_to_matrix
 
     settings = read_settings()
-    dataset = open_evaluation_set(folder)
+    dataset = open_evaluation_set(folder, name)
     photos = [*dataset.database, *dataset.queries]
     describer = extractor_describer(
         settings.new_map_extractor, None, dataset, settings, progress, fit=True
     )
     with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
         matrix = np.array(rows)
-    return described_photos(dataset.name, photos, matrix, len(dataset.database))
+    return _described_photos(dataset.name, photos, matrix, len(dataset.database))
 
 
-def described_photos(
+def _described_photos(
     name: str, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32], database: int
 ) -> DescribedPhotos:
     """Join photos, of which the first `database` are no queries, with their descriptors."""
@@ -180,7 +180,7 @@ class TrialMap:
 
     def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
         self.members = np.flatnonzero(in_map).tolist()
-        self._photos = photos
+        self.photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
         self.locations = [photos.locations[index] for index in self.members]
@@ -198,9 +198,20 @@ class TrialMap:
         spread = self.own_photos.spread(own)
         return list(self.own_photos.samples(own, spread)), spread
 
+    def fit(self, labelled: Sequence[int] = ()) -> PlaceModel:
+        """Fit the place model on the map's photos, and on photos of the set as labelled queries."""
+        samples, spread = self.own_samples()
+        labels = [sample for q in labelled if (sample := self.query_sample(q, spread)).levels]
+        return fit_place_model(samples, labels, self.photos.scheme, spread).model
+
+    def estimate(self, query: int, model: PlaceModel) -> PlaceEstimate | None:
+        """Estimate the place of a photo of the set; None without similar photos of known place."""
+        scheme, radius_m = self.photos.scheme, self.photos.radius_m
+        return model.estimate(*self.search(query), scheme, CERTAINTY, radius_m)
+
     def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
         """Return the ranking of a photo of the set, and that of the best photo in it."""
-        found, scores = _rank(self._rows @ self._photos.rows[query])
+        found, scores = _rank(self._rows @ self.photos.rows[query])
         ranking = [
             RankedPhoto(score, self.locations[index], index)
             for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
@@ -209,9 +220,9 @@ class TrialMap:
 
     def query_sample(self, query: int, spread: float) -> PlaceSample:
         """Return the sample of a photo of the set."""
-        truth = self._photos.locations[query]
+        truth = self.photos.locations[query]
         levels = candidate_levels(
-            *self.search(query), self._photos.scheme, spread, self._photos.radius_m
+            *self.search(query), self.photos.scheme, spread, self.photos.radius_m
         )
         return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
 
@@ -235,13 +246,10 @@ def fit_and_judge(
         labelled: (n,) which are labelled queries; none by default.
     """
     trial = TrialMap(photos, in_map)
-    samples, spread = trial.own_samples()
-    known = np.flatnonzero(labelled).tolist() if labelled is not None else []
-    labels = [sample for q in known if (sample := trial.query_sample(q, spread)).levels]
-    model = fit_place_model(samples, labels, photos.scheme, spread).model
+    model = trial.fit(np.flatnonzero(labelled).tolist() if labelled is not None else [])
     judged = []
     for query in np.flatnonzero(queries).tolist():
-        estimate = model.estimate(*trial.search(query), photos.scheme, CERTAINTY, photos.radius_m)
+        estimate = trial.estimate(query, model)
         if estimate is not None:
             truth = photos.locations[query]
             right = [level.is_right(truth) for level in estimate.levels]

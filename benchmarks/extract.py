@@ -119,7 +119,7 @@ def fit_or_load_centres(extractor: Extractor, photos: list[Pixels]) -> ClusterCe
     return fit_vocabulary(extractor, [photos], len(photos), clusters=clusters, seed=0).centres
 
 
-class ReferenceAnyLoc:
+class _ReferenceAnyLoc:
     def __init__(self, measured: BenchmarkedExtractor, centres: NDArray[np.float32]) -> None:
         """(K, width) centres. The extractor is one of the `anyloc-` ones, with hard VLAD."""
         config, device = measured.config, measured.device
@@ -234,7 +234,7 @@ def _run_rounds(
     report: Report,
     progress: Progress,
     measured: BenchmarkedExtractor,
-    pipeline: ExtractionPipeline,
+    pipeline: _ExtractionPipeline,
     files: Sequence[bytes],
     rounds: int,
     *,
@@ -243,11 +243,11 @@ def _run_rounds(
 ) -> None:
     bar = progress.add_task("rounds", total=rounds)
     pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
-    ours, published = RoundTimings(), RoundTimings()
+    ours, published = _RoundTimings(), _RoundTimings()
     reference, expected = None, None
     if compare and measured.config.depth is not None and measured.config.aggregator == "vlad":
         assert pipeline.centres is not None
-        reference = ReferenceAnyLoc(measured, pipeline.centres.array)
+        reference = _ReferenceAnyLoc(measured, pipeline.centres.array)
         reference.describe(files[:1])
     _reset_peak_memory(measured.device)
     rows = ours.run(lambda: pipeline.describe(files))
@@ -280,7 +280,7 @@ def _run_rounds(
     report.add(f"peak memory{suffix}", peak_bytes / 1e6, "MB")
 
 
-class ExtractionPipeline:
+class _ExtractionPipeline:
     """The extractor service's pipeline: decoder processes work one batch ahead of the network."""
 
     def __init__(self, made: Extractor, decoders: DecoderPool, batch: int) -> None:
@@ -314,15 +314,15 @@ class ExtractionPipeline:
 @contextlib.contextmanager
 def _open_pipeline(
     measured: BenchmarkedExtractor, precision: Precision, batch: int, fit_photos: Sequence[bytes]
-) -> Iterator[ExtractionPipeline]:
+) -> Iterator[_ExtractionPipeline]:
     with contextlib.closing(DecoderPool(measured.settings)) as decoders:
-        pipeline = ExtractionPipeline(measured.load(precision), decoders, batch)
+        pipeline = _ExtractionPipeline(measured.load(precision), decoders, batch)
         pipeline.centres = fit_or_load_centres(pipeline.made, pipeline.pixels(fit_photos))
         yield pipeline
 
 
 @dataclass(slots=True)
-class RoundTimings:
+class _RoundTimings:
     """Timings of one implementation by round."""
 
     seconds: list[float] = field(default_factory=list)

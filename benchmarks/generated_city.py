@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from shared.descriptors.extractor import Extractor
 from shared.evaluation.recall import positives_within
 from shared.imaging.preprocessing import Pixels
 from shared.synthetic_city.plan import CityOptions, make_plan, positions_m
@@ -18,6 +17,8 @@ from shared.synthetic_city.write import write_city
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from shared.descriptors.extractor import Extractor
 
 
 @dataclass(frozen=True, slots=True)

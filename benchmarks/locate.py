@@ -20,20 +20,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from services.cli.environment import read_settings
-from services.cli.evaluation.describers import extractor_describer
+from benchmarks.estimates import CERTAINTY, TrialMap, describe_set
 from services.cli.output import Table, print_table, progress_bar
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.places.fit import fit_place_model
-from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.probability import PlaceModel
-from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.ranking import describe_evaluation_set
 from shared.evaluation.sequences import split_sequences
 from shared.geodesy import distance_m
 from shared.geotagging.evidence import (
@@ -54,53 +48,8 @@ POINT_FRAMES = 5
 POINT_NOISE_M = 5.0
 CLOCK_ERROR_SECONDS = 10.0
 RADIUS_M = 100.0
-CERTAINTY = 0.95
-OWN_PHOTOS_SAMPLED = 1000
-SCHEME = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0, 500.0, 2000.0))
 DEGREES_PER_M = 360 / 40_030_000
 SOURCES = ("picture", "picture, neighbours", "picture, neighbours, GPX", "neighbours", "GPX")
-
-
-@dataclass(frozen=True)
-class DescribedMap:
-    """The photos of a map, with descriptors and the place model that is fitted to them."""
-
-    photos: Sequence[DatasetPhoto]
-    locations: Sequence[PhotoLocation]
-    rows: NDArray[np.float32]
-    """(n, D), of unit length"""
-    model: PlaceModel
-
-    @classmethod
-    def of(cls, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32]) -> DescribedMap:
-        """Fit the place model on up to OWN_PHOTOS_SAMPLED of the photos, as an evaluation does."""
-
-        def rank(photo: int) -> IndexRanking:
-            scores = (rows @ rows[photo]).astype(np.float64)
-            order = np.argsort(-scores, kind="stable")
-            order = order[order != photo]
-            return order, scores[order]
-
-        locations = [PhotoLocation(each.latitude, each.longitude, each.place) for each in photos]
-        times = [photo.captured_at for photo in photos]
-        sampler = OwnPhotoSampler(locations, times, SCHEME, SCHEME.radii_m[0], rank)
-        known = np.flatnonzero([location.is_known for location in locations])
-        sampled = np.random.default_rng(0).permutation(known)[:OWN_PHOTOS_SAMPLED].tolist()
-        spread = sampler.spread(sampled)
-        fitted = fit_place_model(list(sampler.samples(sampled, spread)), (), SCHEME, spread)
-        return cls(photos, locations, rows, fitted.model)
-
-    def rank(self, scores: NDArray[np.float32]) -> list[int]:
-        """Return the first EVIDENCE_DEPTH photos for their (n,) scores."""
-        best: list[int] = np.argsort(-scores, kind="stable")[:EVIDENCE_DEPTH].tolist()
-        return best
-
-    def neighbours(self, photo: int) -> list[RankedPhoto]:
-        """Return the ranking of a photo of the map, without it."""
-        scores = self.rows @ self.rows[photo]
-        scores[photo] = -np.inf
-        order = [each for each in self.rank(scores) if each != photo]
-        return [RankedPhoto(float(scores[each]), self.locations[each]) for each in order]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,50 +66,31 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--share", type=float, default=0.15, help="frames that are photos")
     arguments = parser.parse_args()
-    map_, rides = describe_rides(arguments.city)
-    for name, frames, scores in rides:
-        pictures = [picture_of(map_, row) for row in scores]
+    name = next(n for n in evaluation_set_names(arguments.city) if n.endswith("_rides"))
+    rides = open_evaluation_set(arguments.city, name)
+    with progress_bar() as progress:
+        described = describe_set(arguments.city, progress, name)
+    map_ = TrialMap(described, ~described.is_query)
+    model = map_.fit()
+    for members in split_sequences(rides.queries):
+        frames = [rides.queries[member] for member in members]
+        pictures = [_picture_of(map_, model, len(map_.members) + member) for member in members]
         judged: dict[str, list[Judged]] = {}
         for seed in range(arguments.seeds):
-            for source, proposals in locate_walk(frames, pictures, seed, arguments.share).items():
+            for source, proposals in _locate_walk(frames, pictures, seed, arguments.share).items():
                 judged.setdefault(source, []).extend(proposals)
-        print_table(figures_table(name, judged))
+        print_table(_figures_table(str(frames[0].sequence), judged))
 
 
-def describe_rides(
-    city: Path,
-) -> tuple[DescribedMap, list[tuple[str, list[DatasetPhoto], NDArray[np.float32]]]]:
-    """Describe a city as a new map would be, and return its rides with their (frames, n) scores."""
-    name = next(each for each in evaluation_set_names(city) if each.endswith("_rides"))
-    evaluation_set = open_evaluation_set(city, name)
-    settings = read_settings()
-    with progress_bar() as progress:
-        describer = extractor_describer(
-            settings.new_map_extractor, None, evaluation_set, settings, progress, fit=True
-        )
-        with describe_evaluation_set(describer.describe, evaluation_set) as matrices:
-            database, queries = (np.array(rows) for rows in matrices)
-    map_ = DescribedMap.of(evaluation_set.database, database)
-    rides = []
-    for members in split_sequences(evaluation_set.queries):
-        frames = [evaluation_set.queries[member] for member in members]
-        rides.append((str(frames[0].sequence), frames, queries[members] @ database.T))
-    return map_, rides
-
-
-def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEvidence:
+def _picture_of(map_: TrialMap, model: PlaceModel, query: int) -> PictureEvidence:
     """Return what the search of the map says about a frame, as `placewise locate` reads it."""
-    order = map_.rank(scores)
-    ranking = [RankedPhoto(float(scores[each]), map_.locations[each]) for each in order]
-    neighbours = map_.neighbours(order[0])
-    estimate = map_.model.estimate(ranking, neighbours, SCHEME, CERTAINTY, SCHEME.radii_m[0])
+    ranking, _ = map_.search(query)
+    estimate = map_.estimate(query, model)
     assert estimate is not None
     return PictureEvidence(
         [
-            SimilarPosition(
-                *degrees(map_.photos[each]), float(scores[each]), map_.photos[each].name
-            )
-            for each in order
+            SimilarPosition(*degrees(found.location), found.score, str(found.photo))
+            for found in ranking
         ],
         [
             ProbableCircle(
@@ -169,16 +99,16 @@ def picture_of(map_: DescribedMap, scores: NDArray[np.float32]) -> PictureEviden
             for level, share in zip(estimate.levels, estimate.probabilities, strict=True)
         ],
         estimate.not_in_map,
-        len(map_.photos),
+        len(map_.members),
     )
 
 
-def locate_walk(
+def _locate_walk(
     frames: Sequence[DatasetPhoto], pictures: Sequence[PictureEvidence], seed: int, share: float
 ) -> dict[str, list[Judged]]:
     """Draw photos of a walk, and judge what is proposed for those without coordinates."""
     rng = np.random.default_rng(seed)
-    times = walk_times(frames)
+    times = _walk_times(frames)
     ahead = timedelta(seconds=CLOCK_ERROR_SECONDS)
     known = [
         KnownPosition(time, *degrees(frame)) for time, frame in zip(times, frames, strict=True)
@@ -219,7 +149,7 @@ def locate_walk(
     return judged
 
 
-def walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
+def _walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
     """Return the times of the frames, with half an hour before each jump."""
     seconds = [0.0]
     for before, after in pairwise(frames):
@@ -228,7 +158,7 @@ def walk_times(frames: Sequence[DatasetPhoto]) -> list[datetime]:
     return [START + timedelta(seconds=each) for each in seconds]
 
 
-def figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
+def _figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
     """Return a table of shares in %."""
     table = Table(
         "sources", "photos", "proposed at 0.95", "right", "most at 95 % right", "ECE", title=name
@@ -243,13 +173,13 @@ def figures_table(name: str, judged: dict[str, list[Judged]]) -> Table:
             str(len(proposals)),
             f"{100 * len(accepted) / len(proposals):.1f}",
             f"{100 * np.mean(accepted):.1f}" if accepted else "-",
-            f"{100 * most_proposed(proposals):.1f}",
+            f"{100 * _most_proposed(proposals):.1f}",
             f"{error:.3f}",
         )
     return table
 
 
-def most_proposed(proposals: Sequence[Judged]) -> float:
+def _most_proposed(proposals: Sequence[Judged]) -> float:
     """Return the largest share of photos that any threshold proposes with 95 % of them right."""
     ordered = sorted(proposals, key=lambda each: -each.probability)
     right = np.cumsum([each.is_right for each in ordered])
@@ -257,7 +187,7 @@ def most_proposed(proposals: Sequence[Judged]) -> float:
     return float(np.flatnonzero(precise).max(initial=-1) + 1) / len(ordered)
 
 
-def degrees(photo: DatasetPhoto) -> tuple[float, float]:
+def degrees(photo: DatasetPhoto | PhotoLocation) -> tuple[float, float]:
     """Return latitude and longitude; photos of generated cities have both."""
     assert photo.latitude is not None
     assert photo.longitude is not None

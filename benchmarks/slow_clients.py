@@ -62,7 +62,7 @@ class Calls:
 
 
 @dataclass(frozen=True, slots=True)
-class Attack:
+class _Attack:
     """An attack on the server, which runs in a process of its own."""
 
     port: int
@@ -111,7 +111,7 @@ def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, strea
         jobs = tuple(_upload(port, ours, photo) for _ in range(WATCHED_JOBS))
         bar = progress.add_task("phases", total=len(phases))
         for name, numbers in phases.items():
-            with _under(Attack(port, *numbers, slow, tuple(watching), jobs)):
+            with _under(_Attack(port, *numbers, slow, tuple(watching), jobs)):
                 found[name] = _timed(port, ours, photo, seconds, log)
             progress.advance(bar)
     baseline = found["no attack"]
@@ -179,7 +179,7 @@ def _call(
 
 
 @contextlib.contextmanager
-def _under(attack: Attack) -> Iterator[None]:
+def _under(attack: _Attack) -> Iterator[None]:
     """Run the attack in a process of its own, started SETTLE_SECONDS before the block."""
     context = multiprocessing.get_context("spawn")
     started = context.Event()
@@ -195,14 +195,14 @@ def _under(attack: Attack) -> Iterator[None]:
         process.join()
 
 
-def _attack(attack: Attack, started: Event) -> None:
+def _attack(attack: _Attack, started: Event) -> None:
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     started.set()
     asyncio.run(_attack_together(attack))
 
 
-async def _attack_together(attack: Attack) -> None:
+async def _attack_together(attack: _Attack) -> None:
     clients: list[Callable[[], Awaitable[None]]] = []
     clients += [lambda: _hold(attack.port, ADDRESS, b"")] * attack.idle
     head = (
@@ -217,7 +217,7 @@ async def _attack_together(attack: Attack) -> None:
     await asyncio.gather(*(_again(client) for client in clients))
 
 
-def _stream(attack: Attack, number: int) -> Callable[[], Awaitable[None]]:
+def _stream(attack: _Attack, number: int) -> Callable[[], Awaitable[None]]:
     caller = number % CALLERS
     head = (
         f"GET /api/v1/jobs/{attack.jobs[number % len(attack.jobs)]}/events HTTP/1.1\r\n"

@@ -37,14 +37,14 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=300)
     arguments = parser.parse_args()
-    print(measure_city(arguments.photos, arguments.frames))
+    print(_measure_city(arguments.photos, arguments.frames))
     for peak in (2.6, 3.2):
-        print(measure_railway(peak, arguments.frames))
+        print(_measure_railway(peak, arguments.frames))
 
 
-def measure_city(photos: int, frames: int, seed: int = 0) -> str:
+def _measure_city(photos: int, frames: int) -> str:
     """Follow a car through a city, and measure CPU time and memory."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     side_m = STREETS_M * max(2, round((photos / 10) ** 0.5))  # 20 photos per 100 m of street
     positions = rng.uniform(0, side_m, (photos, 2))
     along = rng.integers(2, size=photos)
@@ -83,7 +83,7 @@ def measure_city(photos: int, frames: int, seed: int = 0) -> str:
     )
 
 
-def railway_scores(rng: np.random.Generator, peak: float, frames: int) -> NDArray[np.float64]:
+def _railway_scores(rng: np.random.Generator, peak: float, frames: int) -> NDArray[np.float64]:
     """Draw (frames, RAILWAY_PHOTOS) scores; frame i is at photo i."""
     views = rng.normal(size=(frames, RAILWAY_PHOTOS))
     for _ in range(3):
@@ -95,7 +95,7 @@ def railway_scores(rng: np.random.Generator, peak: float, frames: int) -> NDArra
     return scores
 
 
-def measure_railway(peak: float, frames: int, seed: int = 0) -> str:
+def _measure_railway(peak: float, frames: int) -> str:
     """Follow a train along a map without coordinates."""
     motion = MOTION_MODELS["train"]
     radius_m = (TOLERANCE_FRAMES + 0.5) * motion.typical_speed_mps
@@ -104,7 +104,7 @@ def measure_railway(peak: float, frames: int, seed: int = 0) -> str:
             (str(row), None, None, None, None, "map", float(row)) for row in range(RAILWAY_PHOTOS)
         )
     )
-    scores = railway_scores(np.random.default_rng(seed), peak, frames)
+    scores = _railway_scores(np.random.default_rng(0), peak, frames)
     scheme = LevelScheme(labels_are_paths=False, radii_m=(radius_m,))
     track_filter = TrackFilter(graph, motion, scheme)
     belief: Belief | None = None

@@ -34,8 +34,7 @@ from services.trainer.data import (
     load_batches,
     to_tensor,
 )
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.losses import make_loss, make_miner
 from services.trainer.model_describer import ModelDescriber
 from services.trainer.model_factory import make_model
 from services.trainer.resolve import Device, resolve_device
@@ -78,7 +77,7 @@ def measure(
     report = Report(f"training on {chosen.torch_device.type}")
     with tempfile.TemporaryDirectory(prefix="placewise-bench-") as folder:
         out = Path(folder)
-        pace = measure_throughput(progress, out / "pace", photos, workers, chosen)
+        pace = _measure_throughput(progress, out / "pace", photos, workers, chosen)
         for what, rate in pace.reading.items():
             report.add(f"photos read to 224 pixels: {what}", rate, "photos/s")
         report.add("photos that the network learns from", pace.network, "photos/s")
@@ -93,7 +92,7 @@ def measure(
             pace.reading["with its workers"] / pace.network,
             at_least=1.0,
         )
-        learnt = measure_learning(progress, out, places, epochs, image_size, workers, chosen, seed)
+        learnt = _measure_learning(progress, out, places, epochs, image_size, workers, chosen, seed)
         for where, gain in learnt.items():
             report.add(f"R@1 untrained, {where}", 100 * gain.untrained, "%")
             report.add(f"R@1 trained, {where}", 100 * gain.trained, "%")
@@ -126,7 +125,7 @@ class RecallGain:
     fingerprint: str
 
 
-def measure_learning(
+def _measure_learning(
     progress: Progress,
     folder: Path,
     places: int,
@@ -253,7 +252,7 @@ class TrainingThroughput:
     """share of the training time spent waiting for photos"""
 
 
-def measure_throughput(
+def _measure_throughput(
     progress: Progress, folder: Path, photos: int, workers: int, device: Device
 ) -> TrainingThroughput:
     """Measure over this number of photos, without the first batches, in which workers start."""

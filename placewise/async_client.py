@@ -17,36 +17,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 from uuid import UUID
 
-from placewise.answers import (
-    AddedModel,
-    Answer,
-    BatchItem,
-    BatchStarted,
-    CreatedKey,
-    Deleted,
-    DeletedMap,
-    DeletedTrack,
-    Evaluation,
-    Generation,
-    Job,
-    Key,
-    Map,
-    OnePhoto,
-    OneTrack,
-    Photo,
-    PhotoHeader,
-    Proposal,
-    RemovedModel,
-    Search,
-    Similar,
-    Started,
-    Stats,
-    Track,
-    TrackFrame,
-    Uploaded,
-    Vocabulary,
-    WordWeights,
-)
+from placewise import answers
 from placewise.async_transport import AsyncTransport
 from placewise.protocol import (
     API,
@@ -63,7 +34,7 @@ from shared.errors import Unavailable, Unprocessable
 
 HEADER_BYTES = 256 * 1024
 Id = UUID | str
-Work = Uploaded | Started | Job | UUID | str
+Work = answers.Uploaded | answers.Started | answers.Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
 
 
@@ -72,7 +43,7 @@ class AsyncClient(AsyncTransport):
 
     async def upload(
         self, photo: str | Path, filename: str | None = None, **fields: Any
-    ) -> Uploaded:
+    ) -> answers.Uploaded:
         """Upload a photo, streamed from its file.
 
         Args:
@@ -88,11 +59,13 @@ class AsyncClient(AsyncTransport):
             Unprocessable: A field or the image is invalid.
         """
         data = {name: str(value) for name, value in drop_none(**fields).items()}
-        return Uploaded(**await self._send_file("/upload", Path(photo), filename, data=data))
+        return answers.Uploaded(
+            **await self._send_file("/upload", Path(photo), filename, data=data)
+        )
 
     async def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
-    ) -> Uploaded:
+    ) -> answers.Uploaded:
         """Upload a photo directly to the server's bucket with a presigned URL.
 
         The arguments are those of `upload`; `fields` are JSON values.
@@ -111,11 +84,11 @@ class AsyncClient(AsyncTransport):
             presigned = await self._call("POST", "/uploads/presign", json=body)
             await self._put_presigned(presigned, file)
         complete_path = presigned["complete_url"].removeprefix(API)
-        return Uploaded(**await self._call("POST", complete_path))
+        return answers.Uploaded(**await self._call("POST", complete_path))
 
     async def upload_archive(
         self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
-    ) -> BatchStarted:
+    ) -> answers.BatchStarted:
         """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
         with open_file(Path(archive)) as file:
             stream = ReadProgressFile(file, on_sent)
@@ -125,7 +98,7 @@ class AsyncClient(AsyncTransport):
 
     async def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
-    ) -> BatchStarted:
+    ) -> answers.BatchStarted:
         """Start a batch upload of photo files.
 
         Each manifest entry contains a `filename` and fields of `upload`.
@@ -139,41 +112,41 @@ class AsyncClient(AsyncTransport):
                 files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return await self._start_batch(files=files)
 
-    async def import_objects(self, manifest: Sequence[Json]) -> BatchStarted:
+    async def import_objects(self, manifest: Sequence[Json]) -> answers.BatchStarted:
         """Start a batch import of objects in the server's store.
 
         Each manifest entry contains an object `key` and fields of `upload`.
         """
         return await self.import_manifest(to_jsonl(manifest))
 
-    async def import_manifest(self, manifest: bytes) -> BatchStarted:
+    async def import_manifest(self, manifest: bytes) -> answers.BatchStarted:
         """Start a batch import like `import_objects`, with the manifest as JSONL."""
         headers = {"Content-Type": "application/x-ndjson"}
         return await self._start_batch(content=manifest, headers=headers)
 
-    async def import_prefix(self, prefix: str) -> BatchStarted:
+    async def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
         return await self._start_batch(files={"prefix": (None, prefix)})
 
-    async def _start_batch(self, **body: Any) -> BatchStarted:
-        return BatchStarted(**await self._call("POST", "/upload/batch", **body))
+    async def _start_batch(self, **body: Any) -> answers.BatchStarted:
+        return answers.BatchStarted(**await self._call("POST", "/upload/batch", **body))
 
-    async def batch_items(self, work: Work, *states: str) -> AsyncIterator[BatchItem]:
+    async def batch_items(self, work: Work, *states: str) -> AsyncIterator[answers.BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
         path = f"/jobs/{_job_id(work)}/items"
         async for item in self._iterate(path, "items", state=list(states) or None):
-            yield BatchItem(**item)
+            yield answers.BatchItem(**item)
 
     async def similar(
         self,
-        photo: str | Path | Photo | UUID,
+        photo: str | Path | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
         rerank: int | None = None,
         explain: bool = False,
         wait_seconds: int = 60,
         **filters: Any,
-    ) -> Similar:
+    ) -> answers.Similar:
         """Find the most similar photos and estimate the place.
 
         Args:
@@ -200,8 +173,8 @@ class AsyncClient(AsyncTransport):
             ),
             "headers": {"Prefer": f"wait={wait_seconds}"},
         }
-        if isinstance(photo, (Photo, UUID)):
-            file_id = photo.image_id if isinstance(photo, Photo) else photo
+        if isinstance(photo, (answers.Photo, UUID)):
+            file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
             answer = await self._call("POST", f"/similarity/{file_id}", **options)
         else:
             answer = await self._send_file("/similarity", Path(photo), **options)
@@ -209,9 +182,9 @@ class AsyncClient(AsyncTransport):
             async for _ in self.watch(answer["job_id"]):
                 pass
             answer = await self._call("GET", answer["result_url"].removeprefix(API))
-        return Similar(**answer)
+        return answers.Similar(**answer)
 
-    async def read_header(self, photo: str | Path) -> PhotoHeader:
+    async def read_header(self, photo: str | Path) -> answers.PhotoHeader:
         """Read when, where and by which camera a photo was taken from the begin of its file.
 
         Raises:
@@ -220,13 +193,13 @@ class AsyncClient(AsyncTransport):
         with open_file(Path(photo)) as file:
             begin = file.read(HEADER_BYTES)
         headers = {"Content-Type": "application/octet-stream"}
-        return PhotoHeader(
+        return answers.PhotoHeader(
             **await self._call("POST", "/photo-headers", content=begin, headers=headers)
         )
 
     async def propose_positions(
         self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
-    ) -> list[Proposal]:
+    ) -> list[answers.Proposal]:
         """Propose where photos were taken that have no coordinates. Nothing is stored.
 
         Args:
@@ -241,11 +214,11 @@ class AsyncClient(AsyncTransport):
         """
         body = {"photos": list(photos), "track": list(track), **options}
         answer = await self._call("POST", "/positions", json=body)
-        return [Proposal(**each) for each in answer["proposals"]]
+        return [answers.Proposal(**each) for each in answer["proposals"]]
 
     async def begin_track(
         self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
-    ) -> Track:
+    ) -> answers.Track:
         """Begin a track: a sequence of frames that is followed through the map.
 
         Args:
@@ -255,7 +228,7 @@ class AsyncClient(AsyncTransport):
                 `accuracy_m`; or `place`.
         """
         body = drop_none(motion=motion, max_speed_mps=max_speed_mps, **start)
-        return Track(**await self._call("POST", "/tracks", json=body))
+        return answers.Track(**await self._call("POST", "/tracks", json=body))
 
     async def add_frame(
         self,
@@ -266,7 +239,7 @@ class AsyncClient(AsyncTransport):
         wait: bool = True,
         expected_version: int | None = None,
         **measured: float | None,
-    ) -> TrackFrame:
+    ) -> answers.TrackFrame:
         """Add a frame to a track. The photo is not stored in the map.
 
         Args:
@@ -293,49 +266,49 @@ class AsyncClient(AsyncTransport):
             data={name: str(value) for name, value in fields.items()},
             headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
         )
-        frame = TrackFrame(**answer)
+        frame = answers.TrackFrame(**answer)
         while wait and frame.status == "pending":
             frame = await self.track_frame(track_id, frame.frame_id, wait_seconds=POLL_SECONDS)
         return frame
 
     async def track_frame(
         self, track_id: Id, frame_id: Id, *, wait_seconds: float = 0
-    ) -> TrackFrame:
+    ) -> answers.TrackFrame:
         """Get a frame of a track; with `wait_seconds`, wait that long until it is applied."""
         path = f"/tracks/{track_id}/frames/{frame_id}"
         headers = {"Prefer": f"wait={wait_seconds:.0f}"}
-        return TrackFrame(**await self._call("GET", path, headers=headers))
+        return answers.TrackFrame(**await self._call("GET", path, headers=headers))
 
-    async def track(self, track_id: Id, *, smoothed: bool = False) -> OneTrack:
+    async def track(self, track_id: Id, *, smoothed: bool = False) -> answers.OneTrack:
         """Get a track with all frames; `smoothed` uses the later frames for each state, too."""
         params = drop_none(smoothed=smoothed or None)
-        return OneTrack(**await self._call("GET", f"/tracks/{track_id}", params=params))
+        return answers.OneTrack(**await self._call("GET", f"/tracks/{track_id}", params=params))
 
-    async def tracks(self) -> AsyncIterator[Track]:
+    async def tracks(self) -> AsyncIterator[answers.Track]:
         """Iterate over the tracks of the map, newest first."""
         async for track in self._iterate("/tracks", "tracks"):
-            yield Track(**track)
+            yield answers.Track(**track)
 
-    async def delete_track(self, track_id: Id) -> DeletedTrack:
+    async def delete_track(self, track_id: Id) -> answers.DeletedTrack:
         """Delete a track with its frames."""
-        return DeletedTrack(**await self._call("DELETE", f"/tracks/{track_id}"))
+        return answers.DeletedTrack(**await self._call("DELETE", f"/tracks/{track_id}"))
 
-    async def job(self, work: Work, wait_seconds: float = 0) -> Job:
+    async def job(self, work: Work, wait_seconds: float = 0) -> answers.Job:
         """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
         path = f"/jobs/{_job_id(work)}"
-        return Job(**await self._call("GET", path, params={"wait": wait_seconds}))
+        return answers.Job(**await self._call("GET", path, params={"wait": wait_seconds}))
 
-    async def jobs(self, **filters: Any) -> AsyncIterator[Job]:
+    async def jobs(self, **filters: Any) -> AsyncIterator[answers.Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
         async for job in self._iterate("/jobs", "jobs", **filters):
-            yield Job(**job)
+            yield answers.Job(**job)
 
     async def watch(
         self,
         work: Work,
         timeout_seconds: float | None = None,
         poll_seconds: float = POLL_SECONDS,
-    ) -> AsyncIterator[Job]:
+    ) -> AsyncIterator[answers.Job]:
         """Poll a job and iterate over its states; the last one is its end, also if it failed.
 
         Args:
@@ -365,9 +338,9 @@ class AsyncClient(AsyncTransport):
         self,
         work: Work,
         timeout_seconds: float | None = None,
-        on_progress: Callable[[Job], object] = lambda job: None,
+        on_progress: Callable[[answers.Job], object] = lambda job: None,
         poll_seconds: float = POLL_SECONDS,
-    ) -> Job:
+    ) -> answers.Job:
         """Wait until a job succeeds.
 
         Args:
@@ -385,52 +358,52 @@ class AsyncClient(AsyncTransport):
         job.raise_for_failure()
         return job
 
-    async def cancel(self, work: Work) -> Job:
+    async def cancel(self, work: Work) -> answers.Job:
         """Cancel a job."""
-        return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
+        return answers.Job(**await self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
-    async def retry(self, work: Work) -> Job:
+    async def retry(self, work: Work) -> answers.Job:
         """Queue a failed or cancelled job again.
 
         For a batch: its failed and cancelled items whose bytes are still stored.
         """
-        return Job(**await self._call("POST", f"/jobs/{_job_id(work)}/retry"))
+        return answers.Job(**await self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
-    async def photo(self, file_id: Id) -> OnePhoto:
+    async def photo(self, file_id: Id) -> answers.OnePhoto:
         """Get a stored photo's metadata and state."""
-        return OnePhoto(**await self._call("GET", f"/uploads/{file_id}"))
+        return answers.OnePhoto(**await self._call("GET", f"/uploads/{file_id}"))
 
     async def image(self, file_id: Id) -> bytes:
         """Download the original bytes of a photo."""
         return await self._get_bytes(f"/uploads/{file_id}/image")
 
-    async def photos(self, **filters: Any) -> AsyncIterator[Photo]:
+    async def photos(self, **filters: Any) -> AsyncIterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
         async for photo in self._iterate("/search", "images", **filters):
-            yield Photo(**photo)
+            yield answers.Photo(**photo)
 
-    async def patch_photo(self, file_id: Id, **fields: Any) -> OnePhoto:
+    async def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
-        return OnePhoto(**await self._call("PATCH", f"/uploads/{file_id}", json=fields))
+        return answers.OnePhoto(**await self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
-    async def delete_photo(self, file_id: Id) -> Deleted:
+    async def delete_photo(self, file_id: Id) -> answers.Deleted:
         """Delete a photo."""
-        return Deleted(**await self._call("DELETE", f"/uploads/{file_id}"))
+        return answers.Deleted(**await self._call("DELETE", f"/uploads/{file_id}"))
 
-    async def fit_vocabulary(self, **options: int) -> Started:
+    async def fit_vocabulary(self, **options: int) -> answers.Started:
         """Start fitting a vocabulary on the map's photos.
 
         Options are `clusters`, `sample` and `seed`.
         """
-        return Started(**await self._call("POST", "/vocabularies", json=options))
+        return answers.Started(**await self._call("POST", "/vocabularies", json=options))
 
-    async def import_vocabulary(self, file: str | Path) -> Started:
+    async def import_vocabulary(self, file: str | Path) -> answers.Started:
         """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return Started(**await self._send_file("/vocabularies/import", Path(file)))
+        return answers.Started(**await self._send_file("/vocabularies/import", Path(file)))
 
-    async def vocabularies(self) -> list[Vocabulary]:
+    async def vocabularies(self) -> list[answers.Vocabulary]:
         """List the map's vocabularies, newest first."""
-        return [Vocabulary(**item) for item in await self._call("GET", "/vocabularies")]
+        return [answers.Vocabulary(**item) for item in await self._call("GET", "/vocabularies")]
 
     async def vocabulary_file(self, vocabulary_id: Id) -> bytes:
         """Download a vocabulary file that `import_vocabulary` accepts.
@@ -445,7 +418,7 @@ class AsyncClient(AsyncTransport):
         vocabulary_id: Id | None = None,
         pca: int | None = None,
         extractor: str | None = None,
-    ) -> Started:
+    ) -> answers.Started:
         """Start a new generation of the map's descriptors.
 
         Without arguments, PCA is undone for an extractor without a vocabulary.
@@ -458,11 +431,11 @@ class AsyncClient(AsyncTransport):
         body = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
         )
-        return Started(**await self._call("POST", "/generations", json=body))
+        return answers.Started(**await self._call("POST", "/generations", json=body))
 
-    async def generations(self) -> list[Generation]:
+    async def generations(self) -> list[answers.Generation]:
         """List the map's generations, newest first."""
-        return [Generation(**item) for item in await self._call("GET", "/generations")]
+        return [answers.Generation(**item) for item in await self._call("GET", "/generations")]
 
     async def export_descriptors(
         self,
@@ -480,33 +453,33 @@ class AsyncClient(AsyncTransport):
         path = f"/generations/{generation_id}/descriptors"
         await self._download(path, file, on_received)
 
-    async def learn_word_weights(self, generation_id: Id, **options: int) -> Started:
+    async def learn_word_weights(self, generation_id: Id, **options: int) -> answers.Started:
         """Start fitting word weights of the active generation; options are `sample` and `seed`."""
         path = f"/generations/{generation_id}/word-weights"
-        return Started(**await self._call("POST", path, json=options))
+        return answers.Started(**await self._call("POST", path, json=options))
 
-    async def word_weights(self, generation_id: Id) -> WordWeights:
+    async def word_weights(self, generation_id: Id) -> answers.WordWeights:
         """Get the word weights that were fitted for a generation."""
         path = f"/generations/{generation_id}/word-weights"
-        return WordWeights(**await self._call("GET", path))
+        return answers.WordWeights(**await self._call("GET", path))
 
-    async def evaluate(self, **options: int) -> Started:
+    async def evaluate(self, **options: int) -> answers.Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""
-        return Started(**await self._call("POST", "/evaluations", json=options))
+        return answers.Started(**await self._call("POST", "/evaluations", json=options))
 
-    async def evaluations(self) -> AsyncIterator[Evaluation]:
+    async def evaluations(self) -> AsyncIterator[answers.Evaluation]:
         """Iterate over the map's evaluations, newest first."""
         async for evaluation in self._iterate("/evaluations", "evaluations"):
-            yield Evaluation(**evaluation)
+            yield answers.Evaluation(**evaluation)
 
-    async def searches(self) -> AsyncIterator[Search]:
+    async def searches(self) -> AsyncIterator[answers.Search]:
         """Iterate over the search history, newest first."""
         async for search in self._iterate("/searches", "searches"):
-            yield Search(**search)
+            yield answers.Search(**search)
 
-    async def maps(self) -> list[Map]:
+    async def maps(self) -> list[answers.Map]:
         """List the maps of the server."""
-        return [Map(**item) for item in await self._call("GET", "/maps")]
+        return [answers.Map(**item) for item in await self._call("GET", "/maps")]
 
     async def create_map(
         self,
@@ -515,7 +488,7 @@ class AsyncClient(AsyncTransport):
         *,
         place_labels_are_paths: bool = False,
         rows: str | None = None,
-    ) -> Map:
+    ) -> answers.Map:
         """Create a map; `extractor` and `rows` (float32 or float16) default to the settings."""
         body = drop_none(
             name=name,
@@ -523,25 +496,25 @@ class AsyncClient(AsyncTransport):
             place_labels_are_paths=place_labels_are_paths or None,
             rows=rows,
         )
-        return Map(**await self._call("POST", "/maps", json=body))
+        return answers.Map(**await self._call("POST", "/maps", json=body))
 
     async def update_map(
         self, name: str, *, place_labels_are_paths: bool | None = None, rows: str | None = None
-    ) -> Map:
+    ) -> answers.Map:
         """Change whether `/` separates the levels of place labels, and the rows' type.
 
         `rows` (float32 or float16) applies to generations that are created from then on.
         """
         body = drop_none(place_labels_are_paths=place_labels_are_paths, rows=rows)
-        return Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
+        return answers.Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
-    async def delete_map(self, name: str) -> DeletedMap:
+    async def delete_map(self, name: str) -> answers.DeletedMap:
         """Delete a map and all its photos."""
-        return DeletedMap(**await self._call("DELETE", f"/maps/{quote(name, safe='')}"))
+        return answers.DeletedMap(**await self._call("DELETE", f"/maps/{quote(name, safe='')}"))
 
-    async def stats(self) -> Stats:
+    async def stats(self) -> answers.Stats:
         """Get statistics of the map."""
-        return Stats(**await self._call("GET", "/database/stats"))
+        return answers.Stats(**await self._call("GET", "/database/stats"))
 
     async def add_model(
         self,
@@ -551,7 +524,7 @@ class AsyncClient(AsyncTransport):
         licence: str | None = None,
         note: str | None = None,
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
-    ) -> Started:
+    ) -> answers.Started:
         """Start adding a checkpoint of `placewise train` as an extractor.
 
         Args:
@@ -564,23 +537,25 @@ class AsyncClient(AsyncTransport):
         data = drop_none(name=name, licence=licence, note=note)
         with open_file(Path(checkpoint)) as file:
             files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
-            return Started(**await self._call("POST", "/models", files=files, data=data))
+            return answers.Started(**await self._call("POST", "/models", files=files, data=data))
 
-    async def models(self) -> list[AddedModel]:
+    async def models(self) -> list[answers.AddedModel]:
         """List the added models."""
         page = await self._call("GET", "/models")
-        return [AddedModel(**item) for item in page["models"]]
+        return [answers.AddedModel(**item) for item in page["models"]]
 
-    async def remove_model(self, name: str) -> RemovedModel:
+    async def remove_model(self, name: str) -> answers.RemovedModel:
         """Remove a model that no map uses."""
         path = f"/models/{quote(name, safe='')}"
-        return RemovedModel(**await self._call("DELETE", path))
+        return answers.RemovedModel(**await self._call("DELETE", path))
 
-    async def keys(self) -> list[Key]:
+    async def keys(self) -> list[answers.Key]:
         """List the API keys of the server, without their secrets (admin only)."""
-        return [Key(**item) for item in await self._call("GET", "/keys")]
+        return [answers.Key(**item) for item in await self._call("GET", "/keys")]
 
-    async def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> CreatedKey:
+    async def create_key(
+        self, name: str, scopes: Sequence[str], **limits: Any
+    ) -> answers.CreatedKey:
         """Create an API key (admin only). Its secret is shown only in this response.
 
         Args:
@@ -590,11 +565,11 @@ class AsyncClient(AsyncTransport):
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
-        return CreatedKey(**await self._call("POST", "/keys", json=body))
+        return answers.CreatedKey(**await self._call("POST", "/keys", json=body))
 
-    async def revoke_key(self, key_id: Id) -> Key:
+    async def revoke_key(self, key_id: Id) -> answers.Key:
         """Revoke an API key (admin only)."""
-        return Key(**await self._call("DELETE", f"/keys/{key_id}"))
+        return answers.Key(**await self._call("DELETE", f"/keys/{key_id}"))
 
     @property
     def raw(self) -> AsyncRawClient:
@@ -627,7 +602,7 @@ class AsyncRawClient:
 def _to_json(answer: Any) -> Any:
     if isinstance(answer, list):
         return [_to_json(item) for item in answer]
-    return answer.as_json() if isinstance(answer, Answer) else answer
+    return answer.as_json() if isinstance(answer, answers.Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

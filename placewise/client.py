@@ -16,36 +16,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 from uuid import UUID
 
-from placewise.answers import (
-    AddedModel,
-    Answer,
-    BatchItem,
-    BatchStarted,
-    CreatedKey,
-    Deleted,
-    DeletedMap,
-    DeletedTrack,
-    Evaluation,
-    Generation,
-    Job,
-    Key,
-    Map,
-    OnePhoto,
-    OneTrack,
-    Photo,
-    PhotoHeader,
-    Proposal,
-    RemovedModel,
-    Search,
-    Similar,
-    Started,
-    Stats,
-    Track,
-    TrackFrame,
-    Uploaded,
-    Vocabulary,
-    WordWeights,
-)
+from placewise import answers
 from placewise.protocol import (
     API,
     POLL_SECONDS,
@@ -62,14 +33,16 @@ from shared.errors import Unavailable, Unprocessable
 
 HEADER_BYTES = 256 * 1024
 Id = UUID | str
-Work = Uploaded | Started | Job | UUID | str
+Work = answers.Uploaded | answers.Started | answers.Job | UUID | str
 """A job: the response that started it, the job itself, or its ID."""
 
 
 class Client(Transport):
     """Client of one server and one map."""
 
-    def upload(self, photo: str | Path, filename: str | None = None, **fields: Any) -> Uploaded:
+    def upload(
+        self, photo: str | Path, filename: str | None = None, **fields: Any
+    ) -> answers.Uploaded:
         """Upload a photo, streamed from its file.
 
         Args:
@@ -85,11 +58,11 @@ class Client(Transport):
             Unprocessable: A field or the image is invalid.
         """
         data = {name: str(value) for name, value in drop_none(**fields).items()}
-        return Uploaded(**self._send_file("/upload", Path(photo), filename, data=data))
+        return answers.Uploaded(**self._send_file("/upload", Path(photo), filename, data=data))
 
     def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
-    ) -> Uploaded:
+    ) -> answers.Uploaded:
         """Upload a photo directly to the server's bucket with a presigned URL.
 
         The arguments are those of `upload`; `fields` are JSON values.
@@ -108,11 +81,11 @@ class Client(Transport):
             presigned = self._call("POST", "/uploads/presign", json=body)
             self._put_presigned(presigned, file)
         complete_path = presigned["complete_url"].removeprefix(API)
-        return Uploaded(**self._call("POST", complete_path))
+        return answers.Uploaded(**self._call("POST", complete_path))
 
     def upload_archive(
         self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
-    ) -> BatchStarted:
+    ) -> answers.BatchStarted:
         """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
         with open_file(Path(archive)) as file:
             stream = ReadProgressFile(file, on_sent)
@@ -120,7 +93,7 @@ class Client(Transport):
 
     def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
-    ) -> BatchStarted:
+    ) -> answers.BatchStarted:
         """Start a batch upload of photo files.
 
         Each manifest entry contains a `filename` and fields of `upload`.
@@ -134,41 +107,41 @@ class Client(Transport):
                 files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return self._start_batch(files=files)
 
-    def import_objects(self, manifest: Sequence[Json]) -> BatchStarted:
+    def import_objects(self, manifest: Sequence[Json]) -> answers.BatchStarted:
         """Start a batch import of objects in the server's store.
 
         Each manifest entry contains an object `key` and fields of `upload`.
         """
         return self.import_manifest(to_jsonl(manifest))
 
-    def import_manifest(self, manifest: bytes) -> BatchStarted:
+    def import_manifest(self, manifest: bytes) -> answers.BatchStarted:
         """Start a batch import like `import_objects`, with the manifest as JSONL."""
         headers = {"Content-Type": "application/x-ndjson"}
         return self._start_batch(content=manifest, headers=headers)
 
-    def import_prefix(self, prefix: str) -> BatchStarted:
+    def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
         return self._start_batch(files={"prefix": (None, prefix)})
 
-    def _start_batch(self, **body: Any) -> BatchStarted:
-        return BatchStarted(**self._call("POST", "/upload/batch", **body))
+    def _start_batch(self, **body: Any) -> answers.BatchStarted:
+        return answers.BatchStarted(**self._call("POST", "/upload/batch", **body))
 
-    def batch_items(self, work: Work, *states: str) -> Iterator[BatchItem]:
+    def batch_items(self, work: Work, *states: str) -> Iterator[answers.BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
         path = f"/jobs/{_job_id(work)}/items"
         for item in self._iterate(path, "items", state=list(states) or None):
-            yield BatchItem(**item)
+            yield answers.BatchItem(**item)
 
     def similar(
         self,
-        photo: str | Path | Photo | UUID,
+        photo: str | Path | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
         rerank: int | None = None,
         explain: bool = False,
         wait_seconds: int = 60,
         **filters: Any,
-    ) -> Similar:
+    ) -> answers.Similar:
         """Find the most similar photos and estimate the place.
 
         Args:
@@ -195,8 +168,8 @@ class Client(Transport):
             ),
             "headers": {"Prefer": f"wait={wait_seconds}"},
         }
-        if isinstance(photo, (Photo, UUID)):
-            file_id = photo.image_id if isinstance(photo, Photo) else photo
+        if isinstance(photo, (answers.Photo, UUID)):
+            file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
             answer = self._call("POST", f"/similarity/{file_id}", **options)
         else:
             answer = self._send_file("/similarity", Path(photo), **options)
@@ -204,9 +177,9 @@ class Client(Transport):
             for _ in self.watch(answer["job_id"]):
                 pass
             answer = self._call("GET", answer["result_url"].removeprefix(API))
-        return Similar(**answer)
+        return answers.Similar(**answer)
 
-    def read_header(self, photo: str | Path) -> PhotoHeader:
+    def read_header(self, photo: str | Path) -> answers.PhotoHeader:
         """Read when, where and by which camera a photo was taken from the begin of its file.
 
         Raises:
@@ -215,11 +188,13 @@ class Client(Transport):
         with open_file(Path(photo)) as file:
             begin = file.read(HEADER_BYTES)
         headers = {"Content-Type": "application/octet-stream"}
-        return PhotoHeader(**self._call("POST", "/photo-headers", content=begin, headers=headers))
+        return answers.PhotoHeader(
+            **self._call("POST", "/photo-headers", content=begin, headers=headers)
+        )
 
     def propose_positions(
         self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
-    ) -> list[Proposal]:
+    ) -> list[answers.Proposal]:
         """Propose where photos were taken that have no coordinates. Nothing is stored.
 
         Args:
@@ -234,11 +209,11 @@ class Client(Transport):
         """
         body = {"photos": list(photos), "track": list(track), **options}
         answer = self._call("POST", "/positions", json=body)
-        return [Proposal(**each) for each in answer["proposals"]]
+        return [answers.Proposal(**each) for each in answer["proposals"]]
 
     def begin_track(
         self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
-    ) -> Track:
+    ) -> answers.Track:
         """Begin a track: a sequence of frames that is followed through the map.
 
         Args:
@@ -248,7 +223,7 @@ class Client(Transport):
                 `accuracy_m`; or `place`.
         """
         body = drop_none(motion=motion, max_speed_mps=max_speed_mps, **start)
-        return Track(**self._call("POST", "/tracks", json=body))
+        return answers.Track(**self._call("POST", "/tracks", json=body))
 
     def add_frame(
         self,
@@ -259,7 +234,7 @@ class Client(Transport):
         wait: bool = True,
         expected_version: int | None = None,
         **measured: float | None,
-    ) -> TrackFrame:
+    ) -> answers.TrackFrame:
         """Add a frame to a track. The photo is not stored in the map.
 
         Args:
@@ -286,47 +261,49 @@ class Client(Transport):
             data={name: str(value) for name, value in fields.items()},
             headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
         )
-        frame = TrackFrame(**answer)
+        frame = answers.TrackFrame(**answer)
         while wait and frame.status == "pending":
             frame = self.track_frame(track_id, frame.frame_id, wait_seconds=POLL_SECONDS)
         return frame
 
-    def track_frame(self, track_id: Id, frame_id: Id, *, wait_seconds: float = 0) -> TrackFrame:
+    def track_frame(
+        self, track_id: Id, frame_id: Id, *, wait_seconds: float = 0
+    ) -> answers.TrackFrame:
         """Get a frame of a track; with `wait_seconds`, wait that long until it is applied."""
         path = f"/tracks/{track_id}/frames/{frame_id}"
         headers = {"Prefer": f"wait={wait_seconds:.0f}"}
-        return TrackFrame(**self._call("GET", path, headers=headers))
+        return answers.TrackFrame(**self._call("GET", path, headers=headers))
 
-    def track(self, track_id: Id, *, smoothed: bool = False) -> OneTrack:
+    def track(self, track_id: Id, *, smoothed: bool = False) -> answers.OneTrack:
         """Get a track with all frames; `smoothed` uses the later frames for each state, too."""
         params = drop_none(smoothed=smoothed or None)
-        return OneTrack(**self._call("GET", f"/tracks/{track_id}", params=params))
+        return answers.OneTrack(**self._call("GET", f"/tracks/{track_id}", params=params))
 
-    def tracks(self) -> Iterator[Track]:
+    def tracks(self) -> Iterator[answers.Track]:
         """Iterate over the tracks of the map, newest first."""
         for track in self._iterate("/tracks", "tracks"):
-            yield Track(**track)
+            yield answers.Track(**track)
 
-    def delete_track(self, track_id: Id) -> DeletedTrack:
+    def delete_track(self, track_id: Id) -> answers.DeletedTrack:
         """Delete a track with its frames."""
-        return DeletedTrack(**self._call("DELETE", f"/tracks/{track_id}"))
+        return answers.DeletedTrack(**self._call("DELETE", f"/tracks/{track_id}"))
 
-    def job(self, work: Work, wait_seconds: float = 0) -> Job:
+    def job(self, work: Work, wait_seconds: float = 0) -> answers.Job:
         """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
         path = f"/jobs/{_job_id(work)}"
-        return Job(**self._call("GET", path, params={"wait": wait_seconds}))
+        return answers.Job(**self._call("GET", path, params={"wait": wait_seconds}))
 
-    def jobs(self, **filters: Any) -> Iterator[Job]:
+    def jobs(self, **filters: Any) -> Iterator[answers.Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
         for job in self._iterate("/jobs", "jobs", **filters):
-            yield Job(**job)
+            yield answers.Job(**job)
 
     def watch(
         self,
         work: Work,
         timeout_seconds: float | None = None,
         poll_seconds: float = POLL_SECONDS,
-    ) -> Iterator[Job]:
+    ) -> Iterator[answers.Job]:
         """Poll a job and iterate over its states; the last one is its end, also if it failed.
 
         Args:
@@ -356,9 +333,9 @@ class Client(Transport):
         self,
         work: Work,
         timeout_seconds: float | None = None,
-        on_progress: Callable[[Job], object] = lambda job: None,
+        on_progress: Callable[[answers.Job], object] = lambda job: None,
         poll_seconds: float = POLL_SECONDS,
-    ) -> Job:
+    ) -> answers.Job:
         """Wait until a job succeeds.
 
         Args:
@@ -376,52 +353,52 @@ class Client(Transport):
         job.raise_for_failure()
         return job
 
-    def cancel(self, work: Work) -> Job:
+    def cancel(self, work: Work) -> answers.Job:
         """Cancel a job."""
-        return Job(**self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
+        return answers.Job(**self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
 
-    def retry(self, work: Work) -> Job:
+    def retry(self, work: Work) -> answers.Job:
         """Queue a failed or cancelled job again.
 
         For a batch: its failed and cancelled items whose bytes are still stored.
         """
-        return Job(**self._call("POST", f"/jobs/{_job_id(work)}/retry"))
+        return answers.Job(**self._call("POST", f"/jobs/{_job_id(work)}/retry"))
 
-    def photo(self, file_id: Id) -> OnePhoto:
+    def photo(self, file_id: Id) -> answers.OnePhoto:
         """Get a stored photo's metadata and state."""
-        return OnePhoto(**self._call("GET", f"/uploads/{file_id}"))
+        return answers.OnePhoto(**self._call("GET", f"/uploads/{file_id}"))
 
     def image(self, file_id: Id) -> bytes:
         """Download the original bytes of a photo."""
         return self._get_bytes(f"/uploads/{file_id}/image")
 
-    def photos(self, **filters: Any) -> Iterator[Photo]:
+    def photos(self, **filters: Any) -> Iterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
         for photo in self._iterate("/search", "images", **filters):
-            yield Photo(**photo)
+            yield answers.Photo(**photo)
 
-    def patch_photo(self, file_id: Id, **fields: Any) -> OnePhoto:
+    def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
-        return OnePhoto(**self._call("PATCH", f"/uploads/{file_id}", json=fields))
+        return answers.OnePhoto(**self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
-    def delete_photo(self, file_id: Id) -> Deleted:
+    def delete_photo(self, file_id: Id) -> answers.Deleted:
         """Delete a photo."""
-        return Deleted(**self._call("DELETE", f"/uploads/{file_id}"))
+        return answers.Deleted(**self._call("DELETE", f"/uploads/{file_id}"))
 
-    def fit_vocabulary(self, **options: int) -> Started:
+    def fit_vocabulary(self, **options: int) -> answers.Started:
         """Start fitting a vocabulary on the map's photos.
 
         Options are `clusters`, `sample` and `seed`.
         """
-        return Started(**self._call("POST", "/vocabularies", json=options))
+        return answers.Started(**self._call("POST", "/vocabularies", json=options))
 
-    def import_vocabulary(self, file: str | Path) -> Started:
+    def import_vocabulary(self, file: str | Path) -> answers.Started:
         """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return Started(**self._send_file("/vocabularies/import", Path(file)))
+        return answers.Started(**self._send_file("/vocabularies/import", Path(file)))
 
-    def vocabularies(self) -> list[Vocabulary]:
+    def vocabularies(self) -> list[answers.Vocabulary]:
         """List the map's vocabularies, newest first."""
-        return [Vocabulary(**item) for item in self._call("GET", "/vocabularies")]
+        return [answers.Vocabulary(**item) for item in self._call("GET", "/vocabularies")]
 
     def vocabulary_file(self, vocabulary_id: Id) -> bytes:
         """Download a vocabulary file that `import_vocabulary` accepts.
@@ -436,7 +413,7 @@ class Client(Transport):
         vocabulary_id: Id | None = None,
         pca: int | None = None,
         extractor: str | None = None,
-    ) -> Started:
+    ) -> answers.Started:
         """Start a new generation of the map's descriptors.
 
         Without arguments, PCA is undone for an extractor without a vocabulary.
@@ -449,11 +426,11 @@ class Client(Transport):
         body = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
         )
-        return Started(**self._call("POST", "/generations", json=body))
+        return answers.Started(**self._call("POST", "/generations", json=body))
 
-    def generations(self) -> list[Generation]:
+    def generations(self) -> list[answers.Generation]:
         """List the map's generations, newest first."""
-        return [Generation(**item) for item in self._call("GET", "/generations")]
+        return [answers.Generation(**item) for item in self._call("GET", "/generations")]
 
     def export_descriptors(
         self,
@@ -471,33 +448,33 @@ class Client(Transport):
         path = f"/generations/{generation_id}/descriptors"
         self._download(path, file, on_received)
 
-    def learn_word_weights(self, generation_id: Id, **options: int) -> Started:
+    def learn_word_weights(self, generation_id: Id, **options: int) -> answers.Started:
         """Start fitting word weights of the active generation; options are `sample` and `seed`."""
         path = f"/generations/{generation_id}/word-weights"
-        return Started(**self._call("POST", path, json=options))
+        return answers.Started(**self._call("POST", path, json=options))
 
-    def word_weights(self, generation_id: Id) -> WordWeights:
+    def word_weights(self, generation_id: Id) -> answers.WordWeights:
         """Get the word weights that were fitted for a generation."""
         path = f"/generations/{generation_id}/word-weights"
-        return WordWeights(**self._call("GET", path))
+        return answers.WordWeights(**self._call("GET", path))
 
-    def evaluate(self, **options: int) -> Started:
+    def evaluate(self, **options: int) -> answers.Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""
-        return Started(**self._call("POST", "/evaluations", json=options))
+        return answers.Started(**self._call("POST", "/evaluations", json=options))
 
-    def evaluations(self) -> Iterator[Evaluation]:
+    def evaluations(self) -> Iterator[answers.Evaluation]:
         """Iterate over the map's evaluations, newest first."""
         for evaluation in self._iterate("/evaluations", "evaluations"):
-            yield Evaluation(**evaluation)
+            yield answers.Evaluation(**evaluation)
 
-    def searches(self) -> Iterator[Search]:
+    def searches(self) -> Iterator[answers.Search]:
         """Iterate over the search history, newest first."""
         for search in self._iterate("/searches", "searches"):
-            yield Search(**search)
+            yield answers.Search(**search)
 
-    def maps(self) -> list[Map]:
+    def maps(self) -> list[answers.Map]:
         """List the maps of the server."""
-        return [Map(**item) for item in self._call("GET", "/maps")]
+        return [answers.Map(**item) for item in self._call("GET", "/maps")]
 
     def create_map(
         self,
@@ -506,7 +483,7 @@ class Client(Transport):
         *,
         place_labels_are_paths: bool = False,
         rows: str | None = None,
-    ) -> Map:
+    ) -> answers.Map:
         """Create a map; `extractor` and `rows` (float32 or float16) default to the settings."""
         body = drop_none(
             name=name,
@@ -514,25 +491,25 @@ class Client(Transport):
             place_labels_are_paths=place_labels_are_paths or None,
             rows=rows,
         )
-        return Map(**self._call("POST", "/maps", json=body))
+        return answers.Map(**self._call("POST", "/maps", json=body))
 
     def update_map(
         self, name: str, *, place_labels_are_paths: bool | None = None, rows: str | None = None
-    ) -> Map:
+    ) -> answers.Map:
         """Change whether `/` separates the levels of place labels, and the rows' type.
 
         `rows` (float32 or float16) applies to generations that are created from then on.
         """
         body = drop_none(place_labels_are_paths=place_labels_are_paths, rows=rows)
-        return Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
+        return answers.Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
-    def delete_map(self, name: str) -> DeletedMap:
+    def delete_map(self, name: str) -> answers.DeletedMap:
         """Delete a map and all its photos."""
-        return DeletedMap(**self._call("DELETE", f"/maps/{quote(name, safe='')}"))
+        return answers.DeletedMap(**self._call("DELETE", f"/maps/{quote(name, safe='')}"))
 
-    def stats(self) -> Stats:
+    def stats(self) -> answers.Stats:
         """Get statistics of the map."""
-        return Stats(**self._call("GET", "/database/stats"))
+        return answers.Stats(**self._call("GET", "/database/stats"))
 
     def add_model(
         self,
@@ -542,7 +519,7 @@ class Client(Transport):
         licence: str | None = None,
         note: str | None = None,
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
-    ) -> Started:
+    ) -> answers.Started:
         """Start adding a checkpoint of `placewise train` as an extractor.
 
         Args:
@@ -555,23 +532,23 @@ class Client(Transport):
         data = drop_none(name=name, licence=licence, note=note)
         with open_file(Path(checkpoint)) as file:
             files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
-            return Started(**self._call("POST", "/models", files=files, data=data))
+            return answers.Started(**self._call("POST", "/models", files=files, data=data))
 
-    def models(self) -> list[AddedModel]:
+    def models(self) -> list[answers.AddedModel]:
         """List the added models."""
         page = self._call("GET", "/models")
-        return [AddedModel(**item) for item in page["models"]]
+        return [answers.AddedModel(**item) for item in page["models"]]
 
-    def remove_model(self, name: str) -> RemovedModel:
+    def remove_model(self, name: str) -> answers.RemovedModel:
         """Remove a model that no map uses."""
         path = f"/models/{quote(name, safe='')}"
-        return RemovedModel(**self._call("DELETE", path))
+        return answers.RemovedModel(**self._call("DELETE", path))
 
-    def keys(self) -> list[Key]:
+    def keys(self) -> list[answers.Key]:
         """List the API keys of the server, without their secrets (admin only)."""
-        return [Key(**item) for item in self._call("GET", "/keys")]
+        return [answers.Key(**item) for item in self._call("GET", "/keys")]
 
-    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> CreatedKey:
+    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> answers.CreatedKey:
         """Create an API key (admin only). Its secret is shown only in this response.
 
         Args:
@@ -581,11 +558,11 @@ class Client(Transport):
                 `upload_bytes_per_day`, `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
-        return CreatedKey(**self._call("POST", "/keys", json=body))
+        return answers.CreatedKey(**self._call("POST", "/keys", json=body))
 
-    def revoke_key(self, key_id: Id) -> Key:
+    def revoke_key(self, key_id: Id) -> answers.Key:
         """Revoke an API key (admin only)."""
-        return Key(**self._call("DELETE", f"/keys/{key_id}"))
+        return answers.Key(**self._call("DELETE", f"/keys/{key_id}"))
 
     @property
     def raw(self) -> RawClient:
@@ -618,7 +595,7 @@ class RawClient:
 def _to_json(answer: Any) -> Any:
     if isinstance(answer, list):
         return [_to_json(item) for item in answer]
-    return answer.as_json() if isinstance(answer, Answer) else answer
+    return answer.as_json() if isinstance(answer, answers.Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

@@ -32,7 +32,7 @@ KEEP_ALIVE_SECONDS = 75
 SHUTDOWN_GRACE_SECONDS = 10  # for requests in flight when the server is stopped
 
 
-class NotifyingServer(uvicorn.Server):
+class _NotifyingServer(uvicorn.Server):
     """uvicorn server that checks its connections regularly and calls `on_stop` before shutdown.
 
     `on_stop` lets requests that wait for something finish early.
@@ -59,7 +59,7 @@ class NotifyingServer(uvicorn.Server):
 
 def http_server(
     app: FastAPI, connections: Connections, *, on_stop: Callable[[], object] = lambda: None
-) -> NotifyingServer:
+) -> _NotifyingServer:
     """Creates a server for the application without starting it.
 
     Args:
@@ -71,7 +71,7 @@ def http_server(
     proxies = [str(network) for network in connections.limits.trusted_proxies]
     # uvicorn types ASGI messages one by one, Starlette does not.
     forwarded: Any = ProxyHeadersMiddleware(app, trusted_hosts=proxies)  # type: ignore[arg-type]
-    server = NotifyingServer(
+    server = _NotifyingServer(
         uvicorn.Config(
             # Instead of uvicorn's own, which would replace the address before it can be recorded.
             _record_peer(forwarded),

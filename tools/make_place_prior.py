@@ -39,17 +39,17 @@ SQUARES_M = (400.0, 100.0, 25.0)
 PRECISION = 50.0  # without it, features that vary together get large coefficients of both signs
 
 
-def sample_city(city: DescribedPhotos) -> list[PlaceSample]:
+def _sample_city(city: DescribedPhotos) -> list[PlaceSample]:
     """Sample a city with coordinates and with label paths."""
     paths = replace(
         city,
         locations=[PhotoLocation(None, None, _square_path(spot)) for spot in city.locations],
         scheme=LevelScheme(labels_are_paths=True, radii_m=city.scheme.radii_m),
     )
-    return [*sample_map(city), *sample_map(paths)]
+    return [*_sample_map(city), *_sample_map(paths)]
 
 
-def sample_map(photos: DescribedPhotos) -> list[PlaceSample]:
+def _sample_map(photos: DescribedPhotos) -> list[PlaceSample]:
     """Sample the database photos and the queries of a city."""
     trial = TrialMap(photos, ~photos.is_query)
     samples, spread = trial.own_samples()
@@ -61,7 +61,7 @@ def sample_map(photos: DescribedPhotos) -> list[PlaceSample]:
     return samples
 
 
-def fit_prior(samples: Sequence[PlaceSample]) -> PlacePrior:
+def _fit_prior(samples: Sequence[PlaceSample]) -> PlacePrior:
     """Fit the prior on the samples of many maps; all levels have the same coefficients."""
     weights = sample_weights(samples, OUT_OF_MAP_SHARE)
     levels = RegressionTable.of_rows(
@@ -93,9 +93,9 @@ def main(folders: Sequence[Path]) -> None:
     samples: list[PlaceSample] = []
     with Progress(console=console) as progress:
         for folder in folders:
-            samples += sample_city(describe_set(folder, progress))
+            samples += _sample_city(describe_set(folder, progress))
             console.print(f"{folder.name}: {len(samples)} samples so far")
-    PRIOR_FILE.write_text(fit_prior(samples).model_dump_json(indent=1) + "\n", encoding="utf-8")
+    PRIOR_FILE.write_text(_fit_prior(samples).model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def _square_path(spot: PhotoLocation) -> str:

@@ -55,14 +55,14 @@ def main() -> None:
     """Fit and write the vocabulary of each extractor that has one."""
     for config in EXTRACTOR_CONFIGS.values():
         if config.shipped_vocabulary is not None:
-            write_vocabulary(config)
+            _write_vocabulary(config)
 
 
-def write_vocabulary(config: ExtractorConfig) -> None:
+def _write_vocabulary(config: ExtractorConfig) -> None:
     """Fit the centres of one extractor and write them with their provenance."""
     extractor = Extractor(config, choose_device("cpu"))
     views = [
-        view for path in list_photographs() for view in cut_views(Image.open(path).convert("RGB"))
+        view for path in _list_photographs() for view in _cut_views(Image.open(path).convert("RGB"))
     ]
     points = torch.cat(
         [
@@ -95,7 +95,7 @@ def write_vocabulary(config: ExtractorConfig) -> None:
             for package, (_, names) in PHOTOGRAPHS.items()
         },
         "photographs_sha256": {
-            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in list_photographs()
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in _list_photographs()
         },
     }
     target = SHIPPED_VOCABULARIES / str(config.shipped_vocabulary)
@@ -130,7 +130,7 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
     return centres, passes
 
 
-def list_photographs() -> list[Path]:
+def _list_photographs() -> list[Path]:
     """List the photograph files of the installed packages."""
     paths = []
     for package, (folder, names) in PHOTOGRAPHS.items():
@@ -142,7 +142,7 @@ def list_photographs() -> list[Path]:
     return paths
 
 
-def cut_views(photograph: Image.Image) -> list[Image.Image]:
+def _cut_views(photograph: Image.Image) -> list[Image.Image]:
     """Cut square views: one at full scale, and a grid of overlapping ones at smaller scales."""
     width, height = photograph.size
     views = []

@@ -58,7 +58,7 @@ KNOWN_FULL_SCANS = (
 )
 
 
-class FakeSearch:
+class _FakeSearch:
     """Search client that returns the same photos for each query: only the catalog join counts."""
 
     def __init__(self, photo_ids: list[UUID]) -> None:
@@ -115,7 +115,7 @@ def _all_calls(
                 catalog,
                 store,
                 InProcessWakeups(),
-                FakeSearch(ids),
+                _FakeSearch(ids),
                 settings,
                 LocalhostAuthenticator(),
             )

@@ -123,23 +123,16 @@ def _encode_jpeg(image: Image.Image, quality: int) -> bytes:
     return buffer.getvalue()
 
 
-def multipart_form(photo: bytes, filename: str = "photo.jpg") -> bytes:
+def multipart_form(photo: bytes) -> bytes:
     """Build a multipart form with the photo as a unique file.
 
     Bytes after the end of the JPEG change its hash but no pixel.
     """
     head = (
-        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="file"; filename="{filename}"\r\n'
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="file"; filename="photo.jpg"\r\n'
         "Content-Type: image/jpeg\r\n\r\n"
     )
-    return b"".join(
-        (
-            head.encode(),
-            photo,
-            f"{next(_numbers):020d}".encode(),
-            f"\r\n--{BOUNDARY}--\r\n".encode(),
-        )
-    )
+    return head.encode() + photo + f"{next(_numbers):020d}\r\n--{BOUNDARY}--\r\n".encode()
 
 
 def multipart_forms(photos: Sequence[bytes], count: int) -> list[bytes]:

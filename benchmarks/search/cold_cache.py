@@ -48,8 +48,8 @@ def measure_cold_cache(
         params = BenchmarkQuery(number, MATCHED_CASE.k)
         ours.search(params)
         warm.append(_time_search(ours, params)[0])
-        drop_page_cache(snapshot, world)
-        cached.append(cached_share(snapshot))
+        _drop_page_cache(snapshot, world)
+        cached.append(_cached_share(snapshot))
         seconds, found = _time_search(ours, params)
         cold.append(seconds)
         differ += not same_ranking(found, oracle.best(number, MATCHED_CASE.k))
@@ -63,7 +63,7 @@ def measure_cold_cache(
     report.details["cold"] = {"warm_seconds": warm, "cold_seconds": cold, "cached": cached}
 
 
-def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
+def _drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
     """Drop the chunks' rows from the page cache."""
     for chunk in snapshot.chunks:
         assert chunk.stored is not None, "a loaded chunk is on disk"
@@ -73,7 +73,7 @@ def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def cached_share(snapshot: Snapshot) -> float:
+def _cached_share(snapshot: Snapshot) -> float:
     """Return the share of the rows' pages that are in memory."""
     libc = ctypes.CDLL(None, use_errno=True)
     cached_pages = pages = 0

@@ -18,7 +18,7 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.report import LatencySummary, Report
-from benchmarks.search.memory_traffic import MemoryBandwidth, private_bytes
+from benchmarks.search.memory_traffic import MemoryBandwidth
 from benchmarks.search.methods import (
     AnyLocSearch,
     BenchmarkQuery,
@@ -38,6 +38,7 @@ from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.codes.sign_codes import SignCodes, encode_signs
 from shared.storage.chunks import Rows
+from tests.support.memory import memory_bytes
 
 PLACEWISE_METHODS = (PlacewiseSearch.name, PlacewiseWorker.name)
 TARGET_MAP_SIZE = (10_000, 98_304)
@@ -183,9 +184,9 @@ def compare_methods(
     photos = len(world.photo_ids)
     query_rows = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
     oracle = BruteForce.of(_stored_rows(world), world.photo_ids, query_rows)
-    before = private_bytes()
+    before = memory_bytes("RssAnon")
     worker = load_worker(world)
-    grown = private_bytes() - before
+    grown = memory_bytes("RssAnon") - before
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
     draw = random.Random(city.seed)

@@ -1,4 +1,4 @@
-"""Measures memory bandwidth, the bytes that a search reads, and the memory of a process."""
+"""Measures memory bandwidth, and the bytes that a search reads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any, Self
 from unittest.mock import patch
@@ -120,11 +119,3 @@ def _distance_bytes(
 ) -> int:
     rows = np.count_nonzero(mask[..., begin:end].reshape(-1, end - begin).any(axis=0))
     return 8 * int(query.shape[-1]) * int(rows)
-
-
-def private_bytes() -> int:
-    """Return the private memory of this process, without the page cache of mapped files."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("RssAnon:"):
-            return 1024 * int(line.split()[1])
-    raise AssertionError("/proc/self/status has no RssAnon: this needs Linux")

@@ -5,6 +5,7 @@ The ground truth is brute force in float64.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,7 @@ class BenchmarkQuery:
 
 
 @dataclass(eq=False)
-class SearchMethod:
+class SearchMethod(ABC):
     """A compared search method over the rows of `photo_ids`, with (q, dimension) `queries`."""
 
     name: ClassVar[str]
@@ -113,8 +114,9 @@ class SearchMethod:
         """Size of the index, without the page cache of files."""
         return int(self.queries[0].nbytes) * len(self.photo_ids)
 
+    @abstractmethod
     def search(self, params: BenchmarkQuery) -> Ranking:
-        raise NotImplementedError
+        """Return the ranking of a query."""
 
     def bytes_touched(self, _params: BenchmarkQuery) -> int:
         """Return the number of bytes of codes and rows that the search reads."""
@@ -138,13 +140,13 @@ class PlacewiseSearch(SearchMethod):
         return self._resident_bytes
 
     def search(self, params: BenchmarkQuery) -> Ranking:
-        found = execute_query(
-            self._snapshot,
-            self.queries[params.query],
-            self._snapshot.photos.findable,
-            SearchOptions(params.k, params.min_score),
-            self._query_batcher,
-        )
+        options = SearchOptions(params.k, params.min_score)
+        return self.search_row(self.queries[params.query], options)
+
+    def search_row(self, query: Rows, options: SearchOptions) -> Ranking:
+        """Return the ranking of a (dimension,) row."""
+        findable = self._snapshot.photos.findable
+        found = execute_query(self._snapshot, query, findable, options, self._query_batcher)
         self.certificates.add(found.certificate)
         return [(hit.photo_id, hit.score) for hit in found.hits]
 

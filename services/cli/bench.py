@@ -6,10 +6,12 @@ benchmark that misses its target exits with code 1.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -17,8 +19,6 @@ from services.cli.output import JsonOption, print_json, print_table, progress_ba
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Run benchmarks on this machine.", no_args_is_help=True)
-
-DeviceOption = Annotated[str, typer.Option("--device", help="Device: auto, cpu or cuda.")]
 
 DEV_PACKAGES = (
     "benchmarks",
@@ -31,63 +31,86 @@ DEV_PACKAGES = (
 )
 
 
-@app.command("spine")
+def _parse_integers(text: str) -> list[int]:
+    try:
+        numbers = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a list of integers such as 1,2,4") from None
+    if numbers[0] < 1:
+        raise typer.BadParameter("numbers must be at least 1")
+    return numbers
+
+
+def _integers_option(help_text: str, *names: str) -> Any:
+    return typer.Option(
+        *names, help=f"{help_text}, comma-separated.", parser=_parse_integers, metavar="INTEGERS"
+    )
+
+
+BatchOption = Annotated[int, typer.Option(min=1, help="Maximum batch size.")]
+DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device.")]
+ExtractorOption = Annotated[str, typer.Option(help="Extractor name, with options as in EXTRACTOR.")]
+PlacesOption = Annotated[int, typer.Option(min=20, help="Number of places in the generated city.")]
+SimulatedWorkOption = Annotated[int, typer.Option(min=0, help="Simulated work per photo.")]
+
+
+def _benchmark(module: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register a command that passes its options to `benchmarks.MODULE.measure`.
+
+    The decorated function declares the options and the help.
+    """
+
+    def register(declaration: Callable[..., None]) -> Callable[..., None]:
+        @app.command(declaration.__name__.replace("_", "-"))
+        @functools.wraps(declaration)
+        def run(as_json: bool, **options: Any) -> None:
+            _run_benchmark(module, as_json, **options)
+
+        return run
+
+    return register
+
+
+@_benchmark("spine")
 def spine(
     photos: Annotated[int, typer.Option(min=2)] = 200,
     queries: Annotated[int, typer.Option(min=1)] = 50,
     as_json: JsonOption = False,
 ) -> None:
     """Measure upload, description and query latency of an embedded server."""
-    _run_benchmark("spine", as_json, photos=photos, queries=queries)
 
 
-@app.command("scaling")
+@_benchmark("scaling")
 def scaling(
-    workers: Annotated[
-        str, typer.Option(help="Numbers of extractor processes, comma-separated.")
-    ] = "1,2,4,8",
+    workers: Annotated[Any, _integers_option("Numbers of extractor processes")] = "1,2,4,8",
     photos: Annotated[int, typer.Option(min=1, help="Photos per extractor.")] = 60,
-    milliseconds: Annotated[int, typer.Option(min=0, help="Simulated work per photo.")] = 500,
-    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 4,
+    milliseconds: SimulatedWorkOption = 500,
+    batch: BatchOption = 4,
     as_json: JsonOption = False,
 ) -> None:
     """Measure how throughput scales with extractors, and check that no photo is done twice."""
-    numbers = _parse_integers(workers)
-    _run_benchmark(
-        "scaling", as_json, workers=numbers, photos=photos, milliseconds=milliseconds, batch=batch
-    )
 
 
-@app.command("pipeline")
+@_benchmark("pipeline")
 def pipeline(
-    widths: Annotated[
-        str, typer.Option(help="Descriptor dimensions, comma-separated.")
-    ] = "7168,98304",
+    widths: Annotated[Any, _integers_option("Descriptor dimensions")] = "7168,98304",
     photos: Annotated[int, typer.Option(min=1)] = 320,
-    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 32,
+    batch: BatchOption = 32,
     rounds: Annotated[int, typer.Option(min=1, help="Upload rounds per gateway.")] = 5,
     as_json: JsonOption = False,
 ) -> None:
     """Measure CPU time per photo outside the model, and upload throughput."""
-    _run_benchmark(
-        "pipeline",
-        as_json,
-        widths=_parse_integers(widths),
-        photos=photos,
-        batch=batch,
-        rounds=rounds,
-    )
 
 
-@app.command("extract")
+@_benchmark("extract")
 def extract(
-    extractor: Annotated[
-        str, typer.Option("--extractor", help="Extractor name, with options as in EXTRACTOR.")
-    ] = "anyloc-vits14",
+    extractor: ExtractorOption = "anyloc-vits14",
     photos: Annotated[int, typer.Option(min=1)] = 32,
     device: DeviceOption = "auto",
-    precision: Annotated[str, typer.Option(help="Precision: auto, float32 or bfloat16.")] = "auto",
-    batch: Annotated[str, typer.Option(help="Maximum batch sizes, comma-separated.")] = "16",
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"], typer.Option(help="Precision.")
+    ] = "auto",
+    batches: Annotated[Any, _integers_option("Maximum batch sizes", "--batch")] = "16",
     rounds: Annotated[int, typer.Option(min=1, help="Passes over all photos per method.")] = 3,
     as_json: JsonOption = False,
 ) -> None:
@@ -95,51 +118,25 @@ def extract(
 
     Without local weights, random weights are used, and the title of the report says so.
     """
-    _check_choice(device, "--device", "auto", "cpu", "cuda")
-    _check_choice(precision, "--precision", "auto", "float32", "bfloat16")
-    _run_benchmark(
-        "extract",
-        as_json,
-        extractor=extractor,
-        photos=photos,
-        device=device,
-        precision=precision,
-        batches=_parse_integers(batch),
-        rounds=rounds,
-    )
 
 
-@app.command("precision")
+@_benchmark("precision")
 def precision(
-    extractor: Annotated[
-        str, typer.Option("--extractor", help="Extractor name, with options as in EXTRACTOR.")
-    ] = "efficientnet-lite0-vlad",
+    extractor: ExtractorOption = "efficientnet-lite0-vlad",
     places: Annotated[
         int, typer.Option(min=2, help="Number of places in the generated city.")
     ] = 60,
     queries: Annotated[int, typer.Option(min=1)] = 60,
     device: DeviceOption = "auto",
-    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
+    batch: BatchOption = 16,
     as_json: JsonOption = False,
 ) -> None:
     """Compare patches, descriptors and recall in bfloat16 with those in float32."""
-    _check_choice(device, "--device", "auto", "cpu", "cuda")
-    _run_benchmark(
-        "precision",
-        as_json,
-        extractor=extractor,
-        places=places,
-        queries=queries,
-        device=device,
-        batch=batch,
-    )
 
 
-@app.command("train")
+@_benchmark("train")
 def train(
-    places: Annotated[
-        int, typer.Option(min=20, help="Number of places in the generated city.")
-    ] = 300,
+    places: PlacesOption = 300,
     epochs: Annotated[int, typer.Option(min=1)] = 20,
     image_size: Annotated[
         int, typer.Option(min=32, help="Image height and width in pixels.")
@@ -148,28 +145,14 @@ def train(
         int, typer.Option(min=64, help="Photos for the throughput measurement.")
     ] = 512,
     workers: Annotated[int, typer.Option(min=1, help="Data loader processes.")] = 2,
-    device: Annotated[
-        str, typer.Option("--device", help="Device: auto, cpu, gpu or mps.")
-    ] = "auto",
+    device: Annotated[Literal["auto", "cpu", "gpu", "mps"], typer.Option(help="Device.")] = "auto",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the city and the network.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Measure training throughput, data loading stalls and the recall that training achieves."""
-    _check_choice(device, "--device", "auto", "cpu", "gpu", "mps")
-    _run_benchmark(
-        "train",
-        as_json,
-        places=places,
-        epochs=epochs,
-        image_size=image_size,
-        photos=photos,
-        workers=workers,
-        device=device,
-        seed=seed,
-    )
 
 
-@app.command("estimates")
+@_benchmark("estimates")
 def estimates(
     folders: Annotated[
         list[Path] | None,
@@ -183,33 +166,22 @@ def estimates(
     as_json: JsonOption = False,
 ) -> None:
     """Measure how often place estimates answer, how often they are right, and their calibration."""
-    _run_benchmark("estimates", as_json, folders=folders, splits=splits)
 
 
-@app.command("query-latency")
+@_benchmark("query_latency")
 def query_latency(
     backlog: Annotated[int, typer.Option(min=1, help="Number of queued uploads.")] = 5000,
     seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 60,
-    milliseconds: Annotated[int, typer.Option(min=0, help="Simulated work per photo.")] = 50,
-    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
+    milliseconds: SimulatedWorkOption = 50,
+    batch: BatchOption = 16,
     as_json: JsonOption = False,
 ) -> None:
     """Measure query latency while thousands of uploads are queued."""
-    _run_benchmark(
-        "query_latency",
-        as_json,
-        backlog=backlog,
-        seconds=seconds,
-        milliseconds=milliseconds,
-        batch=batch,
-    )
 
 
-@app.command("rerank")
+@_benchmark("rerank")
 def rerank(
-    places: Annotated[
-        int, typer.Option(min=20, help="Number of places in the generated city.")
-    ] = 150,
+    places: PlacesOption = 150,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the city.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -217,16 +189,13 @@ def rerank(
 
     With PLACEWISE_TEST_DATA, also report the ranks of true places for real photos.
     """
-    _run_benchmark("rerank", as_json, places=places, seed=seed)
 
 
 @app.command("search")
 def search(
-    photos: Annotated[
-        str, typer.Option(help="Numbers of photos in the map, comma-separated.")
-    ] = "2000",
+    photos: Annotated[Any, _integers_option("Numbers of photos in the map")] = "2000",
     dimensions: Annotated[
-        str, typer.Option(help="Descriptor dimensions, multiples of 64, comma-separated.")
+        Any, _integers_option("Descriptor dimensions, multiples of 64")
     ] = "512,7168,98304",
     queries: Annotated[int, typer.Option(min=2, help="Queries of each kind.")] = 20,
     growth: Annotated[
@@ -254,8 +223,8 @@ def search(
     _run_benchmark(
         "search",
         as_json,
-        photos=_parse_integers("1000,5000,10000" if full else photos),
-        dimensions=_parse_integers(dimensions),
+        photos=[1000, 5000, 10_000] if full else photos,
+        dimensions=dimensions,
         queries=queries,
         growth=growth or full,
         load_seconds=load or (60.0 if full else 0.0),
@@ -263,7 +232,7 @@ def search(
     )
 
 
-@app.command("rivals")
+@_benchmark("rivals")
 def rivals(
     photos: Annotated[int, typer.Option(min=100, help="Number of photos in the map.")] = 10_000,
     dimension: Annotated[
@@ -288,18 +257,9 @@ def rivals(
 
     Requires more packages: uv pip install --group rivals
     """
-    _run_benchmark(
-        "rivals",
-        as_json,
-        photos=photos,
-        dimension=dimension,
-        pca=pca,
-        queries=queries,
-        folder=folder,
-    )
 
 
-@app.command("catalog")
+@_benchmark("catalog.command")
 def catalog(
     photos: Annotated[int, typer.Option(min=100_000, help="Number of rows to create.")] = 1_000_000,
     as_json: JsonOption = False,
@@ -308,10 +268,9 @@ def catalog(
 
     Creates a temporary database on the server of DATABASE_URL and drops it at the end.
     """
-    _run_benchmark("catalog.command", as_json, photos=photos)
 
 
-@app.command("chaos")
+@_benchmark("chaos")
 def chaos(
     photos: Annotated[
         int, typer.Option(min=30, help="Photos to upload while services are killed.")
@@ -321,16 +280,14 @@ def chaos(
     as_json: JsonOption = False,
 ) -> None:
     """Kill every service and server in turn; check that nothing is lost, duplicated or stuck."""
-    _run_benchmark("chaos", as_json, photos=photos, fault_seconds=fault_seconds, seed=seed)
 
 
-@app.command("rolling")
+@_benchmark("rolling")
 def rolling(as_json: JsonOption = False) -> None:
     """Restart every service in turn; check that no request fails and no job is lost."""
-    _run_benchmark("rolling", as_json)
 
 
-@app.command("slow-clients")
+@_benchmark("slow_clients")
 def slow_clients(
     seconds: Annotated[float, typer.Option(min=1, help="Duration of each phase.")] = 30,
     idle: Annotated[int, typer.Option(min=0, help="Number of idle connections.")] = 1100,
@@ -344,9 +301,6 @@ def slow_clients(
 
     The server's limit of open files is 1,024.
     """
-    _run_benchmark(
-        "slow_clients", as_json, seconds=seconds, idle=idle, bodies=bodies, streams=streams
-    )
 
 
 @app.command("scale")
@@ -412,18 +366,3 @@ def _load_benchmark(name: str) -> Any:
             f"`placewise bench {name}` requires a checkout of Placewise with the dev extra: "
             f"{error}. In the checkout, run make setup, then .venv/bin/placewise bench.",
         ) from error
-
-
-def _check_choice(value: str, option: str, *allowed: str) -> None:
-    if value not in allowed:
-        raise typer.BadParameter(f"{option} must be one of {', '.join(allowed)}, not {value!r}")
-
-
-def _parse_integers(text: str) -> list[int]:
-    try:
-        numbers = sorted({int(part) for part in text.split(",")})
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not a list of integers such as 1,2,4") from None
-    if numbers[0] < 1:
-        raise typer.BadParameter("numbers must be at least 1")
-    return numbers

@@ -12,9 +12,10 @@ from rich.progress import Progress
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
 from services.cli.environment import read_settings
+from services.cli.imports import collection_paused
 from services.cli.output import print_note
 from shared.config.embedded_home import RunningServer, find_running_server
-from shared.errors import Unavailable
+from shared.errors import Misconfigured, Unavailable
 
 START_TIMEOUT_SECONDS = 30.0
 
@@ -30,6 +31,7 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         key: API key. The server on PLACEWISE_HOME stores one there for the local user.
 
     Raises:
+        Misconfigured: `separate_services` if SEARCH_URLS is set and no server is named.
         Unavailable: `server_unreachable` if the embedded server does not start in time.
     """
     settings = read_settings()
@@ -40,11 +42,18 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         with Client(running_server.url, map_name, key or running_server.key) as client:
             yield client
         return
+    if settings.search_worker_urls:
+        raise Misconfigured(
+            "separate_services",
+            "SEARCH_URLS is set, so the command starts no server of its own. Name the gateway: "
+            "--server URL, or for example PLACEWISE_SERVER=http://127.0.0.1:8000.",
+        )
     print_note(
         f"No server runs on {settings.placewise_home}: starting one for this command. "
         "--server URL or PLACEWISE_HOME selects another."
     )
-    from services.standalone import run_standalone  # clients of a running server don't need it
+    with collection_paused():
+        from services.standalone import run_standalone  # clients of a running server don't need it
 
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
     with run_standalone(embedded_settings, lazy_extractor=True) as running:

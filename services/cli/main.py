@@ -54,7 +54,7 @@ COMMANDS = {
 }
 
 
-class PlacewiseGroup(TyperGroup):
+class _PlacewiseGroup(TyperGroup):
     """Reports the error of a command in one line, as JSON with `--json`, and exits with code 1."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -88,7 +88,7 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     return app
 
 
-def build_overview() -> typer.Typer:
+def _build_overview() -> typer.Typer:
     """Build the application for its own help: its commands do nothing.
 
     The help texts are read from the source, because importing all commands takes over a second.
@@ -113,17 +113,20 @@ def run() -> None:
     )
     names = sys.argv[1:2]
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
-        app = build_overview()
+        app = _build_overview()
     else:
+        from services.cli.imports import collection_paused
+
         # The suggestion of a similar name, for a typo, needs every command.
-        app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
+        with collection_paused():
+            app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
     app()
 
 
 def _new_app() -> typer.Typer:
     app = typer.Typer(
         name="placewise",
-        cls=PlacewiseGroup,
+        cls=_PlacewiseGroup,
         help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -89,6 +90,12 @@ def print_json(value: Any) -> None:
 def print_message(message: str) -> None:
     """Print a part of the answer to stdout, as it is: the terminal wraps it."""
     console.print(message, soft_wrap=True, markup=False)
+
+
+def program() -> str:
+    """Return how to run this program from any shell: with the PLACEWISE_HOME of this one."""
+    home = os.environ.get("PLACEWISE_HOME")
+    return f"PLACEWISE_HOME={shlex.quote(home)} {sys.argv[0]}" if home else sys.argv[0]
 
 
 def print_note(message: str) -> None:

@@ -125,7 +125,7 @@ def start_whitened_generation(
                 session,
                 job.map_id,
                 dimension=whitening_file.whitening.dimension,
-                kept=whitening_file.whitening.kept,
+                components=whitening_file.whitening.components,
                 rows=whitening_file.whitening.rows,
                 explained=whitening_file.whitening.explained,
                 object_key=key,

@@ -57,7 +57,7 @@ from shared.storage.keys import comparison_key, local_features_key, query_key
 log = logging.getLogger(__name__)
 
 
-class CandidateFeatures:
+class _CandidateFeatures:
     """Computes candidates' local features, and stores them with LOCAL_FEATURES=keep.
 
     Stored features are the objects under `features/`.
@@ -186,7 +186,7 @@ class ComparisonRunner:
         self._store = store
         self._models = models
         self._decoders = decoders
-        self._candidates = CandidateFeatures(store, decoders, settings)
+        self._candidates = _CandidateFeatures(store, decoders, settings)
 
     def prepare(self, job: Job) -> PreparedComparison:
         """Resolve the generation and decode the query; PlacewiseError if the job can't be done."""

@@ -204,7 +204,7 @@ class VocabularyFitJob:
         return PatchStore(self._store, job_work_key(job.id, "patches-"), extractor.backbone.width)
 
 
-class VocabularySwitchJob:
+class _VocabularySwitchJob:
     """Switches a map to an imported or stored vocabulary; one step each."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
@@ -315,7 +315,7 @@ class ModelChangeRunner:
         settings: Settings,
     ) -> None:
         self._fit = VocabularyFitJob(catalog, store, models, decoders, settings)
-        self._switch = VocabularySwitchJob(catalog, store, models)
+        self._switch = _VocabularySwitchJob(catalog, store, models)
         self._pca = PcaFitJob(catalog, store, models)
         self._add = ModelImporter(catalog, store, model_cache_folder(settings))
 

@@ -64,7 +64,7 @@ def read_stored_rows(
     return rows
 
 
-def read_rows_to_project(
+def _read_rows_to_project(
     catalog: Catalog, store: ObjectStore, jobs: list[Job], target: ResolvedGeneration
 ) -> tuple[list[Job], Rows] | None:
     """Return REINDEX jobs into a generation with PCA, and their unprojected (jobs, dimension) rows.
@@ -146,11 +146,11 @@ def prepare_batch(
 
     Query photos get a preview if their format is one that not all browsers show.
 
-    Where possible, stored rows are read instead (`read_rows_to_project`).
+    Where possible, stored rows are read instead (`_read_rows_to_project`).
     """
     batch = DescribeBatch(jobs=jobs, target=target)
     started = time.perf_counter()
-    rows_to_project = read_rows_to_project(catalog, store, jobs, target)
+    rows_to_project = _read_rows_to_project(catalog, store, jobs, target)
     if rows_to_project is not None:
         batch.ready, batch.stored_rows = rows_to_project
         batch.deleted = [job for job in jobs if job not in batch.ready]

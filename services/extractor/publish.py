@@ -24,7 +24,7 @@ from shared.catalog.photos import get_live_photos
 from shared.ids import new_id
 from shared.jobs import JobKind
 from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.trace_context import distinct_request_ids
+from shared.jobs.runner import distinct_request_ids
 from shared.jobs.transitions import cancel_job, fail_job, release_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, encode_rows, write_chunk

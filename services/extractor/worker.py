@@ -47,8 +47,7 @@ from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind, Wait
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
-from shared.jobs.runner import ClaimedJobs, JobRunner
-from shared.jobs.trace_context import job_trace_context
+from shared.jobs.runner import ClaimedJobs, JobRunner, job_trace_context
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows
@@ -60,7 +59,7 @@ QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is d
 
 
 @dataclass(slots=True)
-class ExtractorBatch(ClaimedJobs):
+class _ExtractorBatch(ClaimedJobs):
     """Claimed jobs, and the pending decoding of their photos."""
 
     preparation: Future[DescribeBatch | PreparedComparison | None] | None = None
@@ -164,10 +163,10 @@ class ExtractorWorker:
         return result
 
     def _drain(
-        self, first: ExtractorBatch, stop: threading.Event, until: float, result: DrainStats
+        self, first: _ExtractorBatch, stop: threading.Event, until: float, result: DrainStats
     ) -> None:
-        current: ExtractorBatch | None = None
-        upcoming: ExtractorBatch | None = first
+        current: _ExtractorBatch | None = None
+        upcoming: _ExtractorBatch | None = first
 
         def out_of_time() -> bool:
             return stop.is_set() or time.monotonic() > until
@@ -199,7 +198,7 @@ class ExtractorWorker:
             self._wait_for_publish(result)
 
     def _process_in_order(
-        self, work: ExtractorBatch, result: DrainStats, stop: threading.Event
+        self, work: _ExtractorBatch, result: DrainStats, stop: threading.Event
     ) -> None:
         if _runs_exclusively(work):
             self._wait_for_publish(result)
@@ -239,7 +238,7 @@ class ExtractorWorker:
 
     def _claim_next(
         self, result: DrainStats, min_priority: int | None = None, *, alone: bool = True
-    ) -> ExtractorBatch | None:
+    ) -> _ExtractorBatch | None:
         self._heartbeat.beat()  # for each batch: a drain may last for several
         claimed = self._runner.claim(
             self._settings.batch_photos, min_priority, alone=alone, started=False
@@ -250,7 +249,7 @@ class ExtractorWorker:
         self._metrics.observe_claim(claimed.kind, len(jobs))
         result.claimed += len(jobs)
         result.maps.add(str(jobs[0].map_id))
-        work = ExtractorBatch(jobs, claimed.lease)
+        work = _ExtractorBatch(jobs, claimed.lease)
         if claimed.kind == JobKind.COMPARE:
             work.preparation = self._prepare_executor.submit(self._comparisons.prepare, jobs[0])
         elif claimed.kind not in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS):
@@ -266,7 +265,7 @@ class ExtractorWorker:
 
     def _process(
         self,
-        work: ExtractorBatch,
+        work: _ExtractorBatch,
         result: DrainStats,
         concurrent_jobs: int = 0,
         *,
@@ -291,7 +290,7 @@ class ExtractorWorker:
             )
 
     def _describe_claimed(
-        self, work: ExtractorBatch, result: DrainStats, concurrent_jobs: int
+        self, work: _ExtractorBatch, result: DrainStats, concurrent_jobs: int
     ) -> Rows | None:
         """Return a row for each job of the batch's `ready`; None if there is nothing to publish."""
         with self._step(work, "describe", result):
@@ -316,12 +315,12 @@ class ExtractorWorker:
         return None  # the failure has been handled
 
     @contextlib.contextmanager
-    def _step(self, work: ExtractorBatch, name: str, result: DrainStats) -> Iterator[None]:
+    def _step(self, work: _ExtractorBatch, name: str, result: DrainStats) -> Iterator[None]:
         with self._runner.step(work, name):
             yield
         result.failed += work.failed
 
-    def _publish(self, work: ExtractorBatch, rows: Rows, result: DrainStats) -> None:
+    def _publish(self, work: _ExtractorBatch, rows: Rows, result: DrainStats) -> None:
         with self._step(work, "publish", result):
             batch = work.preparation.result() if work.preparation else None
             assert isinstance(batch, DescribeBatch), "only described batches are published"
@@ -330,7 +329,7 @@ class ExtractorWorker:
 
     def _record_outcome(
         self,
-        work: ExtractorBatch,
+        work: _ExtractorBatch,
         result: DrainStats,
         outcome: PublishResult,
         seconds: dict[str, float],
@@ -338,7 +337,7 @@ class ExtractorWorker:
         result.add_batch(outcome, seconds)
         self._metrics.observe_batch(work.kind, outcome, seconds)
 
-    def _publish_in_background(self, work: ExtractorBatch, rows: Rows) -> DrainStats:
+    def _publish_in_background(self, work: _ExtractorBatch, rows: Rows) -> DrainStats:
         result = DrainStats()
         with work.lease:
             self._publish(work, rows, result)
@@ -350,7 +349,7 @@ class ExtractorWorker:
         if pending is not None:
             result.merge(pending.result())
 
-    def _mark_begun(self, work: ExtractorBatch, concurrent_jobs: int = 0) -> None:
+    def _mark_begun(self, work: _ExtractorBatch, concurrent_jobs: int = 0) -> None:
         """Record that jobs have started: from here on a crash may be caused by a photo.
 
         Decoding runs in other processes and is finished.
@@ -359,11 +358,11 @@ class ExtractorWorker:
             mark_started(session, work.token, len(work.jobs) + concurrent_jobs)
 
 
-def _is_query(work: ExtractorBatch) -> bool:
+def _is_query(work: _ExtractorBatch) -> bool:
     return work.jobs[0].priority >= Priority.QUERY
 
 
-def _runs_exclusively(work: ExtractorBatch) -> bool:
+def _runs_exclusively(work: _ExtractorBatch) -> bool:
     """Whether nothing may run concurrently, so that a crash can be attributed to the job.
 
     Steps of model changes come as a batch of one job and run exclusively, too.

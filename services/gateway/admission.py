@@ -43,7 +43,7 @@ UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
 
 
-class ConcurrencyLimit:
+class _ConcurrencyLimit:
     """Limits concurrent requests of one kind. Must be used on the event loop only."""
 
     def __init__(
@@ -122,7 +122,7 @@ class AdmissionControl:
         self._queue_depth = PolledValue(self._measure_queue_depth, ADMISSION_POLL_SECONDS)
         self._admitted: Counter[str | None] = Counter()  # since the last poll; None: queries
         self._active_uploads = {
-            kind: ConcurrencyLimit(
+            kind: _ConcurrencyLimit(
                 f"{kind} (MAX_CONCURRENT_UPLOADS, MAX_CONCURRENT_UPLOADS_PER_CALLER)",
                 "too_many_uploads",
                 total=settings.max_concurrent_uploads,
@@ -131,7 +131,7 @@ class AdmissionControl:
             )
             for kind in UploadKind
         }
-        self.event_streams = ConcurrencyLimit(
+        self.event_streams = _ConcurrencyLimit(
             "event streams (MAX_EVENT_STREAMS, MAX_EVENT_STREAMS_PER_CALLER)",
             "too_many_event_streams",
             total=settings.max_event_streams,
@@ -221,13 +221,13 @@ class AdmissionControl:
             return measure_queue_depth(session, limit)
 
 
-async def get_admission_control(request: Request) -> AdmissionControl:
+async def _get_admission_control(request: Request) -> AdmissionControl:
     """Dependency that returns the admission control of the application."""
     admission: AdmissionControl = request.app.state.admission
     return admission
 
 
-AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
+AdmissionDep = Annotated[AdmissionControl, Depends(_get_admission_control)]
 
 
 # These read `app.state` instead of declaring what they use: FastAPI resolves each dependency of a

@@ -304,9 +304,9 @@ async def _require_scope(
     if missing:
         raise Forbidden(
             "scope_missing",
-            f"This request needs a key with the scope {', '.join(sorted(missing))}; yours has "
-            f"{', '.join(sorted(caller.scopes))}. An admin can create one with "
-            "placewise keys create.",
+            f"This request needs the scope {', '.join(sorted(missing))}; the caller has "
+            f"{', '.join(sorted(caller.scopes)) or 'none'}. An admin can create a key with it "
+            "(placewise keys create), or grant it to users that a proxy signs in (SIGN_IN_SCOPES).",
             needed=sorted(missing),
         )
     # Each request selects its map by the query parameter, except those of /maps, which check it

@@ -245,7 +245,7 @@ class GatewayContext:
         )
 
 
-async def get_gateway_context(request: Request) -> GatewayContext:
+async def _get_gateway_context(request: Request) -> GatewayContext:
     gateway: GatewayContext = request.app.state.gateway
     return gateway
 
@@ -331,7 +331,7 @@ NO_PARAMETERS = Depends(_accept_no_parameters)
 """Dependency of endpoints that use no query parameters."""
 ALL_MAPS = Depends(_require_all_maps)
 """Dependency of endpoints about no map or all maps: keys for some maps are refused."""
-GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
+GatewayDep = Annotated[GatewayContext, Depends(_get_gateway_context)]
 FileId = Annotated[UUID, _uuid_or_not_found("photo")]
 UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
 JobId = Annotated[UUID, _uuid_or_not_found("job")]

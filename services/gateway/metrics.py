@@ -34,7 +34,7 @@ COUNTED_STATES = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
-class JobCount:
+class _JobCount:
     """Number of jobs of one kind in one state, and the age of the oldest.
 
     The state `waiting` is added for queued jobs that no worker may claim yet.
@@ -46,7 +46,7 @@ class JobCount:
     oldest_seconds: float
 
 
-def count_jobs(session: Session) -> list[JobCount]:
+def count_jobs(session: Session) -> list[_JobCount]:
     """Count the jobs of all maps by kind and state.
 
     Succeeded jobs, by far the most, are excluded, so that the index on (map, state) is used.
@@ -59,7 +59,7 @@ def count_jobs(session: Session) -> list[JobCount]:
         .order_by(Job.kind, state)
     )
     return [
-        JobCount(kind, counted_state, count, max(0.0, (now - oldest).total_seconds()))
+        _JobCount(kind, counted_state, count, max(0.0, (now - oldest).total_seconds()))
         for kind, counted_state, count, oldest, now in rows
     ]
 
@@ -122,7 +122,7 @@ class _LoadCollector(Collector):
         self._job_counts = PolledValue(self._count_jobs, QUEUE_POLL_SECONDS)
         self._admission = admission
 
-    def _count_jobs(self) -> Sequence[JobCount] | None:
+    def _count_jobs(self) -> Sequence[_JobCount] | None:
         """Count the jobs; None while the catalog is unreachable."""
         try:
             with self._catalog.read() as session:

@@ -23,7 +23,7 @@ MAX_USER_CHARACTERS = 200
 
 
 @dataclass(frozen=True, slots=True)
-class ProxySignIn:
+class _ProxySignIn:
     """Authenticates users whom a trusted proxy has signed in; others as `keys` does."""
 
     keys: Authenticator
@@ -87,7 +87,7 @@ def with_proxy_sign_in(keys: Authenticator, settings: Settings) -> Authenticator
     """Return an authenticator that also accepts users of SIGN_IN_PROXIES, if that is set."""
     if not settings.sign_in_networks:
         return keys
-    return ProxySignIn(
+    return _ProxySignIn(
         keys,
         tuple(map(ip_network, settings.sign_in_networks)),
         settings.sign_in_user_header,

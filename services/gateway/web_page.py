@@ -47,7 +47,7 @@ CACHE_CONTROL = "no-cache"
 
 
 @dataclass(frozen=True)
-class StaticAsset:
+class _StaticAsset:
     """A static file."""
 
     suffix: str
@@ -85,11 +85,11 @@ class StaticAsset:
         )
 
 
-def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
+def _load_assets(folder: Path) -> Iterator[tuple[str, _StaticAsset]]:
     """Yield the files below `folder` with a suffix in MEDIA_TYPES, with their relative paths."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in MEDIA_TYPES:
-            yield path.relative_to(folder).as_posix(), StaticAsset(path.suffix, path.read_bytes())
+            yield path.relative_to(folder).as_posix(), _StaticAsset(path.suffix, path.read_bytes())
 
 
 def _accepts_gzip(request: Request) -> bool:
@@ -120,7 +120,7 @@ def create_web_page_router(settings: Settings, lan_url: str | None = None) -> AP
     """
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
-    assets["settings.json"] = StaticAsset(
+    assets["settings.json"] = _StaticAsset(
         ".json", json.dumps(_page_settings(settings, lan_url)).encode()
     )
 
@@ -202,12 +202,12 @@ def _page_headers(settings: Settings) -> dict[str, str]:
 
 
 @functools.cache
-def _load_page_assets() -> dict[str, StaticAsset]:
+def _load_page_assets() -> dict[str, _StaticAsset]:
     """All assets by their URL path below ASSET_PREFIX."""
-    assets = dict(load_assets(PAGE_FOLDER))
+    assets = dict(_load_assets(PAGE_FOLDER))
     for url_folder, package, package_folder, names in VENDORED_PACKAGES:
         source = Path(str(files(package))) / package_folder
         for name in names:
             file = source / name
-            assets[f"{url_folder}/{name}"] = StaticAsset(file.suffix, file.read_bytes())
+            assets[f"{url_folder}/{name}"] = _StaticAsset(file.suffix, file.read_bytes())
     return assets

@@ -48,14 +48,14 @@ SYNCED_STATES = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
 
 @dataclass(frozen=True, slots=True)
-class GenerationVersion:
+class _GenerationVersion:
     """State of a generation to sync, and the current version of its map."""
 
     version: int
     state: GenerationState
 
 
-def read_generation_versions(catalog: Catalog) -> dict[UUID, GenerationVersion]:
+def read_generation_versions(catalog: Catalog) -> dict[UUID, _GenerationVersion]:
     """Read the versions of all generations to sync."""
     with catalog.read() as session:
         rows = session.execute(
@@ -64,7 +64,7 @@ def read_generation_versions(catalog: Catalog) -> dict[UUID, GenerationVersion]:
             .where(Generation.state.in_(SYNCED_STATES), Map.deleted_at.is_(None))
         )
         return {
-            id_: GenerationVersion(version, GenerationState(state)) for id_, version, state in rows
+            id_: _GenerationVersion(version, GenerationState(state)) for id_, version, state in rows
         }
 
 
@@ -201,11 +201,11 @@ class ReplicationLagTracker:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._current: dict[UUID, GenerationVersion] = {}
+        self._current: dict[UUID, _GenerationVersion] = {}
         self._synced_at: dict[UUID, float] = {}
         self._catalog_read_at: float | None = None
 
-    def record_catalog_read(self, current: Mapping[UUID, GenerationVersion], at: float) -> None:
+    def record_catalog_read(self, current: Mapping[UUID, _GenerationVersion], at: float) -> None:
         """Record the generations and versions that the catalog had at `at` (monotonic seconds)."""
         with self._lock:
             self._catalog_read_at = at

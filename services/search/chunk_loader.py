@@ -45,7 +45,7 @@ MMAP_OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MappedFile:
+class _MappedFile:
     """A memory-mapped file, which may be deleted or replaced while it is mapped."""
 
     memory: mmap.mmap
@@ -90,7 +90,7 @@ class MappedFileCache:
         self._store = store
         self._folder = folder
 
-    def map_object(self, key: str, sha256: str) -> MappedFile:
+    def map_object(self, key: str, sha256: str) -> _MappedFile:
         """Map an object whose hash is verified: at the download, or now for a file-based store.
 
         Raises:
@@ -106,7 +106,7 @@ class MappedFileCache:
             raise chunk_corrupt_error(key)
         return mapped
 
-    def _cached(self, key: str, sha256: str) -> MappedFile:
+    def _cached(self, key: str, sha256: str) -> _MappedFile:
         """Map the object from the cache; a damaged copy is downloaded again."""
         name = f"{sha256}.npy"
         downloaded = False
@@ -124,7 +124,7 @@ class MappedFileCache:
         self.evict(name)
         return self.map_or_create(name, download)
 
-    def map_or_create(self, name: str, make: Callable[[Path], None]) -> MappedFile:
+    def map_or_create(self, name: str, make: Callable[[Path], None]) -> _MappedFile:
         """Map the file of this name in the folder; `make` writes it if it does not exist.
 
         The file is created atomically and durably: it never exists in part, even after a power
@@ -162,9 +162,9 @@ class MappedFileCache:
             raise chunk_corrupt_error(key)
 
 
-def _map_file(descriptor: int, path: Path) -> MappedFile:
+def _map_file(descriptor: int, path: Path) -> _MappedFile:
     memory = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **MMAP_OPTIONS)
-    return MappedFile(memory, path, os.fstat(descriptor))
+    return _MappedFile(memory, path, os.fstat(descriptor))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +183,7 @@ class LoadedChunk:
     """Int8 codes; None while they are not in use."""
 
     def was_changed(self) -> bool:
-        """Whether its mapped file was changed; see `MappedFile.was_changed`."""
+        """Whether its mapped file was changed; see `_MappedFile.was_changed`."""
         return self.stored is not None and self.stored.file.was_changed()
 
     def prefetch_row(self, row: int) -> None:
@@ -198,7 +198,7 @@ class LoadedChunk:
 class StoredChunk:
     """A chunk's memory-mapped files."""
 
-    file: MappedFile
+    file: _MappedFile
     rows: StoredRows
     sha256: str
     codes: SignCodes | None = None

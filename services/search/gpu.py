@@ -67,7 +67,7 @@ class GpuQuery:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GpuChunk:
+class _GpuChunk:
     """A chunk's rows in GPU memory."""
 
     numbers: torch.Tensor
@@ -169,7 +169,7 @@ class GpuDevice:
             raise GpuError(str(error)) from error
         return GpuSnapshot(self.torch_device, gpu_chunks)
 
-    def _copy_as_float16(self, rows: StoredRows) -> GpuChunk:
+    def _copy_as_float16(self, rows: StoredRows) -> _GpuChunk:
         parts, part_terms = _partial_sum_layout(rows.shape[1])
         numbers = torch.zeros(
             (_round_up(len(rows), ROWS_ALIGNED), parts * part_terms),
@@ -188,13 +188,13 @@ class GpuDevice:
             stored = scaled.double() / FLOAT16_SCALE
             errors[begin:end] = (block.double() - stored).norm(dim=1)
             lengths[begin:end] = stored.norm(dim=1)
-        return GpuChunk(numbers, errors, lengths)
+        return _GpuChunk(numbers, errors, lengths)
 
 
 class GpuSnapshot:
     """A snapshot's rows in GPU memory; immutable. The memory is freed with its last reference."""
 
-    def __init__(self, torch_device: torch.device, chunks: Mapping[UUID, GpuChunk]) -> None:
+    def __init__(self, torch_device: torch.device, chunks: Mapping[UUID, _GpuChunk]) -> None:
         self.chunks = chunks
         """Chunks by id, in the snapshot's order."""
         self.failure: str | None = None
@@ -237,7 +237,7 @@ def _select_candidates(query: GpuQuery, scores: torch.Tensor, bounds: torch.Tens
 
 
 def _score_all_rows(
-    chunks: Sequence[GpuChunk],
+    chunks: Sequence[_GpuChunk],
     queries: NDArray[np.float32],
     torch_device: torch.device,
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -285,7 +285,7 @@ def _float16_query_columns(
     return columns, np.linalg.norm(unit - restored, axis=1), 1.001 * part_terms * ACCUMULATION_ERROR
 
 
-def _float16_products(chunk: GpuChunk, columns: torch.Tensor) -> torch.Tensor:
+def _float16_products(chunk: _GpuChunk, columns: torch.Tensor) -> torch.Tensor:
     """Products (rows, columns) in float64, of partial sums in float32."""
     parts = -(-columns.shape[1] // PARTIAL_SUM_TERMS)
     rows = chunk.numbers.view(len(chunk.numbers), parts, -1).transpose(0, 1)

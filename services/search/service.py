@@ -92,7 +92,7 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
         An unreadable chunk makes the worker `degraded`; it still answers with the other chunks,
         because a restart would not help.
         """
-        readiness = check_readiness(worker)
+        readiness = _check_readiness(worker)
         response.status_code = 503 if readiness.reasons else 200
         return readiness
 
@@ -104,7 +104,7 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     return app
 
 
-def check_readiness(worker: SearchWorker) -> Readiness:
+def _check_readiness(worker: SearchWorker) -> Readiness:
     """Compute the readiness; a generation that is being built may lag, as no query uses it yet."""
     status = worker.status()
     reasons = []

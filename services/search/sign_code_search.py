@@ -66,7 +66,7 @@ class SignCodeBlocks(RowBlocks):
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> SignCodeBlocks:
-        """Create them from chunks that all have sign codes."""
+        """Collect the sign codes of chunks; ValueError if a chunk has none."""
         codes = [chunk.codes for chunk in chunks if chunk.codes is not None]
         if len(codes) < len(chunks):
             raise ValueError("a chunk has no sign codes")

@@ -85,7 +85,7 @@ class QueryRowReader:
         if chunk is None:
             return self._read_cached(request.object_key, request.row)
         if request.row >= len(chunk.rows):
-            raise reference_expired_error(f"row {request.row} of {request.object_key}")
+            raise _reference_expired_error(f"row {request.row} of {request.object_key}")
         row: Row = chunk.rows[request.row].astype(np.float32)
         return row
 
@@ -117,9 +117,9 @@ class QueryRowReader:
         try:
             loaded = read_row(self._store, object_key, row)
         except NotFound:
-            raise reference_expired_error(f"descriptor {object_key}") from None
+            raise _reference_expired_error(f"descriptor {object_key}") from None
         except IndexError:
-            raise reference_expired_error(f"row {row} of {object_key}") from None
+            raise _reference_expired_error(f"row {row} of {object_key}") from None
         except ValueError as error:
             raise _unreadable_error(object_key) from error
         if object_key.startswith(QUERIES):
@@ -131,7 +131,7 @@ class QueryRowReader:
         return loaded
 
 
-def reference_expired_error(what: str) -> Gone:
+def _reference_expired_error(what: str) -> Gone:
     """Error for a query reference whose row, object or generation no longer exists."""
     return Gone("query_expired", f"The {what} no longer exists. Query with the photo again.")
 
@@ -287,7 +287,7 @@ class SearchWorker:
                 return snapshot
             snapshot = self._sync_generation(generation_id, min_version)
             if snapshot is None:
-                raise reference_expired_error(f"generation {generation_id}")
+                raise _reference_expired_error(f"generation {generation_id}")
             if snapshot.version >= min_version:
                 return snapshot
             if time.monotonic() > deadline:

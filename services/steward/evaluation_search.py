@@ -1,6 +1,6 @@
 """Search client of evaluations: ranks a map's own geotagged photos through the search tier.
 
-Also the index of geotagged photos, which tells how many of them show a given place.
+Also the index of geotagged photos, which counts those that show a given place.
 """
 
 from __future__ import annotations

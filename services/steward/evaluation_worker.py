@@ -37,7 +37,7 @@ from shared.word_weights.record import parse_word_weights
 PROGRESS_INTERVAL_SECONDS = 0.5  # between two updates of the job's progress
 
 
-class EvaluationProgress:
+class _EvaluationProgress:
     """Progress and cancellation of one claimed job, counted in searches."""
 
     def __init__(self, catalog: Catalog, job: Job, stop: threading.Event) -> None:
@@ -108,7 +108,7 @@ class EvaluationWorker:
         return self._runner.run_next(lambda job: self._run_job(job, stop))
 
     def _run_job(self, job: Job, stop: threading.Event) -> None:
-        progress = EvaluationProgress(self._catalog, job, stop)
+        progress = _EvaluationProgress(self._catalog, job, stop)
         with self._catalog.read() as session:
             generation = active_generation(session, job.map_id)
             if generation is None:
@@ -135,7 +135,7 @@ class EvaluationWorker:
         generation: Generation,
         searchable: int,
         evaluation: MapEvaluation,
-        progress: EvaluationProgress,
+        progress: _EvaluationProgress,
     ) -> None:
         record = parse_word_weights(generation.word_weights)
         weights = record.applied if record else ()
@@ -181,7 +181,7 @@ class EvaluationWorker:
         words: int,
         searchable: int,
         evaluation: MapEvaluation,
-        progress: EvaluationProgress,
+        progress: _EvaluationProgress,
     ) -> None:
         if job.params["generation_id"] != str(generation.id):
             raise Conflict(

@@ -101,7 +101,7 @@ class QueryOutcome:
 
 
 @dataclass(slots=True)
-class LabelledQueryMetrics:
+class _LabelledQueryMetrics:
     """Metrics over all labelled queries of an evaluation."""
 
     recall: RecallCounter = field(default_factory=RecallCounter)
@@ -300,7 +300,7 @@ class MapEvaluation:
         self,
         sample: Sequence[GeotaggedPhoto],
         own_photos: OwnPhotoSampler,
-        labelled: LabelledQueryMetrics,
+        labelled: _LabelledQueryMetrics,
     ) -> PlaceEvaluation:
         """Fit the probabilities of the levels, and measure them by cross-validation."""
         photos = [self._index_of[photo.photo_id] for photo in sample]
@@ -323,8 +323,8 @@ class MapEvaluation:
 
     def _evaluate_labelled_queries(
         self, calibration: Calibration, rank_photo: RankPhoto
-    ) -> LabelledQueryMetrics:
-        labelled = LabelledQueryMetrics()
+    ) -> _LabelledQueryMetrics:
+        labelled = _LabelledQueryMetrics()
         for query in self.queries:
             ranking = rank_photo(query, EVIDENCE_DEPTH)
             self.on_query()

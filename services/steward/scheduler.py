@@ -8,15 +8,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import BinaryIO
+from typing import Any, cast
 
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.steward.batches.worker import resume_batches
+from services.steward.batches.worker import cancel_items_of_ended_batches, resume_batches
 from services.steward.metrics import StewardMetrics
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_small_chunks
@@ -49,50 +48,25 @@ from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.protocol import ObjectInfo, ObjectWriter
 from shared.storage.read_retries import ReadRetries
 from shared.telemetry.heartbeat import Heartbeat
 
 log = logging.getLogger(__name__)
 
 
-class DeletionCountingStore:
-    """Wraps an object store and calls `on_delete` after each deletion."""
+class _DeletionCountingStore:
+    """Forwards to an object store and calls `on_delete` after each deletion."""
 
     def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:
         self._store = store
         self._on_delete = on_delete
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._store, name)
+
     def delete(self, key: str) -> None:
         self._store.delete(key)
         self._on_delete()
-
-    def writer(self, key: str) -> ObjectWriter:
-        return self._store.writer(key)
-
-    def put(self, key: str, data: bytes) -> None:
-        self._store.put(key, data)
-
-    def get(self, key: str) -> bytes:
-        return self._store.get(key)
-
-    def open(self, key: str) -> BinaryIO:
-        return self._store.open(key)
-
-    def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
-        return self._store.read_range(key, begin, size_bytes)
-
-    def file(self, key: str) -> Path | None:
-        return self._store.file(key)
-
-    def head(self, key: str) -> ObjectInfo | None:
-        return self._store.head(key)
-
-    def list(self, prefix: str) -> Iterator[ObjectInfo]:
-        return self._store.list(prefix)
-
-    def check(self) -> None:
-        self._store.check()
 
 
 SCHEDULER_TICK_SECONDS = 0.25
@@ -141,8 +115,9 @@ class Scheduler:
         merge_retries = ReadRetries()
         queued_chunks: QueuedChunks = {}
 
-        def counted(task: str) -> DeletionCountingStore:
-            return DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
+        def counted(task: str) -> ObjectStore:
+            counting = _DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
+            return cast("ObjectStore", counting)
 
         # On the disk of the SQLite file; PostgreSQL reserves its own space.
         catalog_file = sqlite_file(catalog)
@@ -171,6 +146,11 @@ class Scheduler:
                 "cancel jobs of ended model changes",
                 0.5,
                 lambda: cancel_jobs_of_abandoned_generations(catalog),
+            ),
+            PeriodicTask(
+                "cancel photos of ended batches",
+                1.0,
+                lambda: cancel_items_of_ended_batches(catalog),
             ),
             PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),

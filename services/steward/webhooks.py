@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 from uuid import UUID
 
 import httpcore2
-from sqlalchemy import ColumnElement, select, update
+from sqlalchemy import ColumnElement, exists, select, update
 from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database.base import db_now, db_now_plus
@@ -60,7 +60,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class DeliveryAttempt:
+class _DeliveryAttempt:
     """The result of an attempt."""
 
     status: int | None
@@ -71,7 +71,7 @@ class DeliveryAttempt:
     """The address is not allowed: a retry would fail, too."""
 
 
-class PinnedBackend(httpcore2.AnyIOBackend):
+class _PinnedBackend(httpcore2.AnyIOBackend):
     """Connects to one IP address, whatever the host name; TLS still verifies the host name."""
 
     def __init__(self, address: str) -> None:
@@ -91,9 +91,9 @@ class PinnedBackend(httpcore2.AnyIOBackend):
             await self._stream.aclose()
 
 
-async def send_webhook(
+async def _send_webhook(
     webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, *, allow_private: bool
-) -> DeliveryAttempt:
+) -> _DeliveryAttempt:
     """Send the delivery once, within ATTEMPT_SECONDS.
 
     Redirects are not followed, and the proxies of the environment are not used. Network errors and
@@ -103,18 +103,18 @@ async def send_webhook(
         async with asyncio.timeout(ATTEMPT_SECONDS):
             status = await _post(webhook, delivery, tls, allow_private)
     except PlacewiseError as error:
-        return DeliveryAttempt(
+        return _DeliveryAttempt(
             None, error.detail, is_permanent=error.code != "webhook_name_unknown"
         )
     except TimeoutError:
-        return DeliveryAttempt(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
+        return _DeliveryAttempt(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
     except (OSError, ValueError, *HTTP_ERRORS) as error:
-        return DeliveryAttempt(None, f"{type(error).__name__}: {error}"[:500])
+        return _DeliveryAttempt(None, f"{type(error).__name__}: {error}"[:500])
     if 200 <= status < 300:
-        return DeliveryAttempt(status, None)
+        return _DeliveryAttempt(status, None)
     if 300 <= status < 400:
-        return DeliveryAttempt(status, f"answered HTTP {status}: redirects are not followed")
-    return DeliveryAttempt(status, f"answered HTTP {status}")
+        return _DeliveryAttempt(status, f"answered HTTP {status}: redirects are not followed")
+    return _DeliveryAttempt(status, f"answered HTTP {status}")
 
 
 async def _post(
@@ -122,7 +122,7 @@ async def _post(
 ) -> int:
     """Send the request and return the response's status; its body is not read."""
     target = parse_webhook_url(webhook.url, allow_private=allow_private)
-    address = await in_daemon_thread(
+    address = await _in_daemon_thread(
         lambda: resolve_webhook_target(target, allow_private=allow_private)
     )
     message_id, timestamp = f"msg_{delivery.event_id}", int(time.time())  # an id for all attempts
@@ -138,7 +138,7 @@ async def _post(
     url = httpcore2.URL(
         scheme=target.scheme, host=target.host, port=target.port, target=target.path
     )
-    backend = PinnedBackend(address)
+    backend = _PinnedBackend(address)
     async with (
         contextlib.aclosing(backend),
         httpcore2.AsyncConnectionPool(ssl_context=tls, network_backend=backend) as pool,
@@ -147,7 +147,7 @@ async def _post(
         return response.status
 
 
-def in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
+def _in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
     """Run a blocking call that cannot be interrupted, such as a name lookup.
 
     Unlike the threads of an executor, a daemon thread delays neither the end of the event loop nor
@@ -197,14 +197,16 @@ class WebhookDispatcher:
         asyncio.run(self._run(stop))  # cancels the remaining tasks
 
     async def _run(self, stop: threading.Event) -> None:
-        stopped = in_daemon_thread(stop.wait)
+        stopped = _in_daemon_thread(stop.wait)
         tasks: dict[UUID, asyncio.Task[None]] = {}
         poll = ChangePoll(self._catalog)
+        has_pending = True
         while not stopped.done():
             due: list[UUID] = []
             try:
-                if tasks or poll.is_due(RETRY_DELAYS_SECONDS[0]):
+                if poll.is_due() or tasks or has_pending:
                     due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                    has_pending = bool(due) or await asyncio.to_thread(self._has_pending)
                     if not due:
                         self._outage.record_success()
             except SQLAlchemyError as error:
@@ -232,6 +234,12 @@ class WebhookDispatcher:
         due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(excluded))
         with self._catalog.read() as session:
             return list(session.scalars(due.distinct()))
+
+    def _has_pending(self) -> bool:
+        """Return whether a delivery waits for its next attempt."""
+        pending = exists().where(Delivery.state == DeliveryState.PENDING)
+        with self._catalog.read() as session:
+            return bool(session.scalar(select(pending)))
 
     async def deliver_due(self, webhook_id: UUID) -> int:
         """Attempt the due deliveries of one webhook, up to MAX_IN_FLIGHT; return their number."""
@@ -264,14 +272,14 @@ class WebhookDispatcher:
 
     async def _attempt(self, webhook: Webhook | None, delivery: Delivery) -> None:
         if webhook is None:  # deleted while the event was being written
-            outcome = DeliveryAttempt(None, "the webhook was deleted", is_permanent=True)
+            outcome = _DeliveryAttempt(None, "the webhook was deleted", is_permanent=True)
         else:
-            outcome = await send_webhook(
+            outcome = await _send_webhook(
                 webhook, delivery, self._tls, allow_private=self._allow_private
             )
         await asyncio.to_thread(self._record_attempt, delivery.id, delivery.attempts, outcome)
 
-    def _record_attempt(self, delivery_id: UUID, attempts: int, outcome: DeliveryAttempt) -> None:
+    def _record_attempt(self, delivery_id: UUID, attempts: int, outcome: _DeliveryAttempt) -> None:
         values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
         delay = retry_delay_seconds(attempts)
         if outcome.error is None:

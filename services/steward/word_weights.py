@@ -46,7 +46,7 @@ ROW_BATCH_BYTES = 64_000_000  # rows in memory: 160 photos at 98,304 dimensions
 MIN_BATCH_ROWS = 8  # at any dimension: the far pairs come from the same photos
 
 
-def accumulate_pair_statistics(
+def _accumulate_pair_statistics(
     catalog: Catalog,
     store: ObjectStore,
     generation_id: UUID,
@@ -146,7 +146,7 @@ class WordWeightsFit:
 
         Raises:
             Conflict, Unavailable: As `EvaluationSearch.rank_similar` and
-                `accumulate_pair_statistics`.
+                `_accumulate_pair_statistics`.
         """
         photos = self._evaluation.database.photos
         row_bytes = self._generation.dimension * np.dtype(np.float32).itemsize
@@ -187,7 +187,7 @@ class WordWeightsFit:
         ids = [photo.photo_id for photo in self._evaluation.database.photos]
 
         def fit_half(half: int) -> PairStatistics:
-            return accumulate_pair_statistics(
+            return _accumulate_pair_statistics(
                 self._catalog,
                 self._store,
                 self._generation.id,

@@ -25,7 +25,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from shared.errors import InvalidRequest, NotFound
 
 
-def parse_literal(value: Any) -> Any:
+def _parse_literal(value: Any) -> Any:
     """Parse text in JSON or Python notation; other text and other values are returned unchanged."""
     if not isinstance(value, str):
         return value
@@ -38,22 +38,22 @@ def parse_literal(value: Any) -> Any:
     return text
 
 
-def parse_names(value: Any) -> Any:
+def _parse_names(value: Any) -> Any:
     """Parse a list of names: a literal, a word, or words separated by commas."""
     if isinstance(value, str) and not value.lstrip().startswith(("[", "(")):
         return [name.strip() for name in value.split(",")]
-    return parse_literal(value)
+    return _parse_literal(value)
 
 
-def parse_integers(value: Any) -> Any:
+def _parse_integers(value: Any) -> Any:
     """Parse a list of integers: a literal, one integer, or integers separated by commas."""
-    parsed = parse_literal(value)
+    parsed = _parse_literal(value)
     return (parsed,) if isinstance(parsed, int) and not isinstance(parsed, bool) else parsed
 
 
-def parse_image_size(value: Any) -> Any:
+def _parse_image_size(value: Any) -> Any:
     """Parse `(320, 320)`, `[320, 320]`, `320 320`, `320x320` or `320` as (height, width)."""
-    parsed = parse_literal(value)
+    parsed = _parse_literal(value)
     if isinstance(parsed, str) and re.fullmatch(r"\d+\s*[x ]\s*\d+", parsed):
         parsed = re.findall(r"\d+", parsed)
     return (parsed, parsed) if isinstance(parsed, int) else parsed
@@ -69,9 +69,9 @@ CITIES = (
 MIN_IMAGE_PIXELS = 32
 """Minimum side in pixels; below it a ResNet's last feature map is smaller than one position."""
 
-NameList = Annotated[tuple[str, ...], BeforeValidator(parse_names)]
-IntList = Annotated[tuple[int, ...], BeforeValidator(parse_integers)]
-HeightWidth = Annotated[tuple[int, int], BeforeValidator(parse_image_size)]
+NameList = Annotated[tuple[str, ...], BeforeValidator(_parse_names)]
+IntList = Annotated[tuple[int, ...], BeforeValidator(_parse_integers)]
+HeightWidth = Annotated[tuple[int, int], BeforeValidator(_parse_image_size)]
 
 
 def _argument(group: str, default: Any, help_text: str, **limits: Any) -> Any:
@@ -90,7 +90,7 @@ class TrainingArguments(BaseModel):
     data_root: Path | None = _argument(
         DATA, None, "Folder of the training set, in a layout that `placewise datasets check` knows."
     )
-    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(parse_literal)] = _argument(
+    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(_parse_literal)] = _argument(
         DATA, (), "JSON list of folders with the evaluation sets. Empty: data_root."
     )
     cities: NameList = _argument(
@@ -147,7 +147,7 @@ class TrainingArguments(BaseModel):
     agg_arch: str = _argument(
         MODEL, "AVG", "Name of the aggregator, or package.module:Class of your own."
     )
-    agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
+    agg_config: Annotated[dict[str, Any], BeforeValidator(_parse_literal)] = _argument(
         MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."
     )
 
@@ -200,7 +200,7 @@ class TrainingArguments(BaseModel):
         "image_size.",
     )
     test_image_size: Annotated[
-        Literal["same", "native"] | HeightWidth, BeforeValidator(parse_image_size)
+        Literal["same", "native"] | HeightWidth, BeforeValidator(_parse_image_size)
     ] = _argument(
         EVALUATION,
         "same",
@@ -235,7 +235,7 @@ class TrainingArguments(BaseModel):
     )
     logger: Annotated[
         tuple[Literal["csv", "tensorboard", "wandb", "mlflow", "none"], ...],
-        BeforeValidator(parse_names),
+        BeforeValidator(_parse_names),
     ] = _argument(
         RUN, ("tensorboard", "csv"), "List of csv, tensorboard, wandb and mlflow, or none."
     )
@@ -268,10 +268,10 @@ class TrainingArguments(BaseModel):
     accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _argument(
         MACHINE, "gpu", "Training accelerator: gpu, cuda, mps, cpu or auto."
     )
-    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(parse_literal)] = _argument(
+    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(_parse_literal)] = _argument(
         MACHINE, (0,), "Device to train on: its index as [0], or 1 for any."
     )
-    precision: Annotated[int | str, BeforeValidator(parse_literal)] = _argument(
+    precision: Annotated[int | str, BeforeValidator(_parse_literal)] = _argument(
         MACHINE, 32, "Floating-point precision: 32, 16-mixed or bf16-mixed."
     )
     compile: bool = _argument(

@@ -38,8 +38,7 @@ from services.trainer.arguments import (
     to_plain_dict,
 )
 from services.trainer.checkpointing import LAST_CHECKPOINT, safe_filename
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.losses import make_loss, make_miner
 from services.trainer.model_factory import build_model_config
 from services.trainer.run_control import Display, RunStopped, StopRequest
 from services.trainer.run_folder import CHECKPOINTS_FOLDER, CONFIG_FILE, METRICS_FILE, lock_folder
@@ -68,7 +67,7 @@ class GridPlan:
     """set name -> fingerprint of the set that published results were measured on; may be empty"""
 
 
-class ListedRun(BaseModel):
+class _ListedRun(BaseModel):
     """A run of `runs`; its other keys are arguments."""
 
     model_config = ConfigDict(extra="allow", coerce_numbers_to_str=True)
@@ -77,14 +76,14 @@ class ListedRun(BaseModel):
     published: dict[str, float] | None = None
 
 
-class GridFile(BaseModel):
+class _GridFile(BaseModel):
     """The keys of a grid's YAML file."""
 
     model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
     base: dict[str, Any] | None = None
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] | None = None
-    runs: list[ListedRun] | None = None
+    runs: list[_ListedRun] | None = None
     fingerprints: dict[str, str] | None = None
 
 
@@ -99,7 +98,7 @@ def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
             an unknown backbone, aggregator, loss or miner.
     """
     try:
-        stored = GridFile.model_validate(load_mapping(path))
+        stored = _GridFile.model_validate(load_mapping(path))
     except ValidationError as error:
         raise _grid_error(path, _describe_first(error)) from error
     base = resolve_keys(stored.base or {}, f"{path}, base")
@@ -144,7 +143,7 @@ def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]
     return str(value), {resolve_name(axis): value}
 
 
-def _listed_runs(path: Path, runs: Sequence[ListedRun]) -> Iterator[RunSettings]:
+def _listed_runs(path: Path, runs: Sequence[_ListedRun]) -> Iterator[RunSettings]:
     for number, listed in enumerate(runs, start=1):
         name = listed.name or f"{number:02d}"
         arguments = resolve_keys(listed.model_extra or {}, f"{path}, runs, {name}")
@@ -173,7 +172,7 @@ def _describe_first(error: ValidationError) -> str:
     first = error.errors()[0]
     location = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        return f"there is no key {location!r}.{suggest_name(location, GridFile.model_fields)}"
+        return f"there is no key {location!r}.{suggest_name(location, _GridFile.model_fields)}"
     return f"{location}: {first['msg']} (got {first['input']!r})"
 
 
@@ -286,9 +285,12 @@ _HARMLESS_ARGUMENTS = {"loss_name", "miner_name", "miner_margin", "lr", "max_epo
 
 
 def find_grid_obstacles(plan: GridPlan) -> dict[str, list[str]]:
-    """Return what keeps runs from starting on this machine: code and detail -> names of the runs.
+    """Check whether each run of a grid could start on this machine.
 
     Runs that differ only in their training settings are checked once.
+
+    Returns:
+        Names of the runs that can't start, by error ("code: detail").
     """
     checked: dict[str, list[PlacewiseError]] = {}
     blocked: dict[str, list[str]] = {}

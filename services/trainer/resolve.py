@@ -26,7 +26,7 @@ from lightning.pytorch.loggers import (
 
 from services.trainer.arguments import TrainingArguments, to_plain_dict
 from services.trainer.checkpointing import CheckpointNameTemplate, TopKCheckpoints
-from services.trainer.dataset_selection import EvaluationSets
+from services.trainer.data import EvaluationSets
 from services.trainer.run_control import Display
 from services.trainer.run_folder import CHECKPOINTS_FOLDER, VALIDATION_KS
 from shared.datasets.dataset import TrainingSet

@@ -12,14 +12,13 @@ from typing import Any
 
 from services.trainer.arguments import TrainingArguments, save_yaml, to_plain_dict
 from services.trainer.checkpointing import seed_everything
-from services.trainer.dataset_selection import (
+from services.trainer.data import (
     EvaluationSets,
     select_evaluation_sets,
     select_training_set,
     summarise_training_set,
 )
-from services.trainer.model_factory import make_model
-from services.trainer.own_modules import register_own_modules
+from services.trainer.model_factory import make_model, register_own_modules
 from services.trainer.resolve import (
     check_environment,
     check_loggers,

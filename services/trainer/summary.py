@@ -15,7 +15,7 @@ import torch
 
 from services.trainer.arguments import TrainingArguments, to_plain_dict
 from services.trainer.checkpointing import TopKCheckpoints
-from services.trainer.dataset_selection import EvaluationSets, summarise_evaluation_set
+from services.trainer.data import EvaluationSets, summarise_evaluation_set
 from services.trainer.run_control import Display
 from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
 from shared.datasets.dataset import TrainingSet

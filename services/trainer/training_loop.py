@@ -33,8 +33,7 @@ from services.trainer.data import (
     PlaceDataset,
     load_batches,
 )
-from services.trainer.losses import make_loss
-from services.trainer.miners import batch_accuracy, make_miner
+from services.trainer.losses import batch_accuracy, make_loss, make_miner
 from services.trainer.resolve import Device, portable_arguments
 from services.trainer.run_control import Display, StopRequest
 from services.trainer.run_folder import (

@@ -259,10 +259,12 @@ def backup_tables() -> list[Table]:
 def dump_rows(session: Session, folder: Path, progress: BackupProgress) -> dict[str, int]:
     """Write every row to `<table>.jsonl.gz`; return the number of rows by table."""
     folder.mkdir(FOLDER_MODE)
-    counts = {}
-    for table in backup_tables():
-        total = session.scalar(select(func.count()).select_from(table)) or 0
-        done = 0
+    counts: dict[str, int] = {}
+    tables = backup_tables()
+    total = sum(session.scalar(select(func.count()).select_from(table)) or 0 for table in tables)
+    done = 0
+    for table in tables:
+        done_before = done
         rows = session.execute(select(table).execution_options(yield_per=ROWS_PER_STATEMENT))
         file = folder / f"{table.name}.jsonl.gz"
         file.touch(FILE_MODE)
@@ -272,9 +274,9 @@ def dump_rows(session: Session, folder: Path, progress: BackupProgress) -> dict[
                 lines.write(json.dumps(values, ensure_ascii=False) + "\n")
                 done += 1
                 if done % ROWS_PER_STATEMENT == 0:
-                    progress(f"rows of {table.name}", done, total)
-        counts[table.name] = done
-        progress(f"rows of {table.name}", done, done)
+                    progress("rows", done, total)
+        counts[table.name] = done - done_before
+    progress("rows", done, done)
     return counts
 
 
@@ -286,19 +288,21 @@ def load_rows(
     Raises:
         Misconfigured: `backup_damaged` when a table does not have `counts` rows, or is unreadable.
     """
-    for table in backup_tables():
-        if table.name in NOT_RESTORED_TABLES:
-            continue
+    tables = [table for table in backup_tables() if table.name not in NOT_RESTORED_TABLES]
+    total = sum(counts.get(table.name, 0) for table in tables)
+    done_before = 0
+    for table in tables:
         done = 0
         try:
             for rows in _read_batches(folder / f"{table.name}.jsonl.gz", table):
                 session.execute(insert(table), rows)
                 done += len(rows)
-                progress(f"rows of {table.name}", done, counts[table.name])
+                progress("rows", done_before + done, total)
         except (OSError, EOFError, ValueError, KeyError) as error:
             raise _damaged_error(table, str(error)) from error
         if done != counts.get(table.name):
             raise _damaged_error(table, f"{done} rows of {counts.get(table.name)}")
+        done_before += done
 
 
 def _read_batches(file: Path, table: Table) -> Iterator[list[dict[str, Any]]]:

@@ -139,13 +139,13 @@ def list_live_filter_values(
     return [(row[0], PhotoFilterValues(*row[1:])) for row in rows]
 
 
-def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
+def _count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos, of one role or of all, with a descriptor in the generation."""
     return count_rows(session, _select_described(generation_id, role))
 
 
 def estimate_described(session: Session, generation_id: UUID) -> int:
-    """Count as `count_described`, or estimate, for progress.
+    """Count as `_count_described`, or estimate, for progress.
 
     Above MAX_EXACT_COUNT it is the sum of the chunks' rows, which may include rows of photos that
     were deleted since the last compaction.
@@ -155,12 +155,14 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
         )
     )
-    return int(rows) if rows and rows > MAX_EXACT_COUNT else count_described(session, generation_id)
+    return (
+        int(rows) if rows and rows > MAX_EXACT_COUNT else _count_described(session, generation_id)
+    )
 
 
 def count_searchable(session: Session, generation_id: UUID) -> int:
     """Count the photos that searches of the generation can return."""
-    return count_described(session, generation_id, PhotoRole.DATABASE)
+    return _count_described(session, generation_id, PhotoRole.DATABASE)
 
 
 def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:

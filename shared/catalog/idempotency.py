@@ -62,7 +62,7 @@ class IdempotencyRecord(Base):
 
 @dataclass(frozen=True, slots=True)
 class RequestIdentity:
-    """Identifies a request, to tell a repetition from another request with the same key."""
+    """Identifies a request: distinguishes a repetition from another request with the same key."""
 
     scope: str
     key: str
@@ -126,7 +126,7 @@ def claim_idempotency_key(
             if row.status is not None:
                 return StoredResponse(row.status, row.headers or {}, row.body or "")
             if is_leased:
-                raise key_in_use_error()
+                raise _key_in_use_error()
         row.call, row.fingerprint = request.call, request.fingerprint
         row.token = new_id()
         row.lease_until = db_now_plus(lease_seconds)
@@ -150,7 +150,7 @@ def store_response(session: Session, token: UUID, response: StoredResponse) -> N
         .execution_options(synchronize_session=False)
     )
     if not affected_rows(updated):
-        raise key_in_use_error()
+        raise _key_in_use_error()
 
 
 def release_idempotency_key(session: Session, token: UUID) -> None:
@@ -162,7 +162,7 @@ def release_idempotency_key(session: Session, token: UUID) -> None:
     )
 
 
-def key_in_use_error() -> Conflict:
+def _key_in_use_error() -> Conflict:
     return Conflict(
         "idempotency_key_in_use",
         "A request with this Idempotency-Key is still being processed. Repeat it a little later.",

@@ -143,13 +143,18 @@ def get_map(session: Session, name: str) -> Map:
     """Return the live map of this name; NotFound (`map_not_found`)."""
     map_ = session.scalar(sa.select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
     if map_ is None:
-        raise NotFound(
-            "map_not_found",
-            f"There is no map named {name!r}. Create it: POST /api/v1/maps, or "
-            f"`placewise maps create {name}`.",
-            map=name,
-        )
+        raise map_not_found_error(name)
     return map_
+
+
+def map_not_found_error(name: str) -> NotFound:
+    """The error of a call about a map that does not exist."""
+    return NotFound(
+        "map_not_found",
+        f"There is no map named {name!r}. Create it: POST /api/v1/maps, or "
+        f"`placewise maps create {name}`.",
+        map=name,
+    )
 
 
 def lock_map(session: Session, map_id: UUID) -> Map:
@@ -252,7 +257,7 @@ def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, d
         cached = session.get(CachedMapStatistics, map_id)
         if cached is not None:
             return MapStatistics(**cached.figures), cached.counted_at
-    return compute_map_statistics(session, map_id), session.execute(
+    return _compute_map_statistics(session, map_id), session.execute(
         sa.select(db_now())
     ).scalar_one()
 
@@ -266,7 +271,7 @@ def is_large_map(session: Session, map_id: UUID) -> bool:
     )
 
 
-def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
+def _compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     """Count the map's rows; this takes seconds on a map with a million photos."""
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
@@ -315,7 +320,7 @@ def cache_map_statistics(session: Session, map_id: UUID) -> None:
     """Count the map's rows and cache the statistics."""
     started = time.perf_counter()
     now = session.execute(sa.select(db_now())).scalar_one()
-    figures = asdict(compute_map_statistics(session, map_id))
+    figures = asdict(_compute_map_statistics(session, map_id))
     took = time.perf_counter() - started
     session.merge(
         CachedMapStatistics(map_id=map_id, figures=figures, counted_at=now, took_seconds=took)

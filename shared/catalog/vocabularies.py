@@ -127,7 +127,7 @@ def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
 
 
 class StoredWhitening(Journaled, Base):
-    """A PCA whitening from `dimension` to `kept` components, stored under `object_key`.
+    """A PCA whitening from `dimension` to `components`, stored under `object_key`.
 
     The file is one of `shared.descriptors.pca_whitening`. It is deleted after a grace period when
     none of its generations is active or being built any more.
@@ -138,7 +138,7 @@ class StoredWhitening(Journaled, Base):
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     dimension: Mapped[int] = mapped_column(Integer)
-    kept: Mapped[int] = mapped_column(Integer)
+    components: Mapped[int] = mapped_column("kept", Integer)
     # The number of rows that it was fitted on, and the explained share of their variance, 0 to 1.
     rows: Mapped[int] = mapped_column(Integer)
     explained: Mapped[float] = mapped_column(Float)
@@ -150,7 +150,7 @@ class StoredWhitening(Journaled, Base):
         """Return its description in API responses."""
         return {
             "from_dimension": self.dimension,
-            "dimension": self.kept,
+            "dimension": self.components,
             "rows": self.rows,
             "explained": self.explained,
         }

@@ -93,7 +93,7 @@ def _wide_strides(x: Float32Vector, stride: int, min_stride: int) -> int:
 
 
 @numba_jit(ORDERED_FASTMATH)
-def hadamard(x: Float32Vector) -> None:
+def _hadamard(x: Float32Vector) -> None:
     """Multiply x, (n,) float32, by the n x n Hadamard matrix (Sylvester's, unscaled), in place.
 
     n is a power of two and at least 16; x is contiguous. Every loop runs over adjacent numbers, so
@@ -240,6 +240,6 @@ def _rotate(
                         destination[position, j] = source[run, j] * round_signs[position, j]
             parts = rotated.reshape(blocks, -1)
             for block_index in range(blocks):
-                hadamard(parts[block_index])
+                _hadamard(parts[block_index])
             if blocks > 1:
                 _householder(parts, buffer)

@@ -45,12 +45,6 @@ def find_running_server(home: Path) -> RunningServer | None:
     return None
 
 
-def _running_server_url(home: Path) -> str | None:
-    """Return the URL of the server that serves the folder now, or None."""
-    running = find_running_server(home)
-    return running.url if running else None
-
-
 @contextlib.contextmanager
 def lock_home(home: Path) -> Iterator[None]:
     """Lock the folder for this process while the block runs.
@@ -63,7 +57,8 @@ def lock_home(home: Path) -> Iterator[None]:
         lock = FileLock(_lock_file(home), timeout=0, mode=FILE_MODE)
         lock.acquire()
     except Timeout:
-        user = _running_server_url(home) or "another process"
+        running = find_running_server(home)
+        user = running.url if running else "another process"
         raise Misconfigured(
             "home_in_use",
             f"The folder {home} is already in use by {user}. Use that server, stop it, or set "

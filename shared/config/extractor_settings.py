@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.sizes import Size
+from shared.config.values import Size
 from shared.errors import Misconfigured
 from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
 from shared.extractor_config.configs import ExtractorConfig, get_extractor_config

@@ -9,8 +9,7 @@ from typing import Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.lists import split_list
-from shared.config.sizes import Size
+from shared.config.values import Size, split_list
 from shared.security.api_keys import Scope
 
 MIN_ADMIN_KEY_CHARACTERS = 16

@@ -9,9 +9,8 @@ from typing import Literal
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.lists import split_list
 from shared.config.shards import Shard
-from shared.config.sizes import Size
+from shared.config.values import Size, split_list
 
 
 class SearchSettings(BaseSettings):

@@ -25,8 +25,8 @@ from shared.config.extractor_settings import ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
 from shared.config.shards import Shard
-from shared.config.sizes import Size
 from shared.config.storage_settings import StorageSettings
+from shared.config.values import Size
 from shared.errors import Misconfigured
 
 # Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.

@@ -118,7 +118,7 @@ def find_evaluation_sets(root: Path) -> tuple[DiscoveredSet, ...]:
     sets: dict[str, DiscoveredSet] = {}
     for home, bases in _candidate_folders(_existing_folder(root)):
         folder_sets: dict[str, DiscoveredSet] = {}
-        prefix = set_prefix(home.resolve().name)
+        prefix = _set_prefix(home.resolve().name)
         for base in bases:
             for layout in EVALUATION_LAYOUTS:
                 for name, key in layout.sets(base, prefix).items():
@@ -234,7 +234,7 @@ def _numbered_names(name: str) -> Iterator[str]:
         yield f"{name}_{number}"
 
 
-def set_prefix(name: str) -> str:
+def _set_prefix(name: str) -> str:
     """Return the prefix of a folder's set names: `SF_XS` -> `sfxs`, as in lists of that dataset."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) or "set"
 

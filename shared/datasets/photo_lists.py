@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,19 +47,12 @@ def photo_from_filename(path: Path, name: str, place: str | None = None) -> Data
     )
 
 
-def add_exif_positions(
-    photos: Iterable[DatasetPhoto], on_progress: Callable[[int], None] = lambda count: None
-) -> list[DatasetPhoto]:
+def add_exif_positions(photos: Iterable[DatasetPhoto]) -> list[DatasetPhoto]:
     """Add positions from EXIF to photos without one.
 
-    Photos without EXIF, and unreadable ones, are returned unchanged. `on_progress` is called with 1
-    after each photo.
+    Photos without EXIF, and unreadable ones, are returned unchanged.
     """
-    located = []
-    for photo in photos:
-        located.append(photo if photo.easting is not None else _add_exif_position(photo))
-        on_progress(1)
-    return located
+    return [photo if photo.easting is not None else _add_exif_position(photo) for photo in photos]
 
 
 def _add_exif_position(photo: DatasetPhoto) -> DatasetPhoto:

@@ -37,7 +37,7 @@ class UtmFileName:
     """UTC"""
     note: str = ""
 
-    def file_name(self, suffix: str = ".jpg") -> str:
+    def file_name(self) -> str:
         """Format the name; latitude and longitude are computed from the UTM position."""
         if "@" in self.pano_id + self.note:
             raise ValueError("the fields of an @UTM@ file name can't contain an @")
@@ -58,7 +58,7 @@ class UtmFileName:
             f"{self.captured_at:%Y%m%d%H%M%S}" if self.captured_at else "",
             self.note,
         )
-        return f"@{'@'.join(fields)}@{suffix}"
+        return f"@{'@'.join(fields)}@.jpg"
 
 
 @dataclass(frozen=True, slots=True)

@@ -200,7 +200,7 @@ class Extractor:
     ) -> int:
         """Return the number of dimensions of a descriptor."""
         if projection is not None:
-            return projection.kept
+            return projection.components
         return self.backbone.width * (centres.clusters if centres else 1)
 
     def warm_up(self, photos: int) -> None:

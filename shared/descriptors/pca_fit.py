@@ -34,14 +34,14 @@ SAMPLE_PER_DIMENSION = 4
 FLOAT32 = np.dtype("<f4")
 
 
-def sample_size(dimension: int, kept: int) -> int:
-    """Return the maximum number of rows to fit on, for `kept` of `dimension` dimensions.
+def sample_size(dimension: int, components: int) -> int:
+    """Return the maximum number of rows to fit on, for `components` of `dimension` dimensions.
 
-    SAMPLE_PER_DIMENSION rows per kept dimension, as far as SAMPLE_BYTES allow, but always two per
-    kept dimension: the time of a fit grows with the square of the number of rows.
+    SAMPLE_PER_DIMENSION rows per component, as far as SAMPLE_BYTES allow, but always two per
+    component: the time of a fit grows with the square of the number of rows.
     """
-    target = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * kept)
-    return min(target, max(2 * kept, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
+    target = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * components)
+    return min(target, max(2 * components, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
 
 
 def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
@@ -174,7 +174,7 @@ class PcaBlock:
     mean: Rows
     """(width,)"""
     directions: Rows
-    """(kept, width), each divided by its standard deviation."""
+    """(components, width), each divided by its standard deviation."""
 
 
 class PcaFit:
@@ -184,11 +184,11 @@ class PcaFit:
     resumed between two steps.
     """
 
-    def __init__(self, rows: ColumnSource, kept: int) -> None:
+    def __init__(self, rows: ColumnSource, components: int) -> None:
         """Raises Unprocessable as `check_pca_fittable` does."""
-        check_pca_fittable(rows.count, rows.dimension, kept)
+        check_pca_fittable(rows.count, rows.dimension, components)
         self._rows = rows
-        self._kept = kept
+        self._components = components
         self._blocks = block_count(rows)
         self.stage = _PcaFitStage.PRODUCTS
         self._block = 0
@@ -265,7 +265,7 @@ class PcaFit:
 
     def _find_variances(self) -> None:
         freedom = self._rows.count - 1
-        squares, vectors = _largest_eigenpairs(self._products, self._kept)
+        squares, vectors = _largest_eigenpairs(self._products, self._components)
         self._variances = squares / freedom
         self._total = float(np.trace(self._products)) / freedom
         # p / sqrt(l) = X'u / s * sqrt(n - 1) / s; by columns the vectors are the directions p.
@@ -299,44 +299,45 @@ class PcaFit:
             self._variances, self._total = saved["variances"], float(saved["total"])
 
 
-def check_pca_fittable(rows: int, dimension: int, kept: int) -> None:
-    """Check that `rows` rows of `dimension` dimensions can be projected to `kept`.
+def check_pca_fittable(rows: int, dimension: int, components: int) -> None:
+    """Check that `rows` rows of `dimension` dimensions can be projected to `components`.
 
     Raises:
-        Unprocessable: `pca_too_many_dimensions` if `kept` exceeds `dimension`; `pca_too_few_rows`
-            unless there are more than `kept` rows.
+        Unprocessable: `pca_too_many_dimensions` if `components` exceeds `dimension`;
+            `pca_too_few_rows` unless there are more than `components` rows.
     """
-    if kept > dimension:
+    if components > dimension:
         raise Unprocessable(
             "pca_too_many_dimensions",
-            f"Descriptors of {dimension} dimensions can't be projected to {kept}. Use fewer.",
+            f"Descriptors of {dimension} dimensions can't be projected to {components}. Use fewer.",
         )
-    if rows <= kept:
+    if rows <= components:
         raise Unprocessable(
             "pca_too_few_rows",
-            f"PCA to {kept} dimensions needs more than {kept} described photos, preferably several "
-            f"times as many, but there are {rows}. Index more photos, or use fewer dimensions.",
+            f"PCA to {components} dimensions needs more than {components} described photos, "
+            f"preferably several times as many, but there are {rows}. Index more photos, or use "
+            "fewer dimensions.",
         )
 
 
-def fit_pca(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhitening:
-    """Fit a whitening of (n, D) rows, which may be memory-mapped, to `kept` dimensions.
+def fit_pca(rows: Rows, components: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhitening:
+    """Fit a whitening of (n, D) rows, which may be memory-mapped, to `components` dimensions.
 
     Raises as `PcaFit` does.
     """
-    return fit_pca_columns(ArrayColumns(rows, block_bytes), kept)
+    return fit_pca_columns(ArrayColumns(rows, block_bytes), components)
 
 
 def fit_pca_columns(
     rows: ColumnSource,
-    kept: int,
+    components: int,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> PcaWhitening:
-    """Fit a whitening of rows to `kept` dimensions.
+    """Fit a whitening of rows to `components` dimensions.
 
     `on_progress` is called with the steps done and the total. Raises as `PcaFit` does.
     """
-    fit = PcaFit(rows, kept)
+    fit = PcaFit(rows, components)
     parts = []
     while not fit.done:
         part = fit.step()
@@ -346,16 +347,16 @@ def fit_pca_columns(
     return fit.whitening(parts)
 
 
-def _largest_eigenpairs(matrix: Matrix, kept: int) -> tuple[Matrix, Matrix]:
-    """Return the `kept` largest eigenvalues, largest first, and (N, kept) unit eigenvectors."""
+def _largest_eigenpairs(matrix: Matrix, components: int) -> tuple[Matrix, Matrix]:
+    """Return the largest eigenvalues, largest first, and (N, components) unit eigenvectors."""
     values, vectors = np.linalg.eigh(matrix)
-    values, vectors = values[::-1][:kept], vectors[:, ::-1][:, :kept]
+    values, vectors = values[::-1][:components], vectors[:, ::-1][:, :components]
     usable = int((values > MIN_VARIANCE * max(values[0], 0)).sum())
-    if usable < kept:
+    if usable < components:
         raise Unprocessable(
             "pca_too_many_dimensions",
-            f"The described photos vary in {usable} directions only, but PCA to {kept} dimensions "
-            f"needs {kept}. Index more varied photos, or use fewer dimensions.",
+            f"The described photos vary in {usable} directions only, but PCA to {components} "
+            f"dimensions needs {components}. Index more varied photos, or use fewer dimensions.",
         )
     return values, vectors
 
@@ -369,7 +370,7 @@ def _centred(block: Rows) -> tuple[Matrix, Matrix]:
 
 
 def _with_fixed_signs(directions: Rows) -> Rows:
-    """Flip directions (kept, D) so that the element of largest magnitude is positive.
+    """Flip directions (components, D) so that the element of largest magnitude is positive.
 
     Eigenvectors have an arbitrary sign; this makes the result deterministic. C order.
     """
@@ -388,7 +389,7 @@ def fit_pca_stream(
     batches: Iterable[Rows],
     max_rows: int,
     dimension: int,
-    kept: int,
+    components: int,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, max_rows: None,
 ) -> PcaWhitening:
     """Fit a whitening to batches of rows, which are stored in a temporary folder meanwhile.
@@ -397,7 +398,7 @@ def fit_pca_stream(
         batches: (n, dimension) rows; rows that are zero or not finite are skipped.
         max_rows: Maximum number of rows in all batches.
         dimension: Number of columns.
-        kept: Number of dimensions after the projection.
+        components: Number of dimensions after the projection.
         on_progress: Called with the stage (`gathering`, `reducing`), the rows or steps done and
             the total.
 
@@ -416,5 +417,5 @@ def fit_pca_stream(
             seen += len(batch)
             on_progress("gathering", seen, max_rows)
         return fit_pca_columns(
-            stored, kept, lambda done, steps: on_progress("reducing", done, steps)
+            stored, components, lambda done, steps: on_progress("reducing", done, steps)
         )

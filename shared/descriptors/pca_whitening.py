@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 from torch.nn.functional import normalize
 
 from shared.errors import Unprocessable
@@ -51,7 +53,7 @@ class PcaWhitening:
         return int(self.directions.shape[1])
 
     @property
-    def kept(self) -> int:
+    def components(self) -> int:
         """Length of a descriptor after."""
         return int(self.directions.shape[0])
 
@@ -69,7 +71,7 @@ class PcaProjection:
     def __init__(self, whitening: PcaWhitening, device: torch.device) -> None:
         self.dimension = whitening.dimension
         """Length of a descriptor before."""
-        self.kept = whitening.kept
+        self.components = whitening.components
         """Length of a descriptor after."""
         self.sha256 = whitening.sha256
         self._mean = _tensor(whitening.mean).to(device)
@@ -77,7 +79,7 @@ class PcaProjection:
 
     @torch.inference_mode()
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
-        """Project (B, dimension) float32 rows on the device to (B, kept) unit rows.
+        """Project (B, dimension) float32 rows on the device to (B, components) unit rows.
 
         A zero row (a photo without structure) stays zero: it was similar to no photo, and must not
         become similar to rows at the same distance from the mean. A row equal to the mean becomes
@@ -113,8 +115,6 @@ class PcaWhiteningFile:
 
     def encode(self) -> bytes:
         """Encode as a `.safetensors` file."""
-        from safetensors.numpy import save
-
         whitening = self.whitening
         return save(
             {
@@ -156,9 +156,6 @@ def decode_whitening(data: bytes) -> PcaWhiteningFile:
 
     Raises Unprocessable (`pca_unfit`) with the reason.
     """
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
     try:
         stored = load(data)
     except SafetensorError as error:
@@ -194,9 +191,9 @@ def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
             f"its mean {mean.shape}, directions {directions.shape} and variances "
             f"{variances.shape} do not match: (D,), (d, D) and (d,) are expected"
         )
-    kept, dimension = directions.shape
-    if not 0 < kept <= dimension:
-        raise _pca_unfit_error(f"it projects {dimension} dimensions to {kept}")
+    components, dimension = directions.shape
+    if not 0 < components <= dimension:
+        raise _pca_unfit_error(f"it projects {dimension} dimensions to {components}")
     if not (variances > 0).all():
         raise _pca_unfit_error("a variance is not positive")
     # Unit directions divided by their standard deviation, within the precision of float32.

@@ -72,7 +72,7 @@ class PairedDifference:
 
 
 def bootstrap_intervals(
-    values: Values, clusters: NDArray[np.int64], *, resamples: int = RESAMPLES, seed: int = 0
+    values: Values, clusters: NDArray[np.int64]
 ) -> list[ConfidenceInterval] | None:
     """Compute the bootstrap interval of each metric's mean.
 
@@ -90,12 +90,12 @@ def bootstrap_intervals(
     sums = np.zeros((count, values.shape[1]))
     np.add.at(sums, cluster, values)
     sizes = np.bincount(cluster, minlength=count).astype(np.float64)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     means = []
     block = max(1, MAX_COUNTS_PER_BLOCK // count)
-    for start in range(0, resamples, block):
+    for start in range(0, RESAMPLES, block):
         counts = rng.multinomial(
-            count, np.full(count, 1 / count), size=min(block, resamples - start)
+            count, np.full(count, 1 / count), size=min(block, RESAMPLES - start)
         ).astype(np.float64)
         means.append((counts @ sums) / (counts @ sizes)[:, None])
     tail = (1 - CONFIDENCE_LEVEL) / 2
@@ -104,7 +104,7 @@ def bootstrap_intervals(
 
 
 def paired_differences(
-    first: Values, second: Values, clusters: NDArray[np.int64], *, seed: int = 0
+    first: Values, second: Values, clusters: NDArray[np.int64]
 ) -> list[PairedDifference]:
     """Compute the paired difference of each metric between two runs on the same queries.
 
@@ -119,7 +119,7 @@ def paired_differences(
     if first.shape != second.shape:
         raise ValueError(f"runs of different shape: {first.shape} and {second.shape}")
     difference = first - second
-    intervals = bootstrap_intervals(difference, clusters, seed=seed)
+    intervals = bootstrap_intervals(difference, clusters)
     return [
         PairedDifference(
             mean=float(column.mean()),

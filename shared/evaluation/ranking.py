@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shared.datasets.open_dataset import EvaluationSet
 from shared.errors import PlacewiseError, Unprocessable
-from shared.evaluation.exact_knn import BLOCK_BYTES, Indices, Rankings, exact_knn
+from shared.evaluation.exact_knn import Indices, Rankings, exact_knn
 from shared.evaluation.recall import recall_at_k
 
 MAX_ROWS_IN_MEMORY_BYTES = 1_000_000_000  # larger matrices are memory-mapped
@@ -43,13 +43,11 @@ def describe_to_matrix(
     describe: DescribeFunction,
     photos: Sequence[Path],
     *,
-    memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
     on_progress: Callable[[int], None] = lambda count: None,
 ) -> Iterator[Rows]:
     """Describe photos into a matrix that is valid inside the `with` block.
 
     Args:
-        memory_bytes: larger matrices are memory-mapped.
         on_progress: called with the number of new rows after each batch.
 
     Yields:
@@ -63,7 +61,7 @@ def describe_to_matrix(
         done = 0
         for batch in describe(photos):
             if done == 0:
-                rows = _allocate_rows(len(photos), batch.shape[1], memory_bytes, stack)
+                rows = _allocate_rows(len(photos), batch.shape[1], stack)
             _check_finite(batch, photos[done : done + len(batch)])
             rows[done : done + len(batch)] = batch
             done += len(batch)
@@ -73,10 +71,8 @@ def describe_to_matrix(
         yield rows
 
 
-def _allocate_rows(
-    count: int, dimension: int, memory_bytes: int, stack: contextlib.ExitStack
-) -> Rows:
-    if 4 * count * dimension <= memory_bytes:
+def _allocate_rows(count: int, dimension: int, stack: contextlib.ExitStack) -> Rows:
+    if 4 * count * dimension <= MAX_ROWS_IN_MEMORY_BYTES:
         return np.empty((count, dimension), np.float32)
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="placewise-rows-"))
     mapped: Rows = np.lib.format.open_memmap(
@@ -152,28 +148,25 @@ def evaluate_recall(
     *,
     ks: Sequence[int] = DEFAULT_KS,
     faiss_gpu: bool = False,
-    memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
-    block_bytes: int = BLOCK_BYTES,
     on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> RecallEvaluation:
     """Describe the database and the queries, rank them exactly, and compute recall@k.
 
     Args:
-        memory_bytes: larger descriptor matrices are memory-mapped.
         on_progress: called with the stage (`database`, `queries`, `search`), done and total.
 
     Raises:
         Misconfigured: `faiss_gpu_missing`; also raises what `describe` raises.
     """
-    with describe_evaluation_set(
-        describe, evaluation_set, memory_bytes=memory_bytes, on_progress=on_progress
-    ) as (database, queries):
+    with describe_evaluation_set(describe, evaluation_set, on_progress=on_progress) as (
+        database,
+        queries,
+    ):
         ranked = exact_knn(
             queries,
             database,
             max(ks),
             faiss_gpu=faiss_gpu,
-            block_bytes=block_bytes,
             on_progress=lambda done, total: on_progress("search", done, total),
         )
         dimension = database.shape[1]
@@ -187,7 +180,6 @@ def describe_evaluation_set(
     describe: DescribeFunction,
     evaluation_set: EvaluationSet,
     *,
-    memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
     on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> Iterator[tuple[Rows, Rows]]:
     """Describe an evaluation set into matrices that are valid inside the `with` block.
@@ -206,7 +198,6 @@ def describe_evaluation_set(
                     describe_to_matrix(
                         describe,
                         [photo.path for photo in photos],
-                        memory_bytes=memory_bytes,
                         on_progress=_accumulate_progress(stage, len(photos), on_progress),
                     )
                 )

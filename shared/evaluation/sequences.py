@@ -130,7 +130,7 @@ def evaluate_sequence(
     """
     queries = [evaluation_set.queries[index] for index in members]
     scores = rows @ map_.rows.T
-    evidence = frames_of(map_, _times(queries), rows)
+    evidence = _frames_of(map_, _times(queries), rows)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     states = []
@@ -168,29 +168,28 @@ def evaluate_kidnapped(
     rows: Rows,
     motion: MotionModel,
     every: int,
-    seed: int = 0,
 ) -> list[int | None]:
-    """Carry the camera of a sequence to another place of it after every so many frames.
+    """Evaluate relocalisation after jumps of the camera to random frames of its sequence.
 
-    The frames outside the map are left out; the sequence goes on from its beginning at its end.
+    Frames outside the map are left out. After its last frame, the sequence begins again.
 
     Args:
         members: Query indices in the order of frames.
         rows: (len(members), D) descriptors of these queries, of unit length.
-        every: Number of frames between two kidnappings.
+        every: Number of frames between two jumps.
 
     Returns:
-        For each of KIDNAPS, the frames until the place is tracked and right; None if it is not
-        before the next one.
+        For each of KIDNAPS jumps, the number of frames until the track has the status `tracking` at
+        a correct photo; None if that does not happen before the next jump.
     """
     inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
     if len(inside) < 2:
         return []
-    starts = np.random.default_rng(seed).integers(len(inside), size=KIDNAPS + 1).tolist()
+    starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
     frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
     times = _times([evaluation_set.queries[index] for index in members])
     interval = (times[-1] - times[0]) / (len(times) - 1)
-    evidence = frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
+    evidence = _frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     found: list[int | None] = [None] * (KIDNAPS + 1)
@@ -201,10 +200,10 @@ def evaluate_kidnapped(
             photo = _photo(track_filter.state(belief).photo)
             if photo in evaluation_set.positives[members[frames[number]]]:
                 found[segment] = since
-    return found[1:]  # the first is no kidnapping
+    return found[1:]  # before the first jump
 
 
-def frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
+def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
     """Return the evidence of the frames of a sequence.
 
     Args:

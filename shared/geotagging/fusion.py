@@ -60,12 +60,12 @@ def propose_position(
     sources: list[tuple[Mixture, str, str]] = []
     if picture is not None:
         mixture = picture_mixture(picture, plane)
-        sources.append((mixture, "", "the picture looks like elsewhere"))
+        sources.append((mixture, "", "looks like another place"))
     if neighbours is not None:
         text = f"taken {_after(neighbours.seconds)} {neighbours.nearest.name}"
         sources.append((position_mixture(neighbours, plane), text, f"not where it was {text}"))
     if track is not None:
-        text = f"GPX track, {_after(track.seconds)} a point"
+        text = f"GPX track, {_duration(track.seconds)} from its nearest point"
         sources.append((position_mixture(track, plane), text, "not on the GPX track"))
     product = reduce(Mixture.times, (mixture for mixture, _, _ in sources))
     if not len(product.weights):
@@ -117,6 +117,11 @@ def _looks_like(
 
 
 def _after(seconds: float) -> str:
+    if abs(seconds) < 0.5:
+        return "at the same time as"
+    return f"{_duration(seconds)} {'before' if seconds < 0 else 'after'}"
+
+
+def _duration(seconds: float) -> str:
     length = abs(seconds)
-    text = f"{length:.0f} s" if length < 99.5 else f"{length / 60:.0f} min"
-    return f"{text} {'before' if seconds < 0 else 'after'}"
+    return f"{length:.0f} s" if length < 99.5 else f"{length / 60:.0f} min"

@@ -189,7 +189,6 @@ MAX_TRAINING_PIXELS = 100_000_000
 def decode_resized(
     path: Path,
     size: tuple[int, int],
-    max_pixels: int = MAX_TRAINING_PIXELS,
     *,
     resampling: Image.Resampling = Image.Resampling.BILINEAR,
 ) -> Image.Image:
@@ -206,7 +205,7 @@ def decode_resized(
         with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
             with open_photo(file) as image:
-                check_pixel_count(image.width, image.height, max_pixels)
+                check_pixel_count(image.width, image.height, MAX_TRAINING_PIXELS)
                 image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
                 upright = _apply_exif_orientation(image, _to_rgb(image))

@@ -40,7 +40,7 @@ QUARTER_TURNS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class HeicHeader:
+class _HeicHeader:
     """Size and EXIF of a HEIC photo."""
 
     width: int
@@ -56,7 +56,7 @@ class _Box:
     content: bytes
 
 
-def _read_heic_header(file: BinaryIO) -> HeicHeader:
+def _read_heic_header(file: BinaryIO) -> _HeicHeader:
     """Read size and EXIF of the primary image.
 
     Raises ValueError if there is none, or if it is not HEVC (AVIF, for example).
@@ -69,7 +69,7 @@ def _read_heic_header(file: BinaryIO) -> HeicHeader:
     width, height = _upright_size(boxes[b"iprp"], primary)
     exif_item = next((item for item, kind in kinds.items() if kind == b"Exif"), None)
     exif = None if exif_item is None else _exif(file, boxes.get(b"iloc", b""), exif_item)
-    return HeicHeader(width, height, exif)
+    return _HeicHeader(width, height, exif)
 
 
 def _meta(file: BinaryIO) -> bytes:

@@ -228,6 +228,7 @@ MAX_MANIFEST_BYTES = 32 * 1024 * 1024
 NAME_COLUMNS = ("filename", "file", "path")
 CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
 KEY_FIELD = "key"  # in a manifest of objects to import
+FORMULA = re.compile("'*[=+@\\t\\r-]")  # such a cell is a formula in a spreadsheet, or was escaped
 MAX_REPORTED_LINES = 20  # bad lines in an error message
 
 
@@ -241,8 +242,23 @@ class ManifestEntry:
     """Values by the names of the upload form, without empty ones."""
 
 
+def escape_csv_text(text: str) -> str:
+    """Put an apostrophe before text that a spreadsheet would run as a formula (`=`, `+`, `-`, `@`).
+
+    `unescape_csv_text` returns the text again.
+    """
+    return f"'{text}" if FORMULA.match(text) else text
+
+
+def unescape_csv_text(cell: str) -> str:
+    """Remove the apostrophe of `escape_csv_text`."""
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell
+
+
 def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
     """Parse a CSV table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
+
+    Text may be as `escape_csv_text` writes it.
 
     Args:
         data: the file's bytes, UTF-8.
@@ -273,7 +289,7 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
         entries: list[ManifestEntry] = []
         seen: dict[str, int] = {}
         for row in reader:
-            name = row[name_column] or ""  # a short row has None
+            name = unescape_csv_text(row[name_column] or "")  # a short row has None
             if name in seen:
                 fault = f"{name!r} is already in line {seen[name]}"
                 raise bad_lines_error("bad_table", source_name, [(reader.line_num, fault)])
@@ -286,7 +302,7 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
                 raise bad_lines_error(
                     "bad_table", source_name, [(reader.line_num, "contains a NUL character")]
                 )
-            fields = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
+            fields = {c: unescape_csv_text(row[c]) for c in CSV_COLUMNS if row.get(c)}
             entries.append(ManifestEntry(reader.line_num, name, fields))
         return entries
     except (UnicodeDecodeError, csv.Error) as error:

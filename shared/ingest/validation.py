@@ -10,7 +10,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 from uuid import UUID
 
-from shared.config.sizes import format_megabytes
+from shared.config.values import format_megabytes
 from shared.errors import PlacewiseError, TooLarge, UnsupportedMedia
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, PHOTO_SIGNATURE_BYTES, detect_media_type
 from shared.imaging.photo_header import PhotoHeader, read_photo_header

@@ -41,6 +41,11 @@ class ObjectKind(StrEnum):
     FILE = "file"  # of an unfinished batch, not yet a photo
 
 
+def plural(kind: str) -> str:
+    """Return the plural of a kind, for messages."""
+    return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+
+
 KIND_BY_JOB = {JobKind.BATCH: ObjectKind.ARCHIVE, JobKind.ADD_MODEL: ObjectKind.CHECKPOINT}
 """Uploads that belong to a job and are deleted when it ends."""
 

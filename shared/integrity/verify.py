@@ -34,6 +34,7 @@ from shared.integrity.referenced_objects import (
     ObjectKind,
     ReferencedObject,
     list_referenced_objects,
+    plural,
 )
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import Wakeups
@@ -82,7 +83,7 @@ class IntegrityReport:
     trash_bytes: int = 0
 
 
-def verify_chunk(
+def _verify_chunk(
     store: ObjectStore,
     chunk_id: UUID,
     object_key: str,
@@ -176,7 +177,7 @@ def verify_store(
         if faults and _is_still_referenced(catalog, one):
             report.faults += faults
         done[one.what] += 1
-        progress(f"{one.what}s", done[one.what], total[one.what])
+        progress(plural(one.what), done[one.what], total[one.what])
     with catalog.read() as session:
         report.faults += _find_missing_descriptors(session)
     return report
@@ -200,7 +201,7 @@ def _verify_object(
                 select(Descriptor.row, Descriptor.photo_id).where(Descriptor.chunk_id == chunk.id)
             ).all()
         rows = [(row, photo_id) for row, photo_id in catalog_rows]
-        yield from verify_chunk(
+        yield from _verify_chunk(
             store, chunk.id, chunk.object_key, chunk.sha256, chunk.rows, rows, report
         )
         return

@@ -124,15 +124,11 @@ def cancel_model_change(session: Session, job: Job) -> None:
     abandon_generation(session, job)
 
 
-CANCELLED_PER_TRANSACTION = 1000  # a generation has as many reindex jobs as its map has photos
-
-
 def abandon_generation(session: Session, job: Job) -> None:
     """Abandon the generation that an ended model change was building, and cancel its photo jobs.
 
-    Cancels CANCELLED_PER_TRANSACTION of them; the steward cancels the others. An extractor that
-    claims one before can't publish it. Does nothing for any other job: the end of one photo's job
-    does not affect its generation.
+    The steward cancels those that remain. An extractor that claims one before can't publish it.
+    Does nothing for any other job: the end of one photo's job does not affect its generation.
     """
     if job.kind not in MODEL_CHANGE_JOBS or job.generation_id is None:
         return
@@ -141,8 +137,4 @@ def abandon_generation(session: Session, job: Job) -> None:
         return
     generation.state = GenerationState.ABANDONED
     generation.ended_at = db_now()
-    cancel_jobs(
-        session,
-        (Job.generation_id == generation.id) & (Job.kind == JobKind.REINDEX),
-        CANCELLED_PER_TRANSACTION,
-    )
+    cancel_jobs(session, (Job.generation_id == generation.id) & (Job.kind == JobKind.REINDEX))

@@ -45,8 +45,8 @@ from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs
 from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.trace_context import job_trace_context
 from shared.jobs.transitions import cancel_batch_items, fail_job, release_job
+from shared.telemetry.tracing import request_id_context, span
 
 log = logging.getLogger(__name__)
 
@@ -311,3 +311,30 @@ def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
     fail_job(job, problem)
     abandon_generation(session, job)
     cancel_batch_items(session, job)
+
+
+@contextlib.contextmanager
+def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
+    """Run the block in a span that links to the traces of the jobs' requests.
+
+    When all jobs come from one request, log lines carry its id, and jobs that the block creates
+    belong to it.
+    """
+    ids = distinct_request_ids(jobs)
+    with (
+        request_id_context(ids[0] if len(ids) == 1 else None),
+        span(
+            step,
+            [job.traceparent for job in jobs],
+            kind=str(jobs[0].kind),
+            jobs=len(jobs),
+            job_id=str(jobs[0].id) if len(jobs) == 1 else None,
+            request_ids=ids,
+        ),
+    ):
+        yield
+
+
+def distinct_request_ids(jobs: Sequence[Job]) -> list[str]:
+    """Return each request id once, in the jobs' order; a job without a request adds none."""
+    return list(dict.fromkeys(job.request_id for job in jobs if job.request_id is not None))

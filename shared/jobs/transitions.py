@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import select, update
+from sqlalchemy import and_, or_, select, update
 from sqlalchemy.orm import Session, object_session
 
 from shared.catalog.batch_items import ITEMS_PER_STATEMENT, BatchItem, BatchSource, sync_item_states
-from shared.catalog.database.base import Condition, db_now, db_now_plus
+from shared.catalog.database.base import Condition, affected_rows, db_now, db_now_plus
 from shared.catalog.jobs import (
     CHECKPOINTED_JOBS,
     MODEL_CHANGE_JOBS,
@@ -146,16 +146,22 @@ def cancel_job(job: Job) -> None:
     _drop_lease(job)
 
 
-def cancel_jobs(session: Session, condition: Condition, limit: int | None = None) -> None:
-    """Cancel the unfinished jobs that match the condition, at most `limit` of them."""
+CANCELLED_PER_TRANSACTION = 1000  # a map, a generation or a batch has as many jobs as photos
+
+
+def cancel_jobs(session: Session, condition: Condition) -> int:
+    """Cancel up to CANCELLED_PER_TRANSACTION unfinished jobs that match; return their number.
+
+    The caller makes sure that the steward cancels the others.
+    """
     unfinished = (
         select(Job.id)
         .where(condition, Job.state.in_(UNFINISHED_STATES))
         .order_by(Job.id)  # the lock order of `lock_leased_jobs`
-        .limit(limit)
+        .limit(CANCELLED_PER_TRANSACTION)
         .with_for_update()
     )
-    session.execute(
+    cancelled = session.execute(
         update(Job)
         .where(Job.id.in_(unfinished))
         .values(
@@ -168,6 +174,7 @@ def cancel_jobs(session: Session, condition: Condition, limit: int | None = None
         )
         .execution_options(synchronize_session=False)
     )
+    return affected_rows(cancelled)
 
 
 def retry_job(session: Session, job: Job) -> None:
@@ -235,7 +242,7 @@ def repeat_job(job: Job) -> None:
 
 
 def cancel_batch(session: Session, job: Job) -> None:
-    """Cancel the batch and its unfinished items; photos that are searchable stay.
+    """Cancel the batch and its unfinished items, as `cancel_batch_items`; searchable photos stay.
 
     Raises:
         Conflict: `job_finished`.
@@ -245,7 +252,11 @@ def cancel_batch(session: Session, job: Job) -> None:
 
 
 def cancel_batch_items(session: Session, job: Job) -> None:
-    """Cancel the unfinished items of an ended batch; does nothing for any other job."""
+    """Cancel the unfinished items of an ended batch; does nothing for any other job.
+
+    Of its photos' jobs it cancels as many as `cancel_jobs`. The items of the others stay `running`
+    until the steward calls it again (`cancel_items_of_ended_batches`).
+    """
     if job.kind != JobKind.BATCH:
         return
     own = select(BatchItem.photo_job_id).where(
@@ -257,7 +268,13 @@ def cancel_batch_items(session: Session, job: Job) -> None:
     sync_item_states(session, job)
     session.execute(
         update(BatchItem)
-        .where(BatchItem.job_id == job.id, BatchItem.state.in_(UNFINISHED_STATES))
+        .where(
+            BatchItem.job_id == job.id,
+            or_(
+                BatchItem.state == JobState.QUEUED,
+                and_(BatchItem.state == JobState.RUNNING, BatchItem.already_there),
+            ),
+        )
         .values(state=JobState.CANCELLED)
         .execution_options(synchronize_session=False)
     )

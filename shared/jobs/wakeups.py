@@ -1,4 +1,4 @@
-"""Wakeups: messages that tell workers that the job table may have work for them.
+"""Wakeups: messages on which workers look for jobs in the job table.
 
 A lost wakeup delays a job by seconds and never loses it; a duplicate is harmless. Queries have a
 queue of their own, so that a worker can receive their wakeups first. Which jobs a worker runs is

@@ -75,10 +75,10 @@ def catalog_lag(catalog: Catalog, store: ObjectStore) -> Lag | None:
     Raises:
         Unavailable: as the store; `journal_busy`.
     """
-    return lag_of(catalog, store, list_segments(store))
+    return _lag_of(catalog, store, list_segments(store))
 
 
-def lag_of(catalog: Catalog, store: ObjectStore, segments: list[Segment]) -> Lag | None:
+def _lag_of(catalog: Catalog, store: ObjectStore, segments: list[Segment]) -> Lag | None:
     """Return the lag as `catalog_lag`, for segments that were just listed."""
     for _ in range(MAX_LIST_ATTEMPTS):
         # Read after listing: segments that other stewards have written since are no lag.
@@ -178,7 +178,7 @@ def write_journal(catalog: Catalog, store: ObjectStore) -> JournalWrite:
         if not lines:
             return JournalWrite(written, None)
         segments = list_segments(store)
-        lag = lag_of(catalog, store, segments)
+        lag = _lag_of(catalog, store, segments)
         if lag is not None:
             return JournalWrite(written, lag)
         # The number of a segment that a killed steward left behind is not reused.
@@ -240,11 +240,11 @@ def _commit(session: Session, before: int, number: int, lines: list[Line]) -> bo
     ).all()
     if not updated:
         return False
-    clear_marks(session, lines)
+    _clear_marks(session, lines)
     return True
 
 
-def clear_marks(session: Session, lines: list[Line]) -> None:
+def _clear_marks(session: Session, lines: list[Line]) -> None:
     """Mark the states of the lines as journaled; rows changed since then stay pending."""
     for name in TABLES:
         table = table_of(name)

@@ -27,7 +27,7 @@ BLADE_REACH_M = 0.85
 
 
 @dataclass(frozen=True, slots=True)
-class StreetObject:
+class _StreetObject:
     """A permanent object, drawn as a billboard: the same sprite from every side."""
 
     position: Metres
@@ -37,7 +37,7 @@ class StreetObject:
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
+class _Vehicle:
     """A vehicle: a box whose sides and ends are sprites."""
 
     position: Metres
@@ -48,7 +48,7 @@ class Vehicle:
 
 
 @dataclass(frozen=True, slots=True)
-class VehiclePanel:
+class _VehiclePanel:
     """A vertical sprite fixed in the city; its direction runs left to right as seen."""
 
     start: Metres
@@ -60,7 +60,7 @@ class VehiclePanel:
 
 def _place_street_objects(
     quarter: Quarter, catalogue: Catalogue, number: int
-) -> list[StreetObject]:
+) -> list[_StreetObject]:
     """Place the permanent objects on the pavements of a street."""
     street = quarter.streets[number]
     rng = random_stream(quarter.seed, quarter.name, "standing", number)
@@ -77,21 +77,23 @@ def _place_street_objects(
             while along < street.length - 14.0:
                 index = int(rng.integers(len(catalogue.trees["summer"])))
                 if rng.uniform() < 0.85:
-                    objects.append(StreetObject(on_pavement(along, 0.7), "tree", index))
+                    objects.append(_StreetObject(on_pavement(along, 0.7), "tree", index))
                 along += street.trees * rng.uniform(0.8, 1.25)
         along = 10.0 + rng.uniform(0, 22)
         while along < street.length - 8.0:
-            objects.append(StreetObject(on_pavement(along, 0.35), "lamps", 0))
+            objects.append(_StreetObject(on_pavement(along, 0.35), "lamps", 0))
             along += rng.uniform(22, 30)
         for kind, count in (("posts", rng.poisson(1.6)), ("boxes", rng.poisson(1.4))):
             for _ in range(int(count)):
                 along = rng.uniform(10, max(11.0, street.length - 10))
                 index = int(rng.integers(len(getattr(catalogue, kind))))
-                objects.append(StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
+                objects.append(
+                    _StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index)
+                )
     return objects
 
 
-def _place_vehicles(quarter: Quarter, number: int, day: str) -> list[Vehicle]:
+def _place_vehicles(quarter: Quarter, number: int, day: str) -> list[_Vehicle]:
     """Place the vehicles of one day in a street: parked at both kerbs, and a few driving."""
     street = quarter.streets[number]
     rng = random_stream(quarter.seed, quarter.name, "vehicles", number, day)
@@ -104,14 +106,14 @@ def _place_vehicles(quarter: Quarter, number: int, day: str) -> list[Vehicle]:
                 index = _choose_vehicle(rng)
                 middle = street.start + street.direction * along
                 vehicles.append(
-                    Vehicle(middle + street.left * side * lane, street.direction * -side, index)
+                    _Vehicle(middle + street.left * side * lane, street.direction * -side, index)
                 )
             along += 6.2 + rng.uniform(0, 1.5)
     for _ in range(int(rng.poisson(0.7))):
         side = float(rng.choice([-1.0, 1.0]))
         middle = street.start + street.direction * rng.uniform(10, street.length - 10)
         vehicles.append(
-            Vehicle(
+            _Vehicle(
                 middle + street.left * side * lane * 0.4,
                 street.direction * -side,
                 _choose_vehicle(rng),
@@ -127,8 +129,8 @@ def _choose_vehicle(rng: np.random.Generator) -> int:
 
 
 def _vehicle_panels(
-    vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres
-) -> list[VehiclePanel]:
+    vehicle: _Vehicle, catalogue: Catalogue, seen_from: Metres
+) -> list[_VehiclePanel]:
     """Return the panels of a vehicle (side, end, windscreen) that are visible from a point."""
     side = catalogue.vehicle_sides[vehicle.index]
     front = catalogue.vehicle_fronts[vehicle.index]
@@ -139,23 +141,23 @@ def _vehicle_panels(
     panels = []
     if away @ left > half_width:  # seen from the left, its front is on the left
         start = vehicle.position + left * half_width + ahead * half_length
-        panels.append(VehiclePanel(start, -ahead, side, ("side", vehicle.index)))
+        panels.append(_VehiclePanel(start, -ahead, side, ("side", vehicle.index)))
     elif away @ left < -half_width:
         start = vehicle.position - left * half_width - ahead * half_length
-        panels.append(VehiclePanel(start, ahead, side, ("side", vehicle.index), mirrored=True))
+        panels.append(_VehiclePanel(start, ahead, side, ("side", vehicle.index), mirrored=True))
     screen = catalogue.vehicle_screens[vehicle.index]
     to_front, to_back = (half_length - metres for metres in catalogue.cabins[vehicle.index])
     if away @ ahead > half_length:
         start = vehicle.position + ahead * half_length - left * half_width
-        panels.append(VehiclePanel(start, left, front, ("front", vehicle.index)))
+        panels.append(_VehiclePanel(start, left, front, ("front", vehicle.index)))
         start = vehicle.position + ahead * to_front - left * half_width
-        panels.append(VehiclePanel(start, left, screen, ("screen", vehicle.index)))
+        panels.append(_VehiclePanel(start, left, screen, ("screen", vehicle.index)))
     elif away @ ahead < -half_length:
         start = vehicle.position - ahead * half_length + left * half_width
         rear = catalogue.vehicle_rears[vehicle.index]
-        panels.append(VehiclePanel(start, -left, rear, ("rear", vehicle.index)))
+        panels.append(_VehiclePanel(start, -left, rear, ("rear", vehicle.index)))
         start = vehicle.position + ahead * to_back + left * half_width
-        panels.append(VehiclePanel(start, -left, screen, ("screen", vehicle.index)))
+        panels.append(_VehiclePanel(start, -left, screen, ("screen", vehicle.index)))
     return panels
 
 
@@ -241,7 +243,7 @@ class VisibleObjects:
                 from_right = away[0] * outwards[1] - away[1] * outwards[0] > 0
                 start = foot if from_right else foot + outwards * BLADE_REACH_M
                 direction = outwards if from_right else -outwards
-                panel = VehiclePanel(
+                panel = _VehiclePanel(
                     start, direction, self.catalogue.blades[index], ("blade", index)
                 )
                 item = _panel_item(camera, panel, slopes)
@@ -249,7 +251,7 @@ class VisibleObjects:
                     yield item
 
     def _billboard(
-        self, camera: Camera, session: CaptureSession, street_object: StreetObject
+        self, camera: Camera, session: CaptureSession, street_object: _StreetObject
     ) -> VisibleSprite | None:
         away = street_object.position - camera.position
         depth = float(away @ camera.forward)
@@ -287,7 +289,7 @@ def _is_visible(camera: Camera, positions: list[Metres], within: float) -> list[
     return [int(i) for i in np.flatnonzero(seen)]
 
 
-def _panel_item(camera: Camera, panel: VehiclePanel, slopes: Floats) -> VisibleSprite | None:
+def _panel_item(camera: Camera, panel: _VehiclePanel, slopes: Floats) -> VisibleSprite | None:
     """Project a panel to canvas columns; None if it is not visible."""
     width = panel.picture.width
     ends = np.stack([panel.start, panel.start + panel.direction * width]) - camera.position

@@ -94,8 +94,6 @@ def random_stream(*key: int | str) -> np.random.Generator:
     )
 
 
-CODE_TRANSPARENT = 0
-"""Transparent"""
 CODE_FIRST_PANE = 1
 PANE_CODES = 8
 """Codes 1 to 8: window panes; each session lights some of them"""

@@ -55,7 +55,7 @@ def with_training_layout(plan: CityPlan, layout: TrainingLayoutName) -> CityPlan
     return CityPlan(plan.options, plan.quarters, photos)
 
 
-def write_training_table(plan: CityPlan, out: Path) -> None:
+def _write_training_table(plan: CityPlan, out: Path) -> None:
     """Write the CSV table of the training photos, in the layout of their folder."""
     city = city_name(plan.options)
     train = sorted((s for s in plan.photos if s.role == "train"), key=lambda photo: photo.number)
@@ -136,7 +136,7 @@ def write_city(
             (out / folder).mkdir(parents=True, exist_ok=True)
         _render_all(plan, out, on_progress)
         if plan.options.train:
-            write_training_table(plan, out)
+            _write_training_table(plan, out)
         (out / "city.json").write_text(json.dumps(describe_city(plan), indent=1) + "\n")
     except OSError as error:
         raise Misconfigured("out_unwritable", f"Can't write to {out}: {error}.") from error

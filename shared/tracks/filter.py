@@ -63,7 +63,7 @@ ENTERING = 0.005
 OUTSIDE_GAIN = 0.7
 """Share of the track's gain above CHANCE_GAIN that a frame outside the map must fall below"""
 CHANCE_GAIN = 0.45
-"""A track that gains no more than this by its frames cannot be told from one outside the map"""
+"""A track that gains no more than this by its frames is not distinguishable from one outside"""
 MAX_GAIN_WEIGHT = 200.0
 """Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
 NEWS_WEIGHT = 1.5
@@ -71,7 +71,7 @@ NEWS_WEIGHT = 1.5
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
-"""A camera that may have moved farther is carried away as far as the filter knows"""
+"""A camera that may have moved farther may be anywhere in the map, as if carried away"""
 MAX_PHOTOS = 300
 """of a belief; the least probable ones beyond go back to `elsewhere`"""
 MOVING_PHOTOS = 100

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from shared.errors import InvalidRequest
+
 TYPICAL_SHARE = 0.4
 """Typical speed of a motion model that is given by its maximum, as a share of the maximum"""
 
@@ -48,3 +50,15 @@ def motion_model(motion: str | float) -> MotionModel:
             f"not {motion!r}."
         )
     return MotionModel(f"{speed:g}", speed * TYPICAL_SHARE, speed)
+
+
+def parse_motion(text: str) -> MotionModel:
+    """Parse `walk`, `bicycle`, `car`, `train` or a maximum speed.
+
+    Raises:
+        InvalidRequest: `bad_motion`.
+    """
+    try:
+        return motion_model(text)
+    except ValueError as error:
+        raise InvalidRequest("bad_motion", str(error)) from error

@@ -1,7 +1,7 @@
 """The map as a filter sees it: photos, and which of them are near each other.
 
 Photos with coordinates are near each other by their distance. For photos without, the map's own
-sequences tell the way: photos that were taken one after the other are as far apart as a camera
+sequences give the distances: photos taken one after the other are as far apart as a camera
 moves at its typical speed between them, and photos with the same label show the same place.
 """
 

@@ -115,7 +115,7 @@ class Town:
 
 
 class Visitor:
-    """One window; `faults` and `foreign` are what went wrong in it, and who else was asked."""
+    """One window, its errors (`faults`) and its requests to other servers (`foreign`)."""
 
     def __init__(self, context: BrowserContext, url: str) -> None:
         self.url = url
@@ -124,19 +124,19 @@ class Visitor:
         self.faults: list[str] = []
         self.foreign: list[str] = []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
-        self.page.on("console", self._heard)
-        self.page.on("request", self._asked)
+        self.page.on("console", self._on_console)
+        self.page.on("request", self._on_request)
 
     def untroubled(self) -> None:
-        """The page has told of no error."""
+        """Check that the page shows no error."""
         expect(self.page.locator(".note.bad")).to_have_count(0)
 
-    def _heard(self, message: Any) -> None:
+    def _on_console(self, message: Any) -> None:
         # A refusal of the server is shown on the page; the browser writes it down as well.
         if message.type in ("error", "warning") and "Failed to load resource" not in message.text:
             self.faults.append(message.text)
 
-    def _asked(self, request: Any) -> None:
+    def _on_request(self, request: Any) -> None:
         parts = urlsplit(request.url)
         if parts.scheme in ("http", "https") and parts.netloc != urlsplit(self.url).netloc:
             self.foreign.append(request.url)
@@ -162,8 +162,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 
 @pytest.fixture
 def visitor(context: BrowserContext, town: Town) -> Iterator[Visitor]:
-    """A window on the town; afterwards the browser must have nothing to complain of, and nobody
-    else may have been asked for anything."""
+    """A window on the town; it must have no errors and send nothing to other servers."""
     visiting = Visitor(context, town.url)
     yield visiting
     assert visiting.faults == []

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import FilePayload, Page, expect
 
 from tests.browser.conftest import Town, Visitor
-from tests.support.photos import photo_bytes
+from tests.support.photos import encoded, photo_bytes, photo_image
 
 NO_PHOTO: FilePayload = {
     "name": "notes.jpg",
@@ -97,6 +97,24 @@ def test_test_photos_are_measured_with_and_never_found(page: Page, town: Town) -
     expect(page.locator(".facts")).to_contain_text("no: a test photo")
 
 
+def test_a_photo_that_can_not_be_described_is_marked_with_the_reason(
+    page: Page, visitor: Visitor
+) -> None:
+    whole = encoded(photo_image(4, 640, 480), "JPEG")
+    damaged = whole[: len(whole) // 2]
+    add(page, {"name": "damaged.jpg", "mimeType": "image/jpeg", "buffer": damaged}, photo(1))
+    expect(page.locator(".queue-row.done, .queue-row.failed")).to_have_count(2)
+    page.get_by_role("link", name="See the photos").click()
+    marked = page.locator(".photo-card", has=page.get_by_text("not searchable"))
+    expect(marked.locator(".photo-name")).to_have_text("damaged.jpg")
+    marked.locator("a").click()
+    expect(page.locator(".facts .bad")).to_contain_text("can't be decoded")
+    visitor.visit("ask")
+    expect(page.locator(".mosaic a")).to_have_count(1)
+    visitor.visit("status")
+    expect(page.get_by_role("row", name="Photo failed")).to_contain_text("can't be decoded")
+
+
 def test_a_photo_of_a_folder_is_named_with_its_path(page: Page, town: Town, tmp_path: Path) -> None:
     folder = tmp_path / "Italy" / "Day 2"
     folder.mkdir(parents=True)
@@ -125,7 +143,7 @@ def test_a_job_is_polled_where_events_do_not_arrive(page: Page, town: Town) -> N
     expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")
 
 
-def test_a_lost_connection_is_said_and_the_photo_sent_again(page: Page, town: Town) -> None:
+def test_a_lost_connection_is_shown_and_the_photo_sent_again(page: Page, town: Town) -> None:
     page.route("**/api/v1/upload?*", lambda route: route.abort())
     add(page, photo(1))
     expect(page.locator(".queue-row.failed .errors")).to_contain_text("connection")

@@ -167,10 +167,32 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     }
     found["estimate"] |= {**nowhere, "reason": "The most similar photo has no place."}
     found["estimate"] |= {"radius_m": None, "radius_68_m": None, "radius_95_m": None}
+    for photo in found["similar_images"]:
+        photo |= {"latitude": None, "place": None, "match_probability": None}
     visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
     page = ask(visitor, town.queries[0])
     expect(page.locator(".badge")).to_have_text("No estimate")
     expect(page.locator(".reason")).to_have_text("The most similar photo has no place.")
+    page.locator(".figures summary").click()
+    expect(page.locator(".figures p")).to_contain_text("in the order of their similarity")
+    expect(page.locator(".figures th")).to_have_text(["Rank", "Photo", "Similarity"])
+
+    page.unroute("**/api/v1/similarity?*")
+    with page.expect_request("**/api/v1/similarity?*box=*"):
+        page.get_by_role("button", name="Search only photos with coordinates").click()
+    expect(page.locator(".badge")).not_to_have_text("No estimate")
+
+
+def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, town: Town) -> None:
+    found = town.ask(town.queries[0])
+    for photo in found["similar_images"]:
+        name = {"original_filename": "a_name_without_a_space_" * 4 + ".jpg", "relative_path": None}
+        photo |= {**name, "latitude": None, "place": "building/floor_7/" * 4}
+    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
+    visitor.page.set_viewport_size({"width": 320, "height": 640})
+    page = ask(visitor, town.queries[0])
+    page.locator(".figures summary").click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
 def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
@@ -202,7 +224,7 @@ def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
     assert similarity == pytest.approx(best["similarity_score"], abs=0.05)
 
 
-def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:
+def test_a_pasted_photo_is_a_query(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("ask")
     expect(page.locator(".mosaic")).to_be_visible()
     page.evaluate(
@@ -242,7 +264,7 @@ def test_what_is_no_photo_gets_the_reason(visitor: Visitor) -> None:
     expect(page.locator(".refused")).to_contain_text("JPEG")
 
 
-def test_a_match_is_shown_beside_the_photo_with_what_speaks_for_it(
+def test_a_match_is_shown_beside_the_photo_with_its_explanation(
     visitor: Visitor, town: Town
 ) -> None:
     page = ask(visitor, town.queries[0])

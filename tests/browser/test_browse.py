@@ -7,6 +7,16 @@ from playwright.sync_api import Dialog, expect
 from tests.browser.conftest import MAP, Town, Visitor
 from tests.support.photos import photo_bytes
 
+COVERED_LABELS = """() => {
+    const covers = [...document.querySelectorAll(".streets-button, .leaflet-control-scale-line")];
+    const boxes = covers.map((element) => element.getBoundingClientRect());
+    return [...document.querySelectorAll(".graticule-label")].filter((label) => {
+        const { left, right, top, bottom } = label.getBoundingClientRect();
+        return boxes.some((box) =>
+            left < box.right && right > box.left && top < box.bottom && bottom > box.top);
+    }).map((label) => label.textContent);
+}"""
+
 
 def bring_in(town: Town, *names: str) -> list[str]:
     """Photos of the map `riverside` that no other test counts on; their ids."""
@@ -42,16 +52,17 @@ def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, town: Town)
     assert 0 < near["total_found"] < everything
     expect(page.locator(".photo-card")).to_have_count(near["total_found"])
     page.get_by_label("Name").fill("no such photo")
-    expect(page.get_by_role("heading", name="No photo passes the filter")).to_be_visible()
+    expect(page.get_by_role("heading", name="No photo matches the filter")).to_be_visible()
 
 
 def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> None:
     page = visitor.visit("photos")
-    # While the map is being loaded, the photos are asked for anew.
+    # While the map is being loaded, the photos are requested again.
     page.get_by_label("Tags").fill("spring")
     page.get_by_role("button", name="Show the map").click()
     expect(page.locator("path.point").first).to_be_attached()
     expect(page.locator(".graticule-label").first).to_be_visible()
+    assert page.evaluate(COVERED_LABELS) == []
     page.locator(".ground").focus()
     page.keyboard.press("Enter")
     expect(page.get_by_label("Near")).not_to_have_value("")
@@ -80,6 +91,15 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> N
     page.get_by_role("button", name="Delete", exact=True).click()
     expect(page.locator(".photo-card")).to_have_count(1)
     assert town.get("/search", filename="tagged-")["total_found"] == 1
+
+
+def test_coordinates_are_shown_without_rounding_errors(visitor: Visitor, town: Town) -> None:
+    (photo_id,) = bring_in(town, "rounded.jpg")
+    town.server.client.patch(
+        f"/api/v1/uploads/{photo_id}", params={"map": MAP}, json={"longitude": 8.700000000000001}
+    ).raise_for_status()
+    page = visitor.visit(f"photo/{photo_id}")
+    expect(page.get_by_label("Longitude")).to_have_value("8.7")
 
 
 def test_a_photo_is_moved_and_named(visitor: Visitor, town: Town) -> None:

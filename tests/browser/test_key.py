@@ -35,7 +35,7 @@ def give(page: Page, key: str) -> None:
     page.get_by_role("button", name="Go on").click()
 
 
-def test_the_key_is_asked_for_once_and_kept_for_the_tab_alone(page: Page) -> None:
+def test_the_key_is_requested_once_and_stored_for_the_tab_alone(page: Page) -> None:
     expect(page.get_by_role("dialog")).to_contain_text("needs a key")
     give(page, "x" * 20)
     expect(page.get_by_role("dialog")).to_contain_text("does not know this key")

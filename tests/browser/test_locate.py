@@ -48,15 +48,18 @@ def test_a_folder_is_located_accepted_by_probability_and_downloaded(
     take_photo(picture, folder / "soon.jpg", 5, None)
     take_photo(town.queries[0], folder / "much later.jpg", 7200, None)
     (folder / "broken.jpg").write_bytes((folder / "soon.jpg").read_bytes()[:100])
+    (folder / "empty.jpg").touch()
 
     page = visitor.visit("add")
     page.get_by_role("link", name="Locate a folder").click()
     page.locator("input[data-use=locate]").set_input_files(sorted(folder.iterdir()))
-    expect(page.locator("tbody tr")).to_have_count(3)
+    expect(page.locator("tbody tr")).to_have_count(4)
     soon = page.locator("tr", has_text="soon.jpg")
     expect(soon).to_contain_text("accepted")
     expect(soon).to_contain_text("taken 5 s after known.jpg")
     expect(page.locator("tr", has_text="broken.jpg")).to_contain_text("damaged")
+    expect(page.locator("tr", has_text="empty.jpg")).to_contain_text("The file is empty.")
+    expect(page.locator(".chip.failed")).to_have_count(2)
     expect(page.locator("path.point.behind")).to_have_count(1)
     expect(page.locator("path.point.tracking").first).to_be_attached()
 
@@ -75,7 +78,7 @@ def test_a_folder_is_located_accepted_by_probability_and_downloaded(
     page.get_by_label("Accept from").fill("100")
     page.get_by_label("Accept from").blur()
     expect(page.get_by_role("button", name="Download CSV")).to_have_count(0)
-    expect(page.get_by_text("3 photos without coordinates, 0 accepted").first).to_be_visible()
+    expect(page.get_by_text("4 photos without coordinates, 0 accepted").first).to_be_visible()
     visitor.untroubled()
 
 

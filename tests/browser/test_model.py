@@ -15,7 +15,7 @@ def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
     page = visitor.visit("model")
     expect(page.locator(".standing .chip")).to_have_text("Foreign")
     page.get_by_role("button", name="Fit a vocabulary…").click()
-    page.get_by_label("Photos to learn from, at most").fill("60")
+    page.get_by_label("Photos to fit on, at most").fill("60")
     page.get_by_role("button", name="Fit it", exact=True).click()
     expect(page.get_by_role("progressbar", name="Fitting a vocabulary")).to_be_visible()
     expect(page.locator(".standing .chip")).to_have_text("Its own")
@@ -43,7 +43,7 @@ def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
     return list(newest.values())
 
 
-def test_the_state_of_things_is_told(visitor: Visitor, town: Town) -> None:
+def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("status")
     expect(page.locator(".parts li")).to_have_count(5)
     expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
@@ -70,11 +70,11 @@ def test_a_phone_gets_the_address_as_a_code_where_it_can_reach_the_server(
     assert code.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 100
 
 
-def test_a_new_map_is_made_and_chosen(visitor: Visitor, town: Town) -> None:
+def test_a_new_map_is_created_and_selected(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("photos")
     page.locator("#map-choice").select_option(label="New map…")
     page.get_by_label("Name").last.fill("old-town")
-    page.get_by_role("button", name="Make it").click()
+    page.get_by_role("button", name="Create").click()
     expect(page.get_by_role("heading", name="This map has no photos yet")).to_be_visible()
     expect(page.locator("#map-choice")).to_have_value("old-town")
     assert "old-town" in [one["name"] for one in town.server.client.get("/api/v1/maps").json()]

@@ -66,7 +66,7 @@ def test_compose_file_makes_a_placewise_that_works_and_ends_in_time(
     for once in ("migrate", "create-bucket") * 2:  # again at each `docker compose up`
         assert machine.run_once(once) == 0, machine.log(once)
 
-    # The passwords are asked for.
+    # Passwords are required.
     assert machine.run_once("create-bucket", S3_SECRET_KEY="another") == 1
     redis = f"redis://127.0.0.1:{machine.port('redis')}"
     with Redis.from_url(redis) as stranger, pytest.raises(RedisError):

@@ -107,7 +107,7 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
             upload(catalog_on_postgres, store, map_id, photo_bytes(number))
         wakeups.send(WakeupQueue.BULK)
 
-        # Drains of before Flower heard of the worker need not be there.
+        # Drains of before Flower knew the worker need not be there.
         def drains() -> list[dict[str, Any]]:
             tasks = flower.get("/api/tasks").json().values()
             done = [task for task in tasks if task["state"] == "SUCCESS"]

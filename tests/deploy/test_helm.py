@@ -380,12 +380,30 @@ def test_backups_go_to_a_volume_that_outlives_the_release() -> None:
     assert folder.startswith(mounts["backups"])
     volumes = {one["name"]: one for one in pod(backup)["spec"]["volumes"]}
     claim = volumes["backups"]["persistentVolumeClaim"]["claimName"]
-    (kept,) = (
+    (volume_claim,) = (
         one
         for one in of_kind("production", "PersistentVolumeClaim")
         if one["metadata"]["name"] == claim
     )
-    assert kept["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
+    assert volume_claim["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
+
+
+def test_a_restore_is_the_backups_job_with_another_word_and_needs_no_service() -> None:
+    """As docs/how-to/kubernetes.md has it: two templates, and the second argument."""
+    files = helm_of_example("production")["files"]
+    texts = [files[f"placewise/templates/{name}.yaml"] for name in ("settings", "backup")]
+    made = [one for text in texts for one in yaml.safe_load_all(text) if one]
+    (job,) = [one for one in made if one["kind"] == "CronJob"]
+    names = {(one["kind"], one["metadata"]["name"]) for one in made}
+    assert job["metadata"]["name"] == "placewise-backup"
+    pod = job["spec"]["jobTemplate"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    assert container["args"] == ["placewise", "backup", "/backups/placewise"]
+    assert ("ConfigMap", container["envFrom"][0]["configMapRef"]["name"]) in names
+    (claim,) = [v["persistentVolumeClaim"] for v in pod["volumes"] if "persistentVolumeClaim" in v]
+    assert ("PersistentVolumeClaim", claim["claimName"]) in names
+    kinds = {"CronJob", "PersistentVolumeClaim", "ConfigMap", "ExternalSecret"}
+    assert {kind for kind, _ in names} == kinds, "no service is started"
 
 
 def test_the_page_is_reached_over_tls() -> None:

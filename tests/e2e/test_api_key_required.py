@@ -78,7 +78,7 @@ def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:
 def test_every_described_call_needs_the_key(stranger: httpx2.Client, key: str) -> None:
     described = stranger.get("/openapi.json").json()
     assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
-    asked = 0
+    calls = 0
     for path, methods in described["paths"].items():
         for method, call in methods.items():
             if not path.startswith(API) and path != "/metrics":
@@ -92,8 +92,8 @@ def test_every_described_call_needs_the_key(stranger: httpx2.Client, key: str) -
                 answer = stranger.request(method.upper(), real, headers=headers)
                 problem(answer, 401, code)
                 assert answer.headers["www-authenticate"] == "Bearer"
-                asked += 1
-    assert asked > 40
+                calls += 1
+    assert calls > 40
 
 
 @pytest.mark.parametrize(

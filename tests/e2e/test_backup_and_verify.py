@@ -64,7 +64,9 @@ def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
     assert run(server.home, "verify")["faults"] == []
 
 
-def test_one_scrape_of_the_embedded_server_tells_of_all_its_parts(server: ServerProcess) -> None:
+def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
+    server: ServerProcess,
+) -> None:
     server.indexed(photo_bytes(20))
     assert server.ask(photo_bytes(21)).is_success
     text = read(server.client.get("/metrics").text)

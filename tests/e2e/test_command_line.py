@@ -202,7 +202,7 @@ def test_index_reads_places_from_a_table(
     (folder / "upstairs").mkdir(parents=True)
     (folder / "hall.jpg").write_bytes(photo_bytes(101))
     (folder / "upstairs" / "bath.jpg").write_bytes(with_gps(102))
-    (folder / "unsaid.jpg").write_bytes(photo_bytes(103))
+    (folder / "plain.jpg").write_bytes(photo_bytes(103))
     table = tmp_path / "places.csv"
     with table.open("w", newline="") as file:
         rows = csv.writer(file)
@@ -213,7 +213,7 @@ def test_index_reads_places_from_a_table(
     assert (report["photos"], report["refused"], report["failed"]) == (3, [], [])
     assert report["fitted"] is None, "the map has a vocabulary of its own"
     images = server.client.get("/api/v1/search", params={"limit": 3}).json()["images"]
-    said = {
+    expected = {
         image["original_filename"]: (
             image["latitude"],
             image["longitude"],
@@ -222,10 +222,10 @@ def test_index_reads_places_from_a_table(
         )
         for image in images
     }
-    assert said == {
+    assert expected == {
         "hall.jpg": (45.25, 7.5, "hall", ["night", "rain"]),
         "bath.jpg": (45.5, 7.25, "bath", []),
-        "unsaid.jpg": (None, None, None, []),
+        "plain.jpg": (None, None, None, []),
     }
 
 
@@ -259,13 +259,13 @@ def test_index_takes_the_zone_of_short_names(
 
 @pytest.mark.usefixtures("indexed")
 def test_query_finds_the_place(placewise: CommandLine, tmp_path: Path) -> None:
-    asked = tmp_path / "where.jpg"
-    asked.write_bytes(photo_bytes(2))
-    answer = placewise("query", asked, "--top-k", "2", "--json").json()
+    photo = tmp_path / "where.jpg"
+    photo.write_bytes(photo_bytes(2))
+    answer = placewise("query", photo, "--top-k", "2", "--json").json()
     assert answer["query_filename"] == "where.jpg"
     assert answer["similar_images"][0]["original_filename"] == UTM_WITH_DEGREES
     assert answer["total_similar"] == 2
-    strict = placewise("query", asked, "--min-score", "0.999", "--json").json()
+    strict = placewise("query", photo, "--min-score", "0.999", "--json").json()
     assert strict["total_similar"] == 1
 
     (tmp_path / "exif.jpg").write_bytes(with_gps(0))
@@ -317,6 +317,8 @@ def test_commands_name_the_map_and_the_server_that_they_use(
 ) -> None:
     url = str(server.client.base_url)
     assert f"Indexing into map default of {url}" in indexed.without_the_broken.stderr
+    home = shlex.quote(str(server.home))
+    assert f"Next: PLACEWISE_HOME={home} " in indexed.without_the_broken.stderr
     elsewhere = CommandLine(tmp_path, tmp_path / "other home")
     assert elsewhere("maps", "create", "yard", "--server", url).code == 0
     report = elsewhere("index", indexed.folder, "--map", "yard", "--no-fit", "--server", url)

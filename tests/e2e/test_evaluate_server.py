@@ -1,4 +1,4 @@
-"""`placewise evaluate --data DIR --server URL`: a data set asked of a running service."""
+"""`placewise evaluate --data DIR --server URL`: a data set evaluated with a running service."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def folder_of(tmp_path: Path, *photos: bytes) -> None:
 
 
 def table_of(tmp_path: Path, text: str) -> Path:
-    table = tmp_path / "said.csv"
+    table = tmp_path / "places.csv"
     table.write_text(text)
     return table
 
@@ -48,7 +48,7 @@ def test_a_corrected_table_is_refused_by_name_and_taken_with_update(
     [photo] = server.client.get("/api/v1/search", params={"near": "45,7,1"}).json()["images"]
     assert photo["tags"] == ["a", "b"]
     assert photo["captured_at"] == "2026-05-01T00:00:00Z"
-    # What is said as before is no difference.
+    # Unchanged metadata is no difference.
     assert index(server, tmp_path, "--csv", table)["already_there"] == 1
 
 

@@ -62,7 +62,7 @@ def post(server: ServerProcess, job_id: str, verb: str) -> httpx2.Response:
     return server.client.post(f"{JOBS}/{job_id}/{verb}")
 
 
-def test_a_job_tells_its_story(server: ServerProcess) -> None:
+def test_a_job_has_its_times_progress_and_result(server: ServerProcess) -> None:
     uploaded = server.upload(photo_bytes(next(fresh))).json()
     job = server.finished(uploaded["job_id"])
     assert job["job_id"] == uploaded["job_id"]

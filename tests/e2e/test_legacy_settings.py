@@ -112,7 +112,7 @@ def test_the_published_env_and_calls_work_and_health_names_the_missing_weights(
             "POST",
             "/api/v1/upload",
             files={"file": ("street.jpg", photo_bytes(1))},
-            headers={"Prefer": "wait=30"},
+            headers={"Prefer": "wait=10"},  # all of it passes
         )
         assert uploaded.status_code == 202
         assert "nowhere.pth" in uploaded.json()["message"]

@@ -49,6 +49,7 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     (trip / "of the map.jpg").write_bytes(taken(3, 5))
     (trip / "later.jpg").write_bytes(taken(900, 10))
     (trip / "broken.jpg").write_bytes(taken(4, 0)[:300])
+    (trip / "empty.jpg").touch()
     before = {path.name: path.read_bytes() for path in trip.iterdir()}
 
     def locate(*options: str) -> subprocess.CompletedProcess[str]:
@@ -57,10 +58,11 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     run = locate("--accept", "0.9", "--json")
     assert run.returncode == 1, "a photo could not be read"
     answer = json.loads(run.stdout)
-    assert (answer["photos"], answer["with_coordinates"]) == (4, 1)
+    assert (answer["photos"], answer["with_coordinates"]) == (5, 1)
     proposals = {each["filename"]: each for each in answer["proposals"]}
     assert "damaged" in proposals["broken.jpg"]["error"]
     assert proposals["broken.jpg"]["position"] is None
+    assert proposals["empty.jpg"]["error"] == "The file is empty."
     by_both = proposals["of the map.jpg"]
     assert by_both["accepted"]
     assert by_both["position"]["latitude"] == pytest.approx(3 * DEGREES_APART, abs=2e-4)

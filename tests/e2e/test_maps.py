@@ -329,7 +329,7 @@ def test_maps_are_created_filled_searched_and_deleted_by_command(
     assert figures["labelled_queries"]["queries"] == 3
     assert figures["labelled_queries"]["R@1"] == 1
     result = run_command("maps", "delete", name, env=env, cwd=tmp_path)
-    assert result.returncode != 0, "nobody said yes"
+    assert result.returncode != 0, "nobody confirmed"
     assert placewise("maps", "delete", name, "--yes")["deleted_map"] == name
     chosen = ("--extractor", "test-tiny-vlad", "--preprocessing", "demo1024")
     other = placewise("maps", "create", next(names), *chosen)

@@ -223,7 +223,7 @@ def test_one_model_change_at_a_time(server: ServerProcess, before: Before) -> No
         cancelled = server.client.post(f"/api/v1/jobs/{running}/cancel")
         assert got(cancelled)["state"] == "cancelled"
     left = {path.name for path in (server.home / "objects" / "vocabularies").iterdir()}
-    assert left == stored, "the refused vocabulary is not kept"
+    assert left == stored, "the rejected vocabulary is not stored"
     problem(server.client.post(f"/api/v1/jobs/{running}/retry"), 409, "job_not_retryable")
     assert active(server)["generation_id"] == answering
     assert got(server.similar(before.photos[0]))["generation_id"] == answering

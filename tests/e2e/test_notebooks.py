@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from nbclient import NotebookClient
 
+from tests.support.processes import forked_program
 from tests.support.training_runs import write_tiny_places
 
 REPOSITORY = Path(__file__).parents[2]
@@ -45,7 +46,10 @@ def run_notebook(name: str, parameters: str, folder: Path) -> None:
     notebook: Any = nbformat.read(file, as_version=4)  # type: ignore[no-untyped-call]
     assert all(not cell.get("outputs") for cell in notebook.cells), "commit it without outputs"
     (cell,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
-    cell.source += f"\n{parameters}"
+    # The notebooks run `python -c "from services.cli import main; main()" ARGUMENTS`. A fork has
+    # imported that.
+    python = forked_program(folder / "python", prefix="shift 2")
+    cell.source += f"\nimport sys\nsys.executable = {str(python)!r}\n{parameters}"
     resources = {"metadata": {"path": str(folder)}}
     NotebookClient(notebook, timeout=CELL_SECONDS, resources=resources).execute()
 

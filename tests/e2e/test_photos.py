@@ -51,7 +51,7 @@ def file_id(server: ServerProcess) -> str:
 # --- one photo -------------------------------------------------------------------------------
 
 
-def test_a_photo_tells_all_that_is_known_of_it(server: ServerProcess, file_id: str) -> None:
+def test_a_photo_has_all_its_metadata(server: ServerProcess, file_id: str) -> None:
     found = got(server.client.get(url(file_id)))
     uploaded, taken = found.pop("upload_time"), found.pop("captured_at")
     assert datetime.fromisoformat(uploaded).utcoffset() == timedelta(0)
@@ -296,7 +296,7 @@ def test_photos_are_found_by_each_filter(
     assert names(server, filename="streets") == []
     assert names(server, tags=["even"]) == streets_named(0, 2, 4)
     assert names(server, tags=["50%_off"]) == streets_named(1, 3)
-    assert names(server, tags=["even", "odd"]) == [], "all tags are wanted"
+    assert names(server, tags=["even", "odd"]) == [], "a photo must have all tags"
     assert names(server, tags=["eve"]) == [], "a part of a tag is another tag"
 
     large = streets[-1]["file_size"]

@@ -17,6 +17,7 @@ import httpx2
 import pytest
 
 from tests.support.photos import near_copy, photo_bytes
+from tests.support.processes import forked_program
 
 REPOSITORY = Path(__file__).parents[2]
 README = REPOSITORY / "README.md"
@@ -45,9 +46,16 @@ def commands() -> list[Command]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the photos that the README speaks of, beside a `.venv`."""
+    """A folder with the photos that the README speaks of, beside a `.venv`.
+
+    Its `placewise` is a fork: twelve new interpreters would import the same.
+    """
     folder = tmp_path_factory.mktemp("newcomer")
-    (folder / ".venv").symlink_to(REPOSITORY / ".venv")
+    programs = folder / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    for name in ("lib", "pyvenv.cfg", "bin/python"):
+        (folder / ".venv" / name).symlink_to(REPOSITORY / ".venv" / name)
+    forked_program(programs / "placewise")
     (folder / "street.jpg").write_bytes(photo_bytes(1))
     (folder / "again.jpg").write_bytes(near_copy(1))
     (folder / "photos").mkdir()

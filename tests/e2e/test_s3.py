@@ -50,8 +50,8 @@ def test_photos_are_described_found_and_deleted_in_the_bucket(
 
     found = server.similar(photos[0]).json()["similar_images"]
     assert {photo["image_id"] for photo in found} == set(photos[1:])
-    asked = server.ask(photo_bytes(1)).json()["similar_images"]
-    assert asked[0]["image_id"] == photos[1]
+    found = server.ask(photo_bytes(1)).json()["similar_images"]
+    assert found[0]["image_id"] == photos[1]
     image = server.client.get(f"/api/v1/uploads/{photos[2]}/image")
     assert image.content == photo_bytes(2)
     assert server.client.get(f"/api/v1/uploads/{photos[2]}/thumbnail").status_code == 200
@@ -69,12 +69,12 @@ def test_photos_are_described_found_and_deleted_in_the_bucket(
 
 
 def test_what_is_in_the_bucket_is_there_at_the_next_start(server: ServerProcess) -> None:
-    photo = server.indexed(photo_bytes(10), "kept.jpg")
+    photo = server.indexed(photo_bytes(10), "new.jpg")
     server.kill()
     server.start()
     assert server.client.get(f"/api/v1/uploads/{photo}/image").content == photo_bytes(10)
-    asked = server.ask(photo_bytes(10)).json()["similar_images"]
-    assert asked[0]["image_id"] == photo
+    found = server.ask(photo_bytes(10)).json()["similar_images"]
+    assert found[0]["image_id"] == photo
 
 
 def test_refused_upload_leaves_nothing_in_the_bucket(server: ServerProcess, bucket: Bucket) -> None:
@@ -89,9 +89,9 @@ def test_placewise_does_not_start_without_its_object_store(tmp_path: Path) -> No
         "serve", env=environment(tmp_path / "home", **nobody.variables("placewise")), cwd=tmp_path
     )
     assert ended.returncode == 1, ended.stderr
-    said = [line for line in ended.stderr.splitlines() if "object_store_unavailable: " in line]
-    assert said, ended.stderr
-    assert nobody.endpoint in said[0]
+    errors = [line for line in ended.stderr.splitlines() if "object_store_unavailable: " in line]
+    assert errors, ended.stderr
+    assert nobody.endpoint in errors[0]
     assert "Traceback" not in ended.stderr
 
 

@@ -51,7 +51,7 @@ def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Pro
 
 
 def ask(port: HttpSearchClient, home: Path, file_id: str) -> SearchResponse:
-    """The photos most similar to a stored one, asked of the shards without a gateway."""
+    """The photos most similar to a stored one, searched in the shards without a gateway."""
     catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
     with catalog.read() as session:
         map_ = get_map(session, "default")

@@ -38,8 +38,8 @@ def test_no_secret_is_logged(server: ServerProcess, s3: S3Server) -> None:
     url, call = str(server.client.base_url), server.client
     secrets = {"ADMIN_KEY": ADMIN, "S3_SECRET_KEY": s3.secret_key}
     secrets["local key"] = json.loads(server_address_file(server.home).read_text())["key"]
-    wanted = {"name": "someone", "scopes": ["read", "write"]}
-    made = call.post(f"{API}/keys", json=wanted).json()
+    request = {"name": "someone", "scopes": ["read", "write"]}
+    made = call.post(f"{API}/keys", json=request).json()
     secrets["key"] = made["key"]
     hook = {"url": "http://127.0.0.1:9/nobody", "events": ["job.succeeded", "job.failed"]}
     secrets["webhook"] = call.post(f"{API}/webhooks", json=hook).json()["secret"]
@@ -79,6 +79,6 @@ def test_no_secret_is_logged(server: ServerProcess, s3: S3Server) -> None:
     assert all(len(secret) > 15 for secret in secrets.values()), "or else they may stand by chance"
     assert [name for name, secret in secrets.items() if secret in log] == []
     assert "X-Amz-Signature" not in log
-    kept = b"".join(path.read_bytes() for path in server.home.rglob("*") if path.is_file())
+    stored = b"".join(path.read_bytes() for path in server.home.rglob("*") if path.is_file())
     hashed = {name: secret for name, secret in secrets.items() if name != "webhook"}
-    assert [name for name, secret in hashed.items() if secret.encode() in kept] == []
+    assert [name for name, secret in hashed.items() if secret.encode() in stored] == []

@@ -1,4 +1,4 @@
-"""A model of one's own, by commands and over HTTP: added, described with, asked, given up again."""
+"""A model of one's own, by commands and over HTTP: added, used to describe and search, replaced."""
 
 from __future__ import annotations
 

@@ -105,7 +105,9 @@ def test_a_near_copy_finds_its_place_first(server: ServerProcess, places: list[s
         assert best["similarity_score"] > 0.9 > scores(body)[1]
 
 
-def test_an_answer_says_all_that_is_documented(server: ServerProcess, places: list[str]) -> None:
+def test_an_answer_has_all_fields_that_are_documented(
+    server: ServerProcess, places: list[str]
+) -> None:
     of_new = answered(server.ask(re_encoded(1)))
     of_stored = answered(server.similar(places[0]))
     for body in (of_new, of_stored):

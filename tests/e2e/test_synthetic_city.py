@@ -38,7 +38,7 @@ def command(tmp_path_factory: pytest.TempPathFactory) -> Command:
 
 @pytest.fixture(scope="module")
 def city(command: Command) -> dict[str, Any]:
-    """A small city and what the command said of it."""
+    """A small city and the output of the command."""
     answer: dict[str, Any] = json.loads(command("out", *SMALL, "--no-ladder", "--json").stdout)
     return answer
 
@@ -79,7 +79,7 @@ def test_every_photo_has_a_name_of_the_convention_and_the_requested_size(out: Pa
             assert image.format == "JPEG"
 
 
-def test_city_json_says_every_argument_and_the_kind_of_each_query(out: Path) -> None:
+def test_city_json_has_every_argument_and_the_kind_of_each_query(out: Path) -> None:
     about = json.loads((out / "city.json").read_text())
     assert about["note"] == NOTE
     assert about["arguments"] == {

@@ -1,4 +1,4 @@
-"""From generated places to an answer: drawn, trained on, evaluated, added, indexed, asked."""
+"""From generated places to an answer: drawn, trained on, evaluated, added, indexed, searched."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_model_is_trained_evaluated_added_and_answers(
     found = placewise("query", query, "--map", MAP, "--top-k", "3")["similar_images"]
     names = {path.name for path in database}
     assert len({photo["original_filename"] for photo in found} & names) == 3
-    # A photo of the map itself, asked anew, is its own best match: what is stored is the model's.
+    # A photo of the map is its own best match: the stored descriptors are the model's.
     searched = database[len(database) // 2]
     (first,) = placewise("query", searched, "--map", MAP, "--top-k", "1")["similar_images"]
     assert first["original_filename"] == searched.name

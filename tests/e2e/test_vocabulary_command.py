@@ -52,7 +52,7 @@ def folder(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> F
 
 @pytest.fixture(scope="module")
 def fitted(folder: Folder) -> Any:
-    """What `vocabulary fit photos --out city.npz` said."""
+    """The output of `vocabulary fit photos --out city.npz`."""
     return folder.json("fit", "photos", "--out", "city.npz", "--clusters", "5", "--seed", "3")
 
 

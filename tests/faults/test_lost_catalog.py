@@ -51,7 +51,7 @@ class Filled:
     def originals(self) -> set[str]:
         return {info.key for info in self.store.list(ORIGINALS)}
 
-    def kept(self) -> set[str]:
+    def stored_photos(self) -> set[str]:
         """The keys of all objects but notes and the journal; of the trash, those from before."""
         keys = {i.key for i in self.store.list("") if not i.key.startswith((JOURNAL, "."))}
         return {key_before_trash(key) if key.startswith(TRASH) else key for key in keys}
@@ -97,9 +97,9 @@ def filled_once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 @pytest.fixture
 def filled(filled_once: Filled, tmp_path: Path) -> Iterator[Filled]:
     """A copy of the home. Of a bucket nothing may be missing at the end of a test."""
-    before = filled_once.kept()
+    before = filled_once.stored_photos()
     yield filled_once.copy(tmp_path / "copied")
-    assert filled_once.kept() == before
+    assert filled_once.stored_photos() == before
 
 
 def _fill(running: ServerProcess, numbers: range) -> None:
@@ -154,7 +154,7 @@ def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
 
 
 def test_older_catalog_deletes_no_original(filled: Filled) -> None:
-    before, originals = filled.kept(), filled.originals()
+    before, originals = filled.stored_photos(), filled.originals()
     filled.remove_catalog()
     shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
     with filled.server(**SETTINGS) as running:
@@ -162,12 +162,12 @@ def test_older_catalog_deletes_no_original(filled: Filled) -> None:
         _wait_for_collection(running)
         assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
         assert running.stop() == 0
-    assert filled.kept() == before
+    assert filled.stored_photos() == before
     assert filled.originals() == originals
 
 
 def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) -> None:
-    originals, before = filled.originals(), filled.kept()
+    originals, before = filled.originals(), filled.stored_photos()
     owner = filled.store.read_note(".placewise")
     assert owner is not None
     filled.remove_catalog()
@@ -192,7 +192,7 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
         confirmed = json.loads(filled.command("storage", "collect", "--confirm", "--json").stdout)
         assert confirmed["moved"] >= len(originals)
         assert filled.originals() == set()
-        assert filled.kept() >= originals
+        assert filled.stored_photos() >= originals
         verified = json.loads(filled.command("verify", "--json").stdout)
         assert verified["trash_objects"] == confirmed["moved"]
         assert verified["trash_bytes"] > 0
@@ -200,4 +200,4 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
         assert back == {"restored": confirmed["moved"], "kept_in_trash": 0}
     assert filled.originals() == originals
     filled.store.write_note(".placewise", owner)  # of the bucket, for the other tests
-    assert filled.kept() >= before
+    assert filled.stored_photos() >= before

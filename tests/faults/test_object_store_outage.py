@@ -17,7 +17,7 @@ from tests.contract.storage.test_s3_store import CALLS
 from tests.support.servers import S3Server, start_s3
 
 MEGABYTE = 1_000_000
-TIMEOUT_SECONDS = 3.0  # waiting twice is told from waiting once on a busy machine, too
+TIMEOUT_SECONDS = 3.0  # long enough to distinguish two waits from one on a busy machine
 AT_ONCE_SECONDS = 4.0  # with one more try, on a busy machine
 
 

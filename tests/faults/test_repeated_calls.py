@@ -41,7 +41,7 @@ def deployment(
 def ask(addresses: list[str], photo: bytes) -> UUID:
     """A query photo, whose every effect is a job of its own: its job, by whoever answers first.
 
-    The first gateway asked commits at once, and answers much later: nobody describes photos here.
+    The first gateway commits at once, and answers much later: nobody describes photos here.
     """
     deadline = time.monotonic() + SECONDS
     files = {"file": ("query.jpg", photo)}

@@ -242,7 +242,7 @@ def set_columns(catalog: Catalog, job_id: UUID, **columns: Any) -> None:
 
 
 def expire_lease(catalog: Catalog, *job_ids: UUID) -> None:
-    """The worker that has the jobs was last heard of too long ago."""
+    """Let the lease of the jobs expire, as if their worker were dead."""
     for job_id in job_ids:
         set_columns(catalog, job_id, lease_until=db_now_plus(-1.0))
 

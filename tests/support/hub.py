@@ -20,7 +20,7 @@ def colours(dimension=24, scale=1.0):
 
 
 def with_attention(dimension=24):
-    """As BoQ: the descriptor, then what nobody asked for."""
+    """As BoQ: the descriptor, then another output."""
 
     class Both(Colours):
         def forward(self, batch):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def memory_bytes(name: str) -> int:
-    """`VmRSS`, the resident set size, or `VmHWM`, its peak."""
+    """`VmRSS`, the resident set size, `VmHWM`, its peak, or `RssAnon`, without mapped files."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return int(line.split()[1]) * 1024

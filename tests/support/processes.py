@@ -8,6 +8,7 @@ import errno
 import functools
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -99,6 +100,19 @@ def start(
     )
 
 
+def forked_program(path: Path, prefix: str = "") -> Path:
+    """Write an executable that runs PLACEWISE as a fork, for scripts that start it themselves.
+
+    `prefix` is a shell command that runs first.
+    """
+    _fork_server()
+    client = Path(__file__).with_name("forked_placewise.py")
+    words = [sys.executable, "-IS", str(client), ADDRESS[1:], PLACEWISE]
+    path.write_text(f'#!/bin/sh\n{prefix}\nexec {shlex.join(words)} "$@"\n')
+    path.chmod(0o755)
+    return path
+
+
 class ForkedProcess:
     """A child of the fork server, which keeps its pid until its exit code is read."""
 
@@ -144,8 +158,8 @@ class ForkServer:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """`environment` is what its libraries see when they are imported."""
-        self._asking = threading.Lock()
-        self._asked = 0
+        self._lock = threading.Lock()
+        self._requests = 0
         self._log = tempfile.TemporaryFile()  # noqa: SIM115, it is open as long as the server runs
         self._process: subprocess.Popen[bytes] | None = None
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -182,14 +196,14 @@ class ForkServer:
 
     def ask(self, request: dict[str, Any], descriptors: list[int] | None = None) -> Any:
         """One request and its answer; `descriptors` are the standard files of a new process."""
-        with self._asking:
-            self._asked += 1
-            message = json.dumps({**request, "number": self._asked}).encode()
+        with self._lock:
+            self._requests += 1
+            message = json.dumps({**request, "number": self._requests}).encode()
             try:
                 socket.send_fds(self._control, [message], descriptors or [])
                 while reported := self._control.recv(ANSWER_BYTES):
                     number, answer = json.loads(reported)
-                    if number == self._asked:  # others are of questions that were cut short
+                    if number == self._requests:  # others are of interrupted requests
                         return answer
             except OSError:
                 pass  # the log says more

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from services.code_reload import ROOT, can_reload, restart_process, watch_code
+from services.cli.operations.servers import ROOT, can_reload, restart_process, watch_code
 
 WAIT_SECONDS = 20
 
@@ -33,9 +33,9 @@ def changed(folder: Path) -> Iterator[threading.Event]:
 def test_a_checkout_can_be_reloaded_and_an_installed_package_cannot(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert (ROOT / "services" / "code_reload.py").exists()
+    assert (ROOT / "services" / "cli" / "operations" / "servers.py").exists()
     assert can_reload()
-    monkeypatch.setattr("services.code_reload.ROOT", tmp_path)
+    monkeypatch.setattr("services.cli.operations.servers.ROOT", tmp_path)
     assert not can_reload()
 
 

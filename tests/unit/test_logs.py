@@ -144,9 +144,9 @@ def test_a_log_file_gets_the_same_lines_is_rotated_and_private(
         logging.getLogger("services").info("line %d", number)
     files = sorted(path.name for path in file.parent.iterdir())
     assert files == ["gateway.log", "gateway.log.1", "gateway.log.2"]
-    kept = [(file.parent / name).read_text() for name in reversed(files)]
-    assert capsys.readouterr().err.endswith("".join(kept))
-    assert all(len(text) <= 1000 for text in kept)
+    contents = [(file.parent / name).read_text() for name in reversed(files)]
+    assert capsys.readouterr().err.endswith("".join(contents))
+    assert all(len(text) <= 1000 for text in contents)
     assert all(path.stat().st_mode & 0o077 == 0 for path in (file.parent, *file.parent.iterdir()))
 
 

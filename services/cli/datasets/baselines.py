@@ -1,8 +1,10 @@
 """Difficulty of a generated city: recall of baselines from average colour to the default extractor.
 
-Weak baselines must find almost nothing and strong ones must differ; otherwise the city measures
-nothing. Results on a generated city are not comparable with published ones. Baselines with a
-vocabulary are also evaluated with word weights, fitted in memory on the database rows.
+Weak baselines (mean colour, colour histogram, thumbnail) must find almost nothing and strong ones
+must differ; otherwise the city measures nothing: a data set on which a weak one recognises places
+can be solved by colour or layout alone. Results on a generated city are not comparable with
+published ones. Baselines with a vocabulary are also evaluated with word weights, fitted in memory
+on the database rows.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ from PIL import Image
 from rich.progress import Progress
 
 from shared.datasets.utm_filenames import upload_fields_of_file_name
-from shared.evaluation.baselines import BASELINE_DESCRIPTORS
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
 from shared.synthetic_city.plan import CityPlan, positions_m
@@ -27,6 +28,53 @@ from shared.word_weights.weights import PairStatistics, apply_word_weights, empt
 SEED = 0
 
 Rows = NDArray[np.float32]
+
+COLOUR_BINS = 8
+"""bins per channel"""
+THUMBNAIL_PIXELS = 16
+"""side of the thumbnail"""
+
+
+def average_colour(photo: Image.Image) -> Rows:
+    """Return the mean colour as a unit vector, (4,) float32.
+
+    The centred colour gets a constant fourth component before normalisation, so that the cosine
+    orders photos as the distance of their colours does.
+    """
+    mean = np.asarray(photo.resize((1, 1), Image.Resampling.BOX), np.float32).ravel() / 255
+    return _unit(np.append(mean - 0.5, 1.0).astype(np.float32))
+
+
+def _colour_histogram(photo: Image.Image) -> Rows:
+    """Return the square roots of the joint colour histogram, (COLOUR_BINS ** 3,) float32.
+
+    The cosine of two such vectors is the Bhattacharyya coefficient.
+    """
+    levels = np.asarray(photo, np.int32) * COLOUR_BINS // 256
+    cells = (levels[..., 0] * COLOUR_BINS + levels[..., 1]) * COLOUR_BINS + levels[..., 2]
+    return _unit(np.sqrt(np.bincount(cells.ravel(), minlength=COLOUR_BINS**3)).astype(np.float32))
+
+
+def thumbnail(photo: Image.Image) -> Rows:
+    """Return the mean-free grey pixels of a thumbnail, (THUMBNAIL_PIXELS ** 2,) float32.
+
+    The cosine of two such vectors is the normalised cross-correlation.
+    """
+    small = photo.convert("L").resize((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), Image.Resampling.BOX)
+    pixels = np.asarray(small, np.float32).ravel()
+    return _unit(pixels - pixels.mean())
+
+
+BASELINE_DESCRIPTORS: dict[str, Callable[[Image.Image], Rows]] = {
+    "average colour": average_colour,
+    "colour histogram": _colour_histogram,
+    "thumbnail 16x16": thumbnail,
+}
+
+
+def _unit(row: Rows) -> Rows:
+    norm = np.linalg.norm(row)
+    return row / norm if norm > 0 else row
 
 
 def _fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[float] | None:

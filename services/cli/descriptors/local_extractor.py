@@ -30,7 +30,7 @@ from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu, choose_precision
-from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
+from shared.descriptors.pca_whitening import PcaProjection, Rows, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vocabulary_file import (
     VocabularyFile,
@@ -96,7 +96,7 @@ def _added_backbone(
 DecodeOutcome = DecodedPhoto | PlacewiseError
 
 
-def decode_batches(
+def _decode_batches(
     photos: Sequence[Path],
     preprocessing: Preprocessing,
     settings: Settings,
@@ -134,7 +134,7 @@ def decode_batches(
         yield prefetched.result()
 
 
-def split_outcomes(
+def _split_outcomes(
     batch: Sequence[tuple[Path, DecodeOutcome]], refused: list[tuple[Path, PlacewiseError]]
 ) -> list[Pixels]:
     """Return the (height, width, 3) pixels of a batch; its other photos are added to `refused`."""
@@ -153,10 +153,46 @@ def decode_pixels(
     settings: Settings,
     refused: list[tuple[Path, PlacewiseError]],
 ) -> Iterator[list[Pixels]]:
-    """Decode photos to batches of pixels as `split_outcomes` does, in the order of the photos."""
-    for batch in decode_batches(photos, preprocessing, settings, defaultdict(float)):
-        if pixels := split_outcomes(batch, refused):
+    """Decode photos to batches of pixels as `_split_outcomes` does, in the order of the photos."""
+    for batch in _decode_batches(photos, preprocessing, settings, defaultdict(float)):
+        if pixels := _split_outcomes(batch, refused):
             yield pixels
+
+
+def describe_photos(
+    photos: Sequence[Path],
+    extractor: Extractor,
+    centres: ClusterCentres | None,
+    settings: Settings,
+    refused: list[tuple[Path, PlacewiseError]],
+    seconds: defaultdict[str, float],
+    projection: PcaProjection | None = None,
+) -> Iterator[Rows]:
+    """Describe photos batch by batch.
+
+    After the first photo that can't be described, the others are only decoded, so that all failures
+    can be reported: they are added to `refused`. The times of the stages are added to
+    `seconds["decode"]` and `seconds["describe"]`.
+
+    Yields:
+        (b, D) float32 rows in the order of the photos.
+    """
+    for batch in _decode_batches(photos, extractor.preprocessing, settings, seconds):
+        pixels = _split_outcomes(batch, refused)
+        if refused or not pixels:
+            continue
+        started = time.perf_counter()
+        try:
+            rows = extractor.describe(pixels, centres, projection)
+        except PhotoTooLargeForGpu as error:
+            refused.append((batch[error.place][0], error))
+            continue
+        seconds["describe"] += time.perf_counter() - started
+        for (photo, _), row in zip(batch, rows, strict=True):
+            if not np.isfinite(row).all():
+                refused.append((photo, not_finite_error()))
+        if not refused:
+            yield rows
 
 
 def _read_photo(photo: Path) -> bytes | PlacewiseError:
@@ -170,7 +206,7 @@ HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
 
 
 @contextlib.contextmanager
-def open_descriptor_writer(
+def _open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
 ) -> Iterator[Callable[[Any], object]]:
     """Open a writer for descriptors; call it with successive (b, D) float32 batches.
@@ -202,7 +238,7 @@ def open_descriptor_writer(
 
 
 @dataclass(slots=True)
-class DescriptorFile:
+class _DescriptorFile:
     """A written file of descriptors, with the extractor spec and timings."""
 
     out: Path
@@ -231,7 +267,7 @@ def describe_files(
     advance: Callable[[int], None],
     *,
     names: Sequence[str] | None = None,
-) -> DescriptorFile:
+) -> _DescriptorFile:
     """Describe photos and write (photos, dimension) float32 rows to a file atomically.
 
     Args:
@@ -258,26 +294,16 @@ def describe_files(
     if whitening is not None:
         whitening.check_compatible(extractor.spec(centres))
         projection = PcaProjection(whitening.whitening, extractor.backbone.device)
-    result = DescriptorFile(out, extractor.spec(centres, projection), len(photos))
+    result = _DescriptorFile(out, extractor.spec(centres, projection), len(photos))
     result.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
-    with atomic_write(out) as file, open_descriptor_writer(file, shape, names) as write:
-        for batch in decode_batches(photos, extractor.preprocessing, settings, result.seconds):
-            pixels = split_outcomes(batch, refused)
-            if not refused:  # after a failure, the rest is only decoded, to report all failures
-                batch_started = time.perf_counter()
-                try:
-                    rows = extractor.describe(pixels, centres, projection)
-                except PhotoTooLargeForGpu as error:
-                    refused.append((batch[error.place][0], error))
-                else:
-                    for (photo, _), row in zip(batch, rows, strict=True):
-                        if not np.isfinite(row).all():
-                            refused.append((photo, not_finite_error()))
-                    write(rows)
-                result.seconds["describe"] += time.perf_counter() - batch_started
-            advance(len(batch))
+    with atomic_write(out) as file, _open_descriptor_writer(file, shape, names) as write:
+        for rows in describe_photos(
+            photos, extractor, centres, settings, refused, result.seconds, projection
+        ):
+            write(rows)
+            advance(len(rows))
         if refused:
             raise _refused_photos_error(refused, len(photos))
     result.seconds["total"] = time.perf_counter() - started

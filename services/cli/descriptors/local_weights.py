@@ -110,7 +110,7 @@ def inspect_weights(
     return _packaged_weights(config, on_reading)
 
 
-def has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
+def _has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
     """Whether the weights of a DINOv2 or torch.hub extractor are on this machine and fit it."""
     if config.hub is not None:
         return _torchhub_weights(config.hub).here
@@ -135,7 +135,7 @@ def suggest_extractor(settings: Settings) -> str | None:
     dinov2 = [config for config in configs if config.depth is not None]
     dinov2.sort(key=lambda config: config.parameters or 0, reverse=True)
     for config in (*hub, *dinov2):
-        if has_local_weights(config, settings):
+        if _has_local_weights(config, settings):
             break
     else:
         return None

@@ -18,6 +18,7 @@ import typer
 from services.cli.environment import require_packages
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
 from shared.errors import InvalidRequest
+from shared.tracks.motion import parse_motion
 
 OptionValues = dict[str, object]
 
@@ -286,7 +287,7 @@ def evaluate(
             checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
         )
         if sequences:
-            from services.cli.evaluation.sequences import evaluate_sequences, parse_motion
+            from services.cli.evaluation.sequences import evaluate_sequences
 
             unused: OptionValues = {
                 "--out": out, "--pairs": pairs, "--recall-at": recall_at,

@@ -49,7 +49,7 @@ SEED = 0
 CHECKPOINT_SUFFIXES = (".ckpt", ".pth")
 
 
-def whiten_set(
+def _whiten_set(
     database: Rows,
     queries: Rows,
     components: int,
@@ -82,7 +82,7 @@ def whiten_set(
 
 
 def _project(rows: Rows, projection: PcaProjection, block_rows: int) -> Rows:
-    reduced = np.empty((len(rows), projection.kept), np.float32)
+    reduced = np.empty((len(rows), projection.components), np.float32)
     for begin in range(0, len(rows), block_rows):
         block = slice(begin, begin + block_rows)
         reduced[block] = projection.project(np.array(rows[block]))
@@ -242,7 +242,7 @@ def _evaluate_entry(
     ):
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            database, queries, projection_ms = whiten_set(
+            database, queries, projection_ms = _whiten_set(
                 database, queries, entry.pca, choose_device(settings.device), on_progress
             )
             if milliseconds is not None:

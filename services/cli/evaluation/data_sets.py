@@ -45,7 +45,7 @@ from shared.evaluation.results import EvaluationResult, EvaluationRun
 Result = TypeVar("Result")
 
 
-def evaluate_server(
+def _evaluate_server(
     evaluation_set: EvaluationSet, target: EvaluationTarget, depth: int, progress: Progress
 ) -> tuple[Rankings, EvaluationRun, dict[str, Any]]:
     """Rank the database photos for each query through a server's HTTP API.
@@ -257,7 +257,7 @@ def evaluate_sets(
     with progress_bar() as progress:
         for evaluation_set in evaluation_sets:
             if target.checkpoint is None and target.extractor is None:
-                ranked, run, figures = evaluate_server(
+                ranked, run, figures = _evaluate_server(
                     evaluation_set, target, options.depth, progress
                 )
                 result = evaluate_rankings(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,19 +11,17 @@ from typing import Any
 from rich.progress import Progress
 
 from services.cli.descriptors.local_extractor import (
-    decode_batches,
     decode_pixels,
+    describe_photos,
     load_extractor,
     load_own_vocabulary,
     resolve_centres,
-    split_outcomes,
 )
 from services.cli.output import stage_bars
 from services.trainer.model_describer import ModelDescriber
 from shared.config.settings import Settings
 from shared.datasets.dataset import EvaluationSet
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
-from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
@@ -63,6 +60,7 @@ class ExtractorDescriber:
         self._extractor = extractor
         self._centres = centres
         self._settings = settings
+        self._seconds: defaultdict[str, float] = defaultdict(float)
         self.seconds = 0.0
         """Inference time of `photos`, without decoding, which overlaps."""
         self.photos = 0
@@ -74,20 +72,10 @@ class ExtractorDescriber:
             Unprocessable: `photos_refused`, which lists every photo that can't be described.
         """
         refused: list[tuple[Path, PlacewiseError]] = []
-        batches = decode_batches(
-            photos, self._extractor.preprocessing, self._settings, defaultdict(float)
-        )
-        for batch in batches:
-            pixels = split_outcomes(batch, refused)
-            if refused or not pixels:  # after a failure, only collect further failures
-                continue
-            started = time.perf_counter()
-            try:
-                rows = self._extractor.describe(pixels, self._centres)
-            except PhotoTooLargeForGpu as error:
-                refused.append((batch[error.place][0], error))
-                continue
-            self.seconds += time.perf_counter() - started
+        for rows in describe_photos(
+            photos, self._extractor, self._centres, self._settings, refused, self._seconds
+        ):
+            self.seconds = self._seconds["describe"]
             self.photos += len(rows)
             yield rows
         if refused:

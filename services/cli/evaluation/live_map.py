@@ -126,7 +126,7 @@ def answers_table(places: Json) -> Table:
         table.add_row(
             f"{answers['certainty']:g}",
             *(
-                format_share(answers[key])
+                _format_share(answers[key])
                 for key in ("answered", "answered_at_finest_level", "precision")
             ),
             "-" if mean_level is None else f"{mean_level:.2f}",
@@ -135,7 +135,7 @@ def answers_table(places: Json) -> Table:
     return table
 
 
-def format_share(figure: Json) -> str:
+def _format_share(figure: Json) -> str:
     """Format a share with its 95 % interval, if it has one."""
     text = _format_percent(figure["mean"])
     if figure["interval"] is None:

@@ -32,7 +32,7 @@ from shared.evaluation.sequences import (
     sequence_figures,
     split_sequences,
 )
-from shared.tracks.motion import MotionModel, motion_model
+from shared.tracks.motion import MotionModel
 
 METHODS = {
     "single": "single frames",
@@ -40,18 +40,6 @@ METHODS = {
     "filter": "filter",
     "smoothed": "filter, forward and backward",
 }
-
-
-def parse_motion(text: str) -> MotionModel:
-    """Parse `walk`, `bicycle`, `car`, `train` or a maximum speed.
-
-    Raises:
-        InvalidRequest: `bad_motion`.
-    """
-    try:
-        return motion_model(text)
-    except ValueError as error:
-        raise InvalidRequest("bad_motion", str(error)) from error
 
 
 def evaluate_sequences(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +19,7 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
+    program,
     progress_bar,
 )
 
@@ -115,4 +115,4 @@ def _print_report(report: Json) -> None:
         f"(vocabulary: {report['vocabulary']})."
     )
     print_failures(report, "missing", "duplicates", "refused", "failed")
-    print_note(f"Next: {sys.argv[0]} query PHOTO")
+    print_note(f"Next: {program()} query PHOTO")

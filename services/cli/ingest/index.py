@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -16,13 +15,6 @@ import typer
 from placewise.client import Client
 from services.cli.client import connect, describe_target
 from services.cli.environment import read_settings
-from services.cli.ingest.batches import (
-    check_archive,
-    import_keys,
-    import_prefix,
-    manifest_has_keys,
-    upload_archive,
-)
 from services.cli.ingest.geotags import (
     LocalPhoto,
     count_other_files,
@@ -31,7 +23,16 @@ from services.cli.ingest.geotags import (
     has_coordinates,
     read_photo_manifest,
 )
-from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
+from services.cli.ingest.upload import (
+    FitOption,
+    UpdateOption,
+    check_archive,
+    import_keys,
+    import_prefix,
+    manifest_has_keys,
+    upload_archive,
+    upload_photos,
+)
 from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
     Json,
@@ -44,6 +45,7 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
+    program,
     progress_bar,
 )
 from shared.catalog.photo_role import PhotoRole
@@ -261,7 +263,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     options = f" --map {map_name}" if map_name else ""
     options += f" --server {server}" if server else ""
     command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    print_note(f"Next: {sys.argv[0]} {command}{options}")
+    print_note(f"Next: {program()} {command}{options}")
 
 
 def _count(number: int, noun: str) -> str:

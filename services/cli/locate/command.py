@@ -35,7 +35,7 @@ from services.cli.output import (
     printable_path,
     progress_bar,
 )
-from shared.errors import InvalidRequest, PlacewiseError
+from shared.errors import PlacewiseError
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geotagging.evidence import (
     KnownPosition,
@@ -46,7 +46,7 @@ from shared.geotagging.evidence import (
     interpolate_position,
 )
 from shared.geotagging.fusion import Proposal, propose_position
-from shared.tracks.motion import MOTION_MODELS, MotionModel, motion_model
+from shared.tracks.motion import MOTION_MODELS, MotionModel, parse_motion
 
 SIMILAR_PHOTOS = 50
 SEARCHES_AT_ONCE = 4
@@ -54,8 +54,8 @@ WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have
 
 
 @dataclass(frozen=True, slots=True)
-class LocatedPhoto:
-    """What is proposed for a photo without coordinates."""
+class _LocatedPhoto:
+    """The proposal for a photo without coordinates."""
 
     photo: FolderPhoto
     proposal: Proposal | None
@@ -153,7 +153,7 @@ def locate(
     if undo_changes:
         _report_undo(undo(folder), as_json)
         return
-    moves = _parse_motion(motion)
+    moves = parse_motion(motion)
     photos = read_folder(folder, time_zone, clock_offset)
     if together:
         check_time_zones(photos, "--together")
@@ -185,13 +185,6 @@ def locate(
         raise typer.Exit(1)
 
 
-def _parse_motion(text: str) -> MotionModel:
-    try:
-        return motion_model(text)
-    except ValueError as error:
-        raise InvalidRequest("bad_motion", str(error)) from error
-
-
 def _search_photos(client: Client, photos: Sequence[FolderPhoto]) -> list[Similar | str]:
     """Search the map with each photo; the reason for those that can't be searched with."""
     with progress_bar() as progress, ThreadPoolExecutor(SEARCHES_AT_ONCE) as pool:
@@ -212,7 +205,7 @@ def _search_photo(client: Client, photo: FolderPhoto) -> Similar | str:
             # Photos of the map without coordinates, such as this one, hide those that have some.
             return client.similar(photo.path, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES)
     except PlacewiseError as error:
-        if error.status not in (413, 415, 422):
+        if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
         return error.detail
     return answer
@@ -226,13 +219,13 @@ def _locate_photo(
     track: Sequence[KnownPosition],
     moves: MotionModel,
     radius_m: float,
-) -> LocatedPhoto:
+) -> _LocatedPhoto:
     speed = moves.max_speed_mps
     on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
     answer = search if isinstance(search, Similar) else None
     evidence = None if answer is None else picture_evidence(answer, photo_count)
     label = next((each for each in answer.estimate.levels if each.place), None) if answer else None
-    return LocatedPhoto(
+    return _LocatedPhoto(
         photo,
         propose_position(evidence, neighbours.position_of(photo, speed), on_track, radius_m),
         label.place if label else None,
@@ -273,7 +266,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
     )
 
 
-def _location(located: LocatedPhoto) -> Location:
+def _location(located: _LocatedPhoto) -> Location:
     photo = located.photo
     return Location(
         photo.path,
@@ -286,7 +279,7 @@ def _location(located: LocatedPhoto) -> Location:
 
 def _to_json(
     photos: Sequence[FolderPhoto],
-    located: Sequence[LocatedPhoto],
+    located: Sequence[_LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> Json:
@@ -314,8 +307,8 @@ def _to_json(
 def _print_proposals(
     folder: Path,
     photos: Sequence[FolderPhoto],
-    located: Sequence[LocatedPhoto],
-    accepted: Sequence[LocatedPhoto],
+    located: Sequence[_LocatedPhoto],
+    accepted: Sequence[_LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> None:

@@ -40,7 +40,7 @@ def read_folder(
     Raises:
         InvalidRequest: `no_photos`, `bad_time_zone`.
     """
-    zone = parse_time_zone(time_zone) if time_zone else None
+    zone = _parse_time_zone(time_zone) if time_zone else None
     photos = [_read_photo(folder, path, zone) for path in list_photos(folder)]
     ahead = timedelta(seconds=clock_offset_seconds)
     unlocated = {photo.camera for photo in photos if photo.latitude is None}
@@ -52,7 +52,7 @@ def read_folder(
     ]
 
 
-def parse_time_zone(text: str) -> tzinfo:
+def _parse_time_zone(text: str) -> tzinfo:
     """Parse an offset such as `+02:00`, `UTC` or a name of the time zone database.
 
     Raises:

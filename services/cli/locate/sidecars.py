@@ -38,7 +38,7 @@ def find_sidecar(photo: Path) -> Path | None:
 
 
 def sidecar_path(photo: Path) -> Path:
-    """Return the path of a new sidecar."""
+    """Return the path of the XMP sidecar that is written for a photo: `IMG_1.jpg.xmp`."""
     return photo.with_name(f"{photo.name}.xmp")
 
 

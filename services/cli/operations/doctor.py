@@ -15,7 +15,7 @@ from shared.errors import Misconfigured, PlacewiseError
 
 
 @dataclass(frozen=True, slots=True)
-class CheckResult:
+class _CheckResult:
     """Outcome of one check."""
 
     part: str
@@ -32,7 +32,7 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     try:
         settings = read_settings()
     except Misconfigured as error:
-        _print_results([CheckResult("settings", False, error.detail)], as_json)
+        _print_results([_CheckResult("settings", False, error.detail)], as_json)
         raise typer.Exit(1) from None
     # Imported here: the help does not need a database.
     from services.cli.operations.installation_checks import list_checks
@@ -45,7 +45,7 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
         raise typer.Exit(1)
 
 
-def _print_results(results: list[CheckResult], as_json: bool) -> None:
+def _print_results(results: list[_CheckResult], as_json: bool) -> None:
     if as_json:
         print_json([asdict(result) for result in results])
         return
@@ -55,15 +55,15 @@ def _print_results(results: list[CheckResult], as_json: bool) -> None:
         console.print(f"{mark} {result.part}: {escape(result.detail)}", soft_wrap=True)
 
 
-def _run_check(part: str, check: Callable[[Settings], str], settings: Settings) -> CheckResult:
+def _run_check(part: str, check: Callable[[Settings], str], settings: Settings) -> _CheckResult:
     try:
-        return CheckResult(part, True, check(settings))
+        return _CheckResult(part, True, check(settings))
     except PlacewiseError as error:
-        return CheckResult(part, False, error.detail)
+        return _CheckResult(part, False, error.detail)
     except ModuleNotFoundError as error:
         # An image contains only the packages of its service.
-        return CheckResult(part, True, f"skipped: {error.name} is not installed here")
+        return _CheckResult(part, True, f"skipped: {error.name} is not installed here")
     except OSError as error:
-        return CheckResult(
+        return _CheckResult(
             part, False, f"{error.filename or ''}: {error.strerror}. Check permissions."
         )

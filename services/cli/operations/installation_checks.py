@@ -75,7 +75,7 @@ def list_checks(settings: Settings, server: str | None, key: str | None) -> list
         checks.append(("uploads", _check_upload_dir))
     else:
         checks.append(("objects", check_object_store))
-    checks += [("collection", check_collection), ("journal", _check_journal)]
+    checks += [("collection", _check_collection), ("journal", _check_journal)]
     if settings.database_url is None:
         checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
@@ -310,7 +310,7 @@ def _check_server(settings: Settings) -> str:
     return f"not running; {photos} photos are stored (start it with make run)"
 
 
-def check_collection(settings: Settings) -> str:
+def _check_collection(settings: Settings) -> str:
     """Check that this catalog owns the store and that orphans are collected.
 
     Raises:

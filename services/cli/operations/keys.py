@@ -8,7 +8,7 @@ implies full control. This is how the first admin key is created.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 from uuid import UUID
 
@@ -33,6 +33,7 @@ from shared.telemetry.logs import configure_logging
 if TYPE_CHECKING:
     from shared.catalog.api_keys import ApiKey
     from shared.catalog.database.session import Catalog
+    from shared.catalog.maps import Map
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -68,7 +69,7 @@ def create(
 ) -> None:
     """Create a key and print it. It can't be shown again.
 
-    Limits that are not given default to the server's settings.
+    The maps must exist. Limits that are not given default to the server's settings.
     """
     limits = {
         "requests_per_minute": requests_per_minute,
@@ -76,6 +77,8 @@ def create(
         "max_photos": max_photos,
     }
     with _open_keys(server, key) as keys:
+        if maps:
+            _check_maps(maps, [each.name for each in keys.maps()])
         created = keys.create_key(name, list(scope), days=days, maps=maps or None, **limits)
     if as_json:
         print_json(created)
@@ -120,6 +123,18 @@ def revoke(
     print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
 
 
+def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:
+    """Raise NotFound (`map_not_found`) if a map does not exist."""
+    missing = [name for name in names if name not in existing]
+    if missing:
+        raise NotFound(
+            "map_not_found",
+            f"There is no map named {', '.join(map(repr, missing))}. The maps are "
+            f"{', '.join(sorted(existing))}. Create a map: `placewise maps create NAME`.",
+            map=missing[0],
+        )
+
+
 class _CatalogKeys:
     """The calls of the client about keys, on the catalog itself."""
 
@@ -153,6 +168,12 @@ class _CatalogKeys:
 
         with self._catalog.read() as session:
             return [Key(**_key_fields(row)) for row in list_api_keys(session)]
+
+    def maps(self) -> list[Map]:
+        from shared.catalog.maps import list_maps
+
+        with self._catalog.read() as session:
+            return list_maps(session)
 
     def revoke_key(self, key_id: UUID) -> Key:
         from shared.catalog.api_keys import revoke_api_key

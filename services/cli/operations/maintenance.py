@@ -54,7 +54,7 @@ UPLOAD_SECONDS = 3600.0  # an older original does not belong to an upload in pro
 
 
 @contextlib.contextmanager
-def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
+def _open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
     """Open the catalog and the object store, whether or not services are running.
 
     Args:
@@ -87,8 +87,8 @@ def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, Ow
 
 
 def back_up(settings: Settings, out: Path, progress: BackupProgress) -> BackupManifest:
-    """Create or update the backup in the folder `out`; raises as `open_storage` does."""
-    with open_storage(settings, "backup") as (catalog, store):
+    """Create or update the backup in the folder `out`; raises as `_open_storage` does."""
+    with _open_storage(settings, "backup") as (catalog, store):
         with catalog.write() as session:
             installation_id = get_or_create_installation(session).id
         return create_backup(catalog, store, installation_id, out, settings.import_prefix, progress)
@@ -160,7 +160,7 @@ class Verification:
 def verify_storage(
     settings: Settings, progress: BackupProgress, *, originals: bool, repair: bool
 ) -> Verification:
-    """Check the object store against the catalog; raises as `open_storage` does.
+    """Check the object store against the catalog; raises as `_open_storage` does.
 
     Args:
         settings: Settings that locate both.
@@ -168,7 +168,7 @@ def verify_storage(
         originals: Whether to check the hashes of the original photos, too.
         repair: Whether to queue photos of damaged chunks and to recover missing records.
     """
-    with open_storage(settings, "verify") as (catalog, store):
+    with _open_storage(settings, "verify") as (catalog, store):
         lag, recovered = catalog_lag(catalog, store), None
         if lag is not None and repair:
             recovered = _recover_from_journal(catalog, store, settings, lag, progress)
@@ -244,7 +244,7 @@ def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, i
     Returns:
         The counts, the number of moved objects, and the hold on garbage collection, if any.
     """
-    with open_storage(settings, "storage") as (catalog, store):
+    with _open_storage(settings, "storage") as (catalog, store):
         count, moved, hold = StoreCount(), 0, read_hold(store)
         for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
             pass
@@ -259,5 +259,5 @@ def restore_from_trash(settings: Settings, prefix: str) -> Counter[bool]:
     Returns:
         The number of restored objects (True), and of those whose key is in use again (False).
     """
-    with open_storage(settings, "storage") as (_, store):
+    with _open_storage(settings, "storage") as (_, store):
         return Counter(was_restored for _, was_restored in restore_trash(store, prefix))

@@ -9,18 +9,30 @@ service only.
 from __future__ import annotations
 
 import io
+import logging
+import os
 import shlex
 import sys
 import threading
+from collections.abc import Callable, Iterable
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.cli.environment import read_settings
+from services.cli.imports import collection_paused
 from services.cli.output import err_console, print_note
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
 
 if TYPE_CHECKING:
     from services.standalone import Standalone
+
+
+log = logging.getLogger(__name__)
+
+ROOT = Path(__file__).parents[3]
+CODE_FOLDERS = tuple(ROOT / package for package in ("placewise", "services", "shared"))
 
 
 def serve() -> None:
@@ -30,10 +42,10 @@ def serve() -> None:
     prints an admin key; `placewise keys` creates others. With DEBUG, in a checkout of the
     repository, the server restarts when its code changes.
     """
-    changed = threading.Event()
-    from services.code_reload import can_reload, restart_process, watch_code
-    from services.standalone import serve_standalone
+    with collection_paused():
+        from services.standalone import serve_standalone
 
+    changed = threading.Event()
     settings = read_settings()
     is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
 
@@ -110,13 +122,59 @@ def _key_instructions(running: Standalone, settings: Settings, command: str) -> 
     return lines
 
 
+def can_reload() -> bool:
+    """Whether the code runs from a checkout with the extra dev, which has watchfiles."""
+    return (ROOT / "pyproject.toml").exists() and find_spec("watchfiles") is not None
+
+
+def watch_code(
+    on_change: Callable[[], object], folders: Iterable[Path] = CODE_FOLDERS
+) -> threading.Event:
+    """Call `on_change` once, in a thread of its own, when a Python file below the folders changes.
+
+    A file that does not compile is logged instead: the running server continues until it does.
+
+    Returns:
+        An event that ends the watch when it is set.
+    """
+    from watchfiles import PythonFilter, watch
+
+    stop = threading.Event()
+
+    def run() -> None:
+        for changes in watch(*folders, watch_filter=PythonFilter(), stop_event=stop):
+            paths = sorted({Path(path) for _, path in changes})
+            if all(_compiles(path) for path in paths if path.exists()):
+                log.info("%s changed: restarting", ", ".join(path.name for path in paths))
+                on_change()
+                return
+
+    threading.Thread(target=run, name="code reload", daemon=True).start()
+    return stop
+
+
+def _compiles(path: Path) -> bool:
+    try:
+        compile(path.read_bytes(), path, "exec")
+    except SyntaxError as error:
+        log.warning("%s:%s: %s; not restarted", path, error.lineno, error.msg)
+        return False
+    return True
+
+
+def restart_process() -> None:
+    """Replace this process by a new one with the same command, environment and id."""
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606  (our own command)
+
+
 def search() -> None:
     """Run a search worker (HOST, PORT) for the shard of all maps given by SEARCH_SHARD.
 
     The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
     gateway and the steward, which find it through SEARCH_URLS.
     """
-    from services.search.service import serve_search
+    with collection_paused():
+        from services.search.service import serve_search
 
     serve_search(read_settings(), print_note)
 
@@ -126,7 +184,8 @@ def gateway() -> None:
 
     Every call requires an API key: ADMIN_KEY, or one created with `placewise keys`.
     """
-    from services.gateway.service import serve_gateway
+    with collection_paused():
+        from services.gateway.service import serve_gateway
 
     serve_gateway(read_settings(), print_note)
 
@@ -136,7 +195,8 @@ def extractor() -> None:
 
     It is a Celery worker on REDIS_URL, DATABASE_URL and the object store.
     """
-    from services.extractor.service import serve_extractor
+    with collection_paused():
+        from services.extractor.service import serve_extractor
 
     serve_extractor(read_settings(), print_note)
 
@@ -146,7 +206,8 @@ def steward() -> None:
 
     Any number of stewards can run at the same time.
     """
-    from services.steward.service import serve_steward
+    with collection_paused():
+        from services.steward.service import serve_steward
 
     serve_steward(read_settings(), print_note)
 

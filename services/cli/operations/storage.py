@@ -93,7 +93,9 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
-    checked = ", ".join(f"{count} {kind}s" for kind, count in sorted(report.checked.items()))
+    from shared.integrity.referenced_objects import plural
+
+    checked = ", ".join(f"{count} {plural(kind)}" for kind, count in sorted(report.checked.items()))
     print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
         f"{len(report.faults)} faults"
@@ -121,7 +123,7 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
     repaired = {"chunk", "manifest", "photo"} if queued is not None else set()
     for kind in dict.fromkeys(fault.what for fault in report.faults):
         if kind not in repaired:
-            print_note(f"{kind}s: {REMEDIES[kind]}")
+            print_note(f"{plural(kind)}: {REMEDIES[kind]}")
     if queued is not None:
         print_message(f"Queued {queued} photos for description.")
     if any(f.wrong == "missing" and f.what == "original" for f in report.faults):

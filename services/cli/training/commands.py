@@ -1,6 +1,6 @@
 """`placewise train` and `placewise grid`: train place descriptors, and run hyperparameter grids.
 
-`TerminalDisplay` shows the progress of a run on the terminal.
+`_TerminalDisplay` shows the progress of a run on the terminal.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LOG_INTERVAL_SECONDS = 60.0
 SHOWN_KS = ("1", "5", "10", "15", "20")
 
 
-class TerminalDisplay:
+class _TerminalDisplay:
     """Implements `services.trainer.run_control.Display` with progress bars on stderr."""
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class TerminalDisplay:
             self.info(f"{what}: {done}/{most}  {note}".rstrip())
 
 
-def print_summary(report: Json) -> None:
+def _print_summary(report: Json) -> None:
     """Print a run's summary: R@k per set, the best checkpoint and suggested next commands."""
     if report.get("fast_dev_run"):
         return
@@ -171,7 +171,7 @@ def train(
     if as_json:
         print_json(report)
     else:
-        print_summary(report)
+        _print_summary(report)
 
 
 def _run_training(config: Path | None, resume: Path | None, overrides: dict[str, Any]) -> Any:
@@ -182,7 +182,7 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
         raise InvalidRequest(
             "bad_argument", "--resume uses the run's own arguments. Remove --config."
         )
-    with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
+    with _TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
             if resume is not None:
                 return run.resume(resume, overrides, display, stop)
@@ -251,7 +251,7 @@ def _run_grid_command(
         out.mkdir(parents=True, exist_ok=True)
         write_leaderboard(leaderboard(plan, outcomes), out)
 
-    with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
+    with _TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
             outcomes = run_grid(plan, out, display, stop, write)
         except RunStopped as stopped:

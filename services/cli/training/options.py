@@ -37,7 +37,7 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
     decorated.__signature__ = inspect.Signature(parameters)
     decorated.__annotations__ = {p.name: p.annotation for p in parameters}
     decorated.command_settings = {
-        "cls": TrainingCommand,
+        "cls": _TrainingCommand,
         "context_settings": {"token_normalize_func": normalise_name},
     }
     return command
@@ -72,14 +72,14 @@ def _format_default(value: Any) -> str:
     return json.dumps(value) if isinstance(value, tuple) else str(value)
 
 
-class TrainingCommand(TyperCommand):
+class _TrainingCommand(TyperCommand):
     """Accepts booleans and sizes as GSV-Cities scripts write them."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, add_values(args))
+        return super().parse_args(ctx, _add_values(args))
 
 
-def add_values(tokens: Sequence[str]) -> list[str]:
+def _add_values(tokens: Sequence[str]) -> list[str]:
     """Write a boolean option without a value, and the two numbers of a size, as `--name=value`."""
     remaining, rewritten = list(tokens), []
     while remaining:

@@ -28,6 +28,7 @@ from shared.catalog.chunks import Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
+from shared.ingest.photo_metadata import escape_csv_text
 from shared.storage import ObjectStore
 from shared.storage.chunks import read_chunk
 
@@ -134,8 +135,7 @@ def _write_tables(
         if not chunks:
             writer.writerow(CSV_HEADER)
         for photo in photo_rows:
-            values = (v.isoformat() if isinstance(v, datetime) else v for v in photo[1:])
-            writer.writerow([number, *values])
+            writer.writerow([number, *map(_csv_cell, photo[1:])])
             # A file name may contain line breaks.
             names.write(" ".join(photo.filename.splitlines()).encode() + b"\n")
             number += 1
@@ -144,6 +144,12 @@ def _write_tables(
     if not chunks:
         table.write(",".join(CSV_HEADER).encode() + b"\r\n")
     return chunks
+
+
+def _csv_cell(value: Any) -> Any:
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return escape_csv_text(value) if isinstance(value, str) else value
 
 
 def _npy_header(rows: int, dimension: int) -> bytes:

@@ -8,16 +8,17 @@ The module also selects the word weights that a search ranks by (`select_ranking
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
@@ -33,7 +34,7 @@ from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, active_generation
-from shared.catalog.maps import Map, Search, get_map
+from shared.catalog.maps import Map, Search, get_map, map_not_found_error
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
@@ -51,7 +52,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class RankingWeights:
+class _RankingWeights:
     """Word weights of a search, and the calibration that belongs to them."""
 
     generation: Generation
@@ -78,11 +79,11 @@ class RankingWeights:
 
 def select_ranking_weights(
     generation: Generation, enabled: bool, settings: Settings
-) -> RankingWeights:
+) -> _RankingWeights:
     """Select the word weights of the generation, unless the request or a setting disables them."""
     record = parse_word_weights(generation.word_weights)
     enabled = enabled and settings.word_weights
-    return RankingWeights(generation, record, record.applied if record and enabled else ())
+    return _RankingWeights(generation, record, record.applied if record and enabled else ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,10 +178,13 @@ def find_similar(
 
     The query itself is not among the photos. If the disk of the catalog is full, the history row is
     left out.
+
+    Raises:
+        NotFound: `map_not_found` if the map was deleted meanwhile.
     """
     result = run_similarity_search(gateway, query, search_params)
     try:
-        with gateway.catalog.write() as session:
+        with write_to_map(gateway, query.map) as session:
             session.add(result.history_row)
     except SQLAlchemyError as error:
         if not isinstance(to_unavailable(error), StorageFull):
@@ -195,6 +199,23 @@ def find_similar(
         )
         for hit in result.hits
     )
+
+
+@contextlib.contextmanager
+def write_to_map(gateway: GatewayContext, map_: Map) -> Iterator[Session]:
+    """Open a transaction that adds rows of a map that was read in an earlier one.
+
+    Raises:
+        NotFound: `map_not_found` if the map was deleted meanwhile, and its row is gone.
+    """
+    try:
+        with gateway.catalog.write() as session:
+            yield session
+    except IntegrityError:
+        with gateway.catalog.read() as session:
+            if session.get(Map, map_.id) is None:
+                raise map_not_found_error(map_.name) from None
+        raise
 
 
 def run_similarity_search(

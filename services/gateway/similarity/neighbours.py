@@ -21,7 +21,7 @@ Neighbours = tuple[tuple[UUID, RankedPhoto], ...]
 
 
 class NeighbourCache:
-    """The rankings used last, by a key that changes when the map does; thread-safe."""
+    """Thread-safe LRU cache of rankings, by a key that changes when the map does."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

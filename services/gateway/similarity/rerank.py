@@ -21,7 +21,11 @@ from services.gateway.schemas import (
     SimilarityResponse,
     SimilarPhotoResponse,
 )
-from services.gateway.similarity.execute import SimilarityQuery, run_similarity_search
+from services.gateway.similarity.execute import (
+    SimilarityQuery,
+    run_similarity_search,
+    write_to_map,
+)
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Search, get_map
@@ -83,7 +87,7 @@ def start_comparison_of_stored_photo(
 ) -> Job:
     """Search with a stored photo and queue a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
-    with gateway.catalog.write() as session:
+    with write_to_map(gateway, query.map) as session:
         session.add(history)
         idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
@@ -99,7 +103,7 @@ def start_comparison_of_query_photo(
     if existing is not None:
         return existing
     job, history = _build_compare_job(gateway, query, search_params, describe_job.id)
-    with gateway.catalog.write() as session:
+    with write_to_map(gateway, query.map) as session:
         current = session.get(Job, describe_job.id, with_for_update=True, populate_existing=True)
         if current is None:
             raise query_expired_error()

@@ -1,6 +1,6 @@
 """The photos of a map as the filter of a track sees them, read from the catalog.
 
-The catalog knows no sequences: all photos of a map that have a time form one, so photos that were
+The catalog has no sequences: all photos of a map that have a time form one, so photos that were
 taken within seconds of each other are near each other. That counts only for photos without
 coordinates.
 """

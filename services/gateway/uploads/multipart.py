@@ -232,7 +232,7 @@ async def use_form_file(
         rest = parts.take_pending()
         small_file = rest if writer is None else None
         if small_file == b"":
-            raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
+            raise InvalidRequest("empty_file", "The file is empty.")
         key = key or make_key(parts.filename)
 
         def finish_and_use() -> Result:

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import Any
 
-from services.steward.archives import Archive, ArchiveMember
-from services.steward.archives.archive import MemberKind
+from services.steward.archives.archive import Archive, ArchiveMember, MemberKind
 from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, Unprocessable, UnsupportedMedia
 from shared.imaging.file_formats import PHOTO_SUFFIXES

@@ -25,7 +25,8 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from services.steward.archives import Archive, ArchiveLimits, open_archive
+from services.steward.archives.archive import Archive, ArchiveLimits
+from services.steward.archives.readers import open_archive
 from services.steward.batches.listing import (
     list_archive_photos,
     list_prefix_photos,
@@ -44,8 +45,9 @@ from shared.catalog.batch_items import (
     sync_item_states,
     update_batch_progress,
 )
+from shared.catalog.database.base import for_update
 from shared.catalog.database.session import Catalog, ChangePoll
-from shared.catalog.jobs import WaitingFor, claimable_condition
+from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
@@ -63,7 +65,12 @@ from shared.ingest.validation import (
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner
-from shared.jobs.transitions import make_waiting_jobs_claimable, release_job, succeed_job
+from shared.jobs.transitions import (
+    cancel_batch_items,
+    make_waiting_jobs_claimable,
+    release_job,
+    succeed_job,
+)
 from shared.storage import ObjectStore
 from shared.storage.keys import new_original_key
 
@@ -73,7 +80,7 @@ OBJECT_READ_BYTES = 256 * 1024
 MAX_OPEN_ARCHIVES = 4  # reopening a gzipped archive decompresses it from its beginning
 
 
-class BatchItemImporter:
+class _BatchItemImporter:
     """Imports batch items; caches the open archives."""
 
     def __init__(
@@ -242,6 +249,20 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
         make_waiting_jobs_claimable(session, waits)
 
 
+def cancel_items_of_ended_batches(catalog: Catalog) -> None:
+    """Cancel the photos of cancelled and failed batches that are still being indexed."""
+    is_ended = (Job.kind == JobKind.BATCH) & Job.state.in_((JobState.CANCELLED, JobState.FAILED))
+    unfinished = exists().where(BatchItem.job_id == Job.id, BatchItem.state.in_(UNFINISHED_STATES))
+    with catalog.read() as session:
+        batch_ids = session.scalars(select(Job.id).where(is_ended, unfinished)).all()
+    for batch_id in batch_ids:
+        with catalog.write() as session:
+            # Unless it was retried or deleted since.
+            batch = session.scalar(for_update(select(Job).where(Job.id == batch_id, is_ended)))
+            if batch is not None:
+                cancel_batch_items(session, batch)
+
+
 class BatchWorker:
     """Runs batch jobs in slices."""
 
@@ -258,7 +279,7 @@ class BatchWorker:
         self._store = store
         self._settings = settings
         self._disk = DiskSpace(settings)
-        self._importer = BatchItemImporter(catalog, store, wakeups, settings)
+        self._importer = _BatchItemImporter(catalog, store, wakeups, settings)
         metrics = metrics or StewardMetrics(CollectorRegistry())
         self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics.count_jobs)
 

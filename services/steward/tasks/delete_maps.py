@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from itertools import chain, islice
 from uuid import UUID
 
 from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
 
+from services.steward.tasks.garbage_collection import delete_with_objects
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
 from services.steward.tasks.maintenance import TRACKS_PER_TRANSACTION
 from shared.catalog.batch_items import BatchItem
@@ -21,7 +24,7 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import Track, delete_tracks
@@ -88,16 +91,8 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _cancel_jobs(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        ids = session.scalars(
-            select(Job.id)
-            .where(Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES))
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    if ids:
-        with catalog.write() as session:
-            cancel_jobs(session, Job.id.in_(ids))
-    return bool(ids)
+    with catalog.write() as session:
+        return cancel_jobs(session, Job.map_id == map_id) > 0
 
 
 def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -116,19 +111,15 @@ def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        ids = session.scalars(
-            select(Job.id)
-            .where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS))
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for job_id in ids:
-        for key in query_object_keys(job_id):
-            store.delete(key)
-    if ids:
-        with catalog.write() as session:
-            session.execute(delete(Job).where(Job.id.in_(ids)))
-    return bool(ids)
+    return delete_with_objects(
+        catalog,
+        store,
+        select(Job.id)
+        .where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS))
+        .limit(ROWS_PER_TRANSACTION),
+        query_object_keys,
+        lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),
+    )
 
 
 def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -162,37 +153,32 @@ def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        photos = session.scalars(
-            select(Photo).where(Photo.map_id == map_id).limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for photo in photos:
-        if photo.object_key:  # empty: its objects were deleted with the photo
-            store.delete(photo.object_key)
-        for key in derived_image_keys(photo.id):
-            store.delete(key)
-    ids = [photo.id for photo in photos]
-    if ids:
-        with catalog.write() as session:
-            session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(ids)))
-            session.execute(delete(Job).where(Job.photo_id.in_(ids)))
-            session.execute(delete(Photo).where(Photo.id.in_(ids)))
-    return bool(ids)
+    def object_keys(photo: Photo) -> tuple[str, ...]:
+        # Without a key, its objects were deleted with the photo.
+        return (*filter(None, [photo.object_key]), *derived_image_keys(photo.id))
+
+    def delete_rows(session: Session, photos: Sequence[Photo]) -> None:
+        ids = [photo.id for photo in photos]
+        session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(ids)))
+        session.execute(delete(Job).where(Job.photo_id.in_(ids)))
+        session.execute(delete(Photo).where(Photo.id.in_(ids)))
+
+    photos = select(Photo).where(Photo.map_id == map_id).limit(ROWS_PER_TRANSACTION)
+    return delete_with_objects(catalog, store, photos, object_keys, delete_rows)
 
 
 def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        ids = session.scalars(
-            select(PresignedUpload.id)
-            .where(PresignedUpload.map_id == map_id)
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for upload_id in ids:
-        store.delete(incoming_key(upload_id))
-    if ids:
-        with catalog.write() as session:
-            session.execute(delete(PresignedUpload).where(PresignedUpload.id.in_(ids)))
-    return bool(ids)
+    return delete_with_objects(
+        catalog,
+        store,
+        select(PresignedUpload.id)
+        .where(PresignedUpload.map_id == map_id)
+        .limit(ROWS_PER_TRANSACTION),
+        lambda upload_id: [incoming_key(upload_id)],
+        lambda session, ids: session.execute(
+            delete(PresignedUpload).where(PresignedUpload.id.in_(ids))
+        ),
+    )
 
 
 def _purge_searches(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:

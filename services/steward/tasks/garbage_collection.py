@@ -8,9 +8,12 @@ the opposite order would leave objects that no row refers to. Objects without ro
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+from typing import TypeVar
 from uuid import UUID
 
-from sqlalchemy import and_, delete, exists, or_, select, update
+from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
@@ -38,8 +41,33 @@ from shared.storage.keys import (
     query_object_keys,
 )
 
+T = TypeVar("T")
+
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
 COMPLETED_UPLOAD_SECONDS = 86_400.0  # retention of a completed presigned upload
+
+
+def delete_with_objects(
+    catalog: Catalog,
+    store: ObjectStore,
+    rows: Select[T],
+    object_keys: Callable[[T], Iterable[str]],
+    delete_rows: Callable[[Session, Sequence[T]], object],
+) -> bool:
+    """Delete the objects of the selected rows, then the rows in one transaction.
+
+    Returns:
+        Whether there were any rows.
+    """
+    with catalog.read() as session:
+        found = session.scalars(rows).all()
+    for row in found:
+        for key in object_keys(row):
+            store.delete(key)
+    if found:
+        with catalog.write() as session:
+            delete_rows(session, found)
+    return bool(found)
 
 
 def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -87,8 +115,11 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(abandoned_job_ids)))
     for generation_id in {chunk.generation_id for chunk in ended}:
-        for info in list(store.list(local_features_prefix(generation_id))):
-            store.delete(info.key)
+        prefix = local_features_prefix(generation_id)
+        # Listed again after some were deleted: a listing that goes on may skip others.
+        while infos := list(islice(store.list(prefix), ROWS_PER_TRANSACTION)):
+            for info in infos:
+                store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
         with catalog.write() as session:
@@ -101,22 +132,21 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
         Generation.whitening_id == StoredWhitening.id,
         or_(Generation.ended_at.is_(None), Generation.ended_at >= db_now_plus(-grace_seconds)),
     )
-    with catalog.read() as session:
-        ended = session.scalars(
-            select(StoredWhitening).where(~in_use).limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for whitening in ended:
-        store.delete(whitening.object_key)
-    if ended:
-        ids = [whitening.id for whitening in ended]
-        with catalog.write() as session:
-            session.execute(
-                update(Generation)
-                .where(Generation.whitening_id.in_(ids))
-                .values(whitening_id=None)
-                .execution_options(synchronize_session=False)
-            )
-            session.execute(delete(StoredWhitening).where(StoredWhitening.id.in_(ids)))
+
+    def delete_rows(session: Session, whitenings: Sequence[StoredWhitening]) -> None:
+        ids = [whitening.id for whitening in whitenings]
+        session.execute(
+            update(Generation)
+            .where(Generation.whitening_id.in_(ids))
+            .values(whitening_id=None)
+            .execution_options(synchronize_session=False)
+        )
+        session.execute(delete(StoredWhitening).where(StoredWhitening.id.in_(ids)))
+
+    ended = select(StoredWhitening).where(~in_use).limit(ROWS_PER_TRANSACTION)
+    delete_with_objects(
+        catalog, store, ended, lambda whitening: [whitening.object_key], delete_rows
+    )
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -195,22 +225,16 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
     Jobs of pending frames stay until their frame is applied, or the track is deleted.
     """
     awaited_by_frame = exists().where(TrackFrame.job_id == Job.id, is_pending())
-    with catalog.read() as session:
-        job_ids = session.scalars(
-            select(Job.id)
-            .where(
-                Job.kind.in_(QUERY_JOBS),
-                Job.created_at < db_now_plus(-ttl_seconds),
-                ~awaited_by_frame,
-            )
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for job_id in job_ids:
-        for key in query_object_keys(job_id):
-            store.delete(key)
-    if job_ids:
-        with catalog.write() as session:
-            session.execute(delete(Job).where(Job.id.in_(job_ids)))
+    is_old = Job.created_at < db_now_plus(-ttl_seconds)
+    delete_with_objects(
+        catalog,
+        store,
+        select(Job.id)
+        .where(Job.kind.in_(QUERY_JOBS), is_old, ~awaited_by_frame)
+        .limit(ROWS_PER_TRANSACTION),
+        query_object_keys,
+        lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),
+    )
 
 
 def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
@@ -223,18 +247,16 @@ def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
         and_(PresignedUpload.response_body.is_(None), PresignedUpload.expires_at < db_now()),
         PresignedUpload.expires_at < db_now_plus(-COMPLETED_UPLOAD_SECONDS),
     )
-    with catalog.read() as session:
-        upload_ids = session.scalars(
-            select(PresignedUpload.id).where(expired).limit(ROWS_PER_TRANSACTION)
-        ).all()
-    for upload_id in upload_ids:
-        store.delete(incoming_key(upload_id))
-    if upload_ids:
-        with catalog.write() as session:
-            session.execute(
-                # Checked again: the upload may have been completed since it was selected.
-                delete(PresignedUpload).where(PresignedUpload.id.in_(upload_ids), expired)
-            )
+    delete_with_objects(
+        catalog,
+        store,
+        select(PresignedUpload.id).where(expired).limit(ROWS_PER_TRANSACTION),
+        lambda upload_id: [incoming_key(upload_id)],
+        lambda session, ids: session.execute(
+            # Checked again: the upload may have been completed since it was selected.
+            delete(PresignedUpload).where(PresignedUpload.id.in_(ids), expired)
+        ),
+    )
 
 
 def collect_model_change_files(catalog: Catalog, store: ObjectStore) -> None:

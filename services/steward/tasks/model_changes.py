@@ -38,8 +38,8 @@ from shared.errors import Conflict
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.model_changes import CANCELLED_PER_TRANSACTION, start_model_change
-from shared.jobs.transitions import cancel_jobs, succeed_job
+from shared.jobs.model_changes import start_model_change
+from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs, succeed_job
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ def remove_dead_search_workers(catalog: Catalog) -> None:
         log.warning("removed %d search workers without a recent heartbeat", removed)
 
 
-def search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
+def _search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
     """Return whether every live search worker has loaded the complete generation.
 
     If not, the job is set to wait for them, for as long as they live: without a worker, the photos
@@ -289,7 +289,7 @@ def _finish_model_change(session: Session, job: Job, generation: Generation) -> 
     """Activate the complete generation, unless search workers have yet to load it."""
     failed = _count_jobs(session, _open_jobs(job, generation) & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
-        if not search_workers_have_loaded(session, job, generation):
+        if not _search_workers_have_loaded(session, job, generation):
             return
         _activate_generation(session, job, generation)
     job.progress_failed = failed

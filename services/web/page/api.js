@@ -116,7 +116,7 @@ export async function get(path, options) {
 export const post = (path, options = {}) =>
   get(path, { method: "POST", ...options, headers: { "Idempotency-Key": idempotencyKey(), ...options.headers } });
 
-/** POST a form and tell how much of it was sent: `onSent(share)`. fetch does not know. */
+/** POST a form, and report the share that was sent: `onSent(share)`. fetch can't. */
 export async function send(path, form, { query, key, onSent }) {
   while (true) {
     const response = await new Promise((resolve, reject) => {

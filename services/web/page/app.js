@@ -61,9 +61,9 @@ async function listMaps() {
 async function makeMap() {
   const name = h("input", { required: true, maxlength: 100, pattern: "[A-Za-z0-9][A-Za-z0-9._\\-]*", autocomplete: "off", spellcheck: "false" });
   const { dialog, closed } = openDialog("A new map", h("form", { method: "dialog" },
-    h("p", {}, "Photos of one city, building or trail belong into one map; it learns a vocabulary of its own."),
+    h("p", {}, "Photos of one city, building or trail belong in one map, which gets a vocabulary of its own."),
     field("Name", name, "Letters, digits, “.”, “_” and “-”"),
-    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Make it"))));
+    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Create"))));
   if ((await closed) !== "yes") return;
   await post("/maps", { json: { name: name.value } });
   chooseMap(name.value);

@@ -4,7 +4,7 @@ SwaggerUIBundle({
   url: target.dataset.url,
   domNode: target,
   deepLinking: true,
-  validatorUrl: null, // the public validator would be asked otherwise
+  validatorUrl: null, // otherwise the public validator would be called
   presets: [SwaggerUIBundle.presets.apis],
   layout: "BaseLayout",
 });

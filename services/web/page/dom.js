@@ -15,7 +15,7 @@ export function h(name, attributes = {}, ...children) {
   return element;
 }
 
-/** A time as people say it; the exact one as its title. */
+/** A relative time; the exact one is its title. */
 export const time = (text) => h("time", { datetime: text, title: when(text) }, ago(text));
 
 /** Put these in the place of all that is in the element. */
@@ -70,9 +70,9 @@ export function note(text, kind = "") {
   setTimeout(() => line.remove(), kind === "bad" ? 12000 : 5000);
 }
 
-/** Have screen readers say what the eye sees anyway. */
-export function say(text) {
-  document.getElementById("said").textContent = text;
+/** Announce to screen readers what has changed on the screen. */
+export function announce(text) {
+  document.getElementById("announcement").textContent = text;
 }
 
 /** What went wrong, unless the view was only left. */

@@ -46,7 +46,7 @@ export function duration(seconds) {
   return seconds < 129600 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} days`;
 }
 
-/** What a photo says of where it was taken. */
+/** The place and the coordinates of a photo. */
 export function whereabouts(photo) {
   const place = photo.place ? [photo.place] : [];
   if (photo.latitude !== null) place.push(degrees(photo.latitude, photo.longitude));

@@ -3,7 +3,7 @@
 import { ask, get } from "./api.js";
 
 const ENDED = ["succeeded", "failed", "cancelled"];
-const SILENCE_MS = 40_000; // the server says something every 15 s
+const SILENCE_MS = 40_000; // the server sends a heartbeat every 15 s
 const POLL_SECONDS = 10;
 
 export const hasEnded = (job) => ENDED.includes(job.state);

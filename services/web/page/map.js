@@ -9,6 +9,8 @@ const MOST_ZOOM = 21;
 const LINES = 9; // about so many across the map
 const POINTS_DRAWN = 5000;
 const LABEL_PIXELS = 20; // height of a label of the graticule
+const SCALE_PIXELS = 40; // height of the scale, with a label above it
+const STREETS_PIXELS = 130; // width of the streets button, with a label beside it
 
 let loaded = null;
 
@@ -41,18 +43,22 @@ function drawGraticule(map, layer) {
   const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
   const line = (from, to, text, at) => {
     L.polyline([from, to], { className: "graticule", interactive: false }).addTo(layer);
-    L.marker(at, { interactive: false, keyboard: false, icon: L.divIcon({ className: "graticule-label", html: text, iconSize: null }) }).addTo(layer);
+    if (text) L.marker(at, { interactive: false, keyboard: false, icon: L.divIcon({ className: "graticule-label", html: text, iconSize: null }) }).addTo(layer);
   };
   const { x: width, y: height } = map.getSize();
   const corner = map.containerPointToLatLng([4, height - 6]);
   for (let lat = Math.ceil(bounds.getSouth() / step) * step; lat < bounds.getNorth(); lat += step) {
-    // Labels of the meridians are at the top.
-    if (Math.abs(lat) > 85 || map.latLngToContainerPoint([lat, corner.lng]).y < LABEL_PIXELS) continue;
-    line([lat, bounds.getWest()], [lat, bounds.getEast()], `${lat.toFixed(digits)}°`, [lat, corner.lng]);
+    if (Math.abs(lat) > 85) continue;
+    const { y } = map.latLngToContainerPoint([lat, corner.lng]);
+    // Labels of the meridians are at the top, the scale at the bottom.
+    const text = y < LABEL_PIXELS || y > height - SCALE_PIXELS ? "" : `${lat.toFixed(digits)}°`;
+    line([lat, bounds.getWest()], [lat, bounds.getEast()], text, [lat, corner.lng]);
   }
   const top = map.containerPointToLatLng([width, 4]);
   for (let lng = Math.ceil(bounds.getWest() / step) * step; lng < bounds.getEast(); lng += step) {
-    line([bounds.getSouth(), lng], [bounds.getNorth(), lng], `${lng.toFixed(digits)}°`, [top.lat, lng]);
+    const { x } = map.latLngToContainerPoint([top.lat, lng]);
+    const text = x < 0 || x > width - STREETS_PIXELS ? "" : `${lng.toFixed(digits)}°`;
+    line([bounds.getSouth(), lng], [bounds.getNorth(), lng], text, [top.lat, lng]);
   }
 }
 
@@ -83,7 +89,7 @@ export async function openMap(element, label, { onpick = null, signal } = {}) {
   L.control.scale({ imperial: false }).addTo(map);
   map.attributionControl.setPrefix("");
   addGround(map, element, settings);
-  // The wheel scrolls the page until the map was asked for.
+  // The wheel scrolls the page until the map is focused or clicked.
   map.on("focus click", () => map.scrollWheelZoom.enable());
   map.on("blur mouseout", () => map.scrollWheelZoom.disable());
   const things = L.layerGroup().addTo(map);

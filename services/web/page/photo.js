@@ -8,6 +8,7 @@ import { hasEnded } from "./jobs.js";
 const AT_ONCE = 6;
 const JOB_WAIT_SECONDS = 10;
 const waiting = [];
+const whenUndescribed = new WeakMap(); // what to do with an image whose photo has no thumbnail
 let loading = 0;
 
 const inSight = new IntersectionObserver((entries) => {
@@ -36,7 +37,10 @@ async function show(image) {
   try {
     const response = await ask(url).catch((error) => {
       // Until it is described, a photo has no thumbnail; one that can't be described has neither.
-      if (["thumbnail_not_found", "preview_not_found"].includes(error.code)) return ask(original);
+      if (["thumbnail_not_found", "preview_not_found"].includes(error.code)) {
+        whenUndescribed.get(image)?.();
+        return ask(original);
+      }
       throw error;
     });
     if (response.status !== 202) {
@@ -87,8 +91,13 @@ function picture(url, photo, alt) {
   return image;
 }
 
-/** The thumbnail, loaded when it comes into sight. */
-export const thumbnail = (photo, alt = nameOf(photo)) => picture(photo.thumbnail_url, photo, alt);
+/** The thumbnail, loaded when it comes into sight. `onundescribed` is called if the photo has none: it
+ * waits to be described, or can't be. */
+export function thumbnail(photo, alt = nameOf(photo), onundescribed = null) {
+  const image = picture(photo.thumbnail_url, photo, alt);
+  if (onundescribed) whenUndescribed.set(image, onundescribed);
+  return image;
+}
 
 /** The photo at the size of a screen. */
 export const preview = (photo, alt = nameOf(photo)) => picture(photo.preview_url, photo, alt);

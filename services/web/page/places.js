@@ -22,7 +22,7 @@ async function copy(text) {
 }
 
 function copySelected(text) {
-  const input = h("input", { value: text, class: "heard", readonly: true });
+  const input = h("input", { value: text, class: "visually-hidden", readonly: true });
   document.body.append(input);
   input.select();
   const copied = document.execCommand("copy");

@@ -1,4 +1,4 @@
-// What the server says of itself to everyone: map_tiles, map_attribution, max_file_size (bytes).
+// Public settings of the server: map_tiles, map_attribution, max_file_size (bytes).
 
 let read = null;
 

@@ -13,7 +13,7 @@ export async function shrinkPhoto(file, extractor) {
   try {
     picture = await createImageBitmap(file);
   } catch {
-    return file; // the server says what is wrong with it
+    return file; // the server reports what is wrong with it
   }
   const scale = LONGER_SIDE / Math.max(picture.width, picture.height);
   if (scale >= 1) return file;

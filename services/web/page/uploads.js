@@ -125,8 +125,8 @@ class BatchEntry extends Entry {
 
   form() {
     const form = new FormData();
-    const said = Object.keys(this.fields).length > 0;
-    if (said) form.append("manifest", this.files.map(({ path }) => JSON.stringify({ filename: path, ...this.fields })).join("\n"));
+    const hasFields = Object.keys(this.fields).length > 0;
+    if (hasFields) form.append("manifest", this.files.map(({ path }) => JSON.stringify({ filename: path, ...this.fields })).join("\n"));
     for (const { file, path } of this.files) form.append("file", file, path);
     return form;
   }

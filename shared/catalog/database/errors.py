@@ -1,4 +1,4 @@
-"""Database errors: tells outages (unreachable, busy, full, damaged) from bugs, and logs outages.
+"""Database errors: separates outages (unreachable, busy, full, damaged) from bugs, and logs them.
 
 Outages become `Unavailable` errors that a client may retry; any other error, such as a violated
 constraint, is raised unchanged.

@@ -122,7 +122,7 @@ class Catalog:
     `read()` opens a read-only session on a consistent snapshot; `write()` commits at the end of its
     block and rolls back when it raises; `run(unit)` is a `write()` that is retried after a
     deadlock. Objects stay readable after the block. Database errors raise SQLAlchemyError;
-    `shared.catalog.database.errors` tells which of them are outages.
+    `shared.catalog.database.errors` decides which of them are outages.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Catalog:
     def write(self, *, is_heartbeat: bool = False) -> Iterator[Session]:
         """Open a session that commits at the end of the block. PostgreSQL: READ COMMITTED.
 
-        A heartbeat ends no wait of a `ChangePoll`: nobody has anything to do because of it.
+        A heartbeat ends no wait of a `ChangePoll`: it gives no process anything to do.
         """
         if not self.is_sqlite:
             with self._sessions(bind=self._writes) as session:

@@ -21,11 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import torch
+from safetensors import safe_open
 
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     OnProgress,
+    download_hub_file,
     first_error_line,
     load_tensors,
 )
@@ -46,7 +49,7 @@ def hub_repository(size: str) -> str:
     return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
 
 
-def weights_help(size: str) -> str:
+def _weights_help(size: str) -> str:
     """Return the three ways to get the weights; the end of each error message."""
     repository = hub_repository(size)
     cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
@@ -87,13 +90,13 @@ def find_or_download_weights(
             what = "is not a file" if given.exists() else "does not exist"
             raise _weights_missing_error(f"DINO_WEIGHTS={given} {what}.", size)
         return given
-    return cached_weights(size) or _download(size, on_progress)
+    return _cached_weights(size) or _download(size, on_progress)
 
 
 def find_local_weights(size: str, given: Path | None) -> Path:
     """As `find_or_download_weights`, without downloading: raises `weights_missing` instead."""
     if given is None:
-        cached = cached_weights(size)
+        cached = _cached_weights(size)
         if cached is None:
             raise _weights_missing_error(
                 f"DINO_WEIGHTS is not set, and {hub_repository(size)} is not in the Hugging Face "
@@ -104,7 +107,7 @@ def find_local_weights(size: str, given: Path | None) -> Path:
     return find_or_download_weights(size, given)
 
 
-def cached_weights(size: str) -> Path | None:
+def _cached_weights(size: str) -> Path | None:
     """Return timm's file in the local Hugging Face cache, or None; uses no network."""
     import huggingface_hub
 
@@ -113,10 +116,6 @@ def cached_weights(size: str) -> Path | None:
 
 
 def _download(size: str, on_progress: OnProgress) -> Path:
-    import httpx2
-
-    from shared.descriptors.weight_files import download_hub_file
-
     try:
         return download_hub_file(hub_repository(size), HUB_FILE, on_progress)
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
@@ -147,7 +146,7 @@ def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
     """Return the error for a weights file that can't be used."""
     return Misconfigured(
         "weights_unfit",
-        f"The weights {path} can't be used for dinov2-{size}: {reason}. {weights_help(size)}",
+        f"The weights {path} can't be used for dinov2-{size}: {reason}. {_weights_help(size)}",
     )
 
 
@@ -184,8 +183,6 @@ def _guess_size(file: DinoWeightsFile, size: str) -> str:
 
 
 def _open_safetensors(path: Path) -> DinoWeightsFile:
-    from safetensors import safe_open
-
     stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
     names: list[str] = stored.keys()
     shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}
@@ -236,7 +233,7 @@ def _timms_name(name: str) -> str:
 
 
 def _weights_missing_error(reason: str, size: str) -> Misconfigured:
-    return Misconfigured("weights_missing", f"{reason} {weights_help(size)}")
+    return Misconfigured("weights_missing", f"{reason} {_weights_help(size)}")
 
 
 def _join_some(faults: list[str]) -> str:

@@ -24,6 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import httpx2
 import torch
+from safetensors.torch import load_file
 from torch import nn
 
 from shared.descriptors.backbones.dinov2 import MEAN as IMAGENET_MEAN
@@ -112,7 +113,7 @@ class StagedBackbone(nn.Module):
         return self
 
 
-class Dinov2Backbone(StagedBackbone):
+class _Dinov2Backbone(StagedBackbone):
     """Patch tokens as a map, and the class token."""
 
     patch: ClassVar[int] = PATCH
@@ -124,7 +125,7 @@ class Dinov2Backbone(StagedBackbone):
         return FeatureMaps(maps, tokens[:, 0])
 
 
-class VitTokens(nn.Module):
+class _VitTokens(nn.Module):
     """Stem of a ViT: (B, 3, H, W) -> (B, 1 + patches, width), class token first.
 
     Patches are in row-major order.
@@ -172,10 +173,10 @@ def build_dinov2(
             shape, shape.depth - 1, "token", with_norm=True, device=torch.get_default_device()
         )
     vit.requires_grad_(True)
-    return Dinov2Backbone(VitTokens(vit), list(vit.blocks), vit.norm)
+    return _Dinov2Backbone(_VitTokens(vit), list(vit.blocks), vit.norm)
 
 
-def load_torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
+def _load_torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
     """Build the network `torchvision.models.NAME`.
 
     Args:
@@ -192,15 +193,15 @@ def load_torchvision_network(name: str, pretrained: bool, weights: Path | None) 
     network = models.get_model(name, weights=None)
     if pretrained:
         url = models.get_model_weights(name)["IMAGENET1K_V1"].url
-        path = find_or_download_torchvision_weights(name, url, weights)
-        load_state(network, read_tensors(path, name), path, name)
+        path = _find_or_download_torchvision_weights(name, url, weights)
+        _load_state(network, _read_tensors(path, name), path, name)
     return network
 
 
-def find_or_download_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
+def _find_or_download_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
     """Return the weights file: `given`, else that of torch.hub's cache, downloaded if missing."""
     if given is not None:
-        return check_weights_file(given, name)
+        return _check_weights_file(given, name)
     filename = url.rpartition("/")[2]
     cached = Path(torch.hub.get_dir(), "checkpoints", filename)
     if not cached.exists():
@@ -214,7 +215,7 @@ def find_or_download_torchvision_weights(name: str, url: str, given: Path | None
     return cached
 
 
-def check_weights_file(path: Path, name: str) -> Path:
+def _check_weights_file(path: Path, name: str) -> Path:
     """Return `path`; raise Misconfigured (`weights_missing`) unless it is a file."""
     if not path.is_file():
         what = "is not a file" if path.exists() else "does not exist"
@@ -225,13 +226,11 @@ def check_weights_file(path: Path, name: str) -> Path:
     return path
 
 
-def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
+def _read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
     """Load the tensors of a `.safetensors` or PyTorch file by name; no code is executed.
 
     Raises Misconfigured (`weights_unfit`) for other files.
     """
-    from safetensors.torch import load_file
-
     try:
         with path.open("rb") as file:
             begin = file.read(9)
@@ -240,13 +239,13 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
         state = load_tensors(path)
     except TENSOR_READ_ERRORS as error:
         reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
-        raise pretrained_unfit_error(path, name, reason) from error
+        raise _pretrained_unfit_error(path, name, reason) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise pretrained_unfit_error(path, name, "it contains other objects than named tensors")
+        raise _pretrained_unfit_error(path, name, "it contains other objects than named tensors")
     return state
 
 
-def load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
+def _load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
     """Load tensors into a network; raise Misconfigured (`weights_unfit`) if they don't fit."""
     expected: dict[str, torch.Tensor] = network.state_dict()
     # Files of old releases lack num_batches_tracked, which is not used.
@@ -260,11 +259,11 @@ def load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: s
     ]
     if problems:
         more = f" and {len(problems) - 1} more problems" if len(problems) > 1 else ""
-        raise pretrained_unfit_error(path, name, f"it has {problems[0]}{more}")
+        raise _pretrained_unfit_error(path, name, f"it has {problems[0]}{more}")
     network.load_state_dict(state)
 
 
-def pretrained_unfit_error(path: Path, name: str, reason: str) -> Misconfigured:
+def _pretrained_unfit_error(path: Path, name: str, reason: str) -> Misconfigured:
     return Misconfigured("weights_unfit", f"The weights {path} can't be used for {name}: {reason}.")
 
 
@@ -279,14 +278,14 @@ def _pretrained_missing_error(name: str, url: str, reason: str) -> Misconfigured
     )
 
 
-def build_resnet(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def _build_resnet(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Build a ResNet or ResNeXt; `name` is a key of `config.STAGES`."""
-    network = load_torchvision_network(name, pretrained, weights)
+    network = _load_torchvision_network(name, pretrained, weights)
     stem = nn.Sequential(network.conv1, network.bn1, network.relu, network.maxpool)
     return StagedBackbone(stem, [network.layer1, network.layer2, network.layer3, network.layer4])
 
 
-class SwinBackbone(StagedBackbone):
+class _SwinBackbone(StagedBackbone):
     """Swin transformer with its map in channels-first order."""
 
     def forward(self, photos: torch.Tensor) -> FeatureMaps:
@@ -299,23 +298,23 @@ class SwinBackbone(StagedBackbone):
         super().crop(count)
 
 
-def build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def _build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Build a Swin transformer; each stage begins with its patch merging."""
-    network = load_torchvision_network(name, pretrained, weights)
+    network = _load_torchvision_network(name, pretrained, weights)
     stem, first, *later = network.features
     merged = [
         nn.Sequential(merge, blocks) for merge, blocks in zip(later[::2], later[1::2], strict=True)
     ]
-    return SwinBackbone(stem, [first, *merged], network.norm)
+    return _SwinBackbone(stem, [first, *merged], network.norm)
 
 
-def build_efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def _build_efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Build an EfficientNet of torchvision."""
-    stem, *stages = load_torchvision_network(name, pretrained, weights).features
+    stem, *stages = _load_torchvision_network(name, pretrained, weights).features
     return StagedBackbone(stem, stages)
 
 
-def build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def _build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Build EfficientNet-Lite0.
 
     Pretrained weights come from the package of the embedded default, or from a file in timm's
@@ -330,12 +329,12 @@ def build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) 
         network = published_network()
     else:
         network = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-        load_state(network, read_tensors(check_weights_file(weights, name), name), weights, name)
-    stem = nn.Sequential(Renormalise(), network.conv_stem, network.bn1)
+        _load_state(network, _read_tensors(_check_weights_file(weights, name), name), weights, name)
+    stem = nn.Sequential(_Renormalise(), network.conv_stem, network.bn1)
     return StagedBackbone(stem, [*network.blocks, nn.Sequential(network.conv_head, network.bn2)])
 
 
-class Renormalise(nn.Module):
+class _Renormalise(nn.Module):
     """Converts pixels from ImageNet's normalisation to that of Lite0's training."""
 
     def __init__(self) -> None:
@@ -355,15 +354,15 @@ class Renormalise(nn.Module):
 BackboneBuilder = Callable[[str, bool, Path | None], StagedBackbone]
 
 _BUILDERS: dict[str, BackboneBuilder] = {
-    "resnet18": build_resnet,
-    "resnet34": build_resnet,
-    "resnet50": build_resnet,
-    "resnet101": build_resnet,
-    "resnet152": build_resnet,
-    "resnext50_32x4d": build_resnet,
-    "efficientnet_b0": build_efficientnet_b0,
-    "efficientnet_lite0": build_efficientnet_lite0,
-    "swin_t": build_swin,
+    "resnet18": _build_resnet,
+    "resnet34": _build_resnet,
+    "resnet50": _build_resnet,
+    "resnet101": _build_resnet,
+    "resnet152": _build_resnet,
+    "resnext50_32x4d": _build_resnet,
+    "efficientnet_b0": _build_efficientnet_b0,
+    "efficientnet_lite0": _build_efficientnet_lite0,
+    "swin_t": _build_swin,
     "dinov2_vits14": build_dinov2,
     "dinov2_vitb14": build_dinov2,
     "dinov2_vitl14": build_dinov2,
@@ -371,7 +370,7 @@ _BUILDERS: dict[str, BackboneBuilder] = {
 }
 
 
-class OwnBackbone(StagedBackbone):
+class _OwnBackbone(StagedBackbone):
     """A network of the user without stages: it is trained or frozen as a whole."""
 
     def __init__(self, network: nn.Module) -> None:
@@ -397,7 +396,7 @@ def register_backbone(name: str, build: Callable[[bool], nn.Module]) -> None:
             normalised as for ImageNet, to (B, C, h, w) maps.
     """
     STAGES[name] = 0
-    _BUILDERS[name] = lambda _name, pretrained, _weights: OwnBackbone(build(pretrained))
+    _BUILDERS[name] = lambda _name, pretrained, _weights: _OwnBackbone(build(pretrained))
 
 
 def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbone:

@@ -53,7 +53,7 @@ class Thresholds(BaseModel):
         least = certainty if self.probability is None else self.probability
         for position, probability in enumerate(probabilities):
             least_odds = self.odds[position] if position < len(self.odds) else 0.0
-            if probability >= least and odds_in_map(probability, not_in_map) >= least_odds:
+            if probability >= least and _odds_in_map(probability, not_in_map) >= least_odds:
                 return position
         return None
 
@@ -91,7 +91,7 @@ def choose_thresholds(
     return Thresholds(probability=probability, odds=odds)
 
 
-def odds_in_map(probability: float, not_in_map: float) -> float:
+def _odds_in_map(probability: float, not_in_map: float) -> float:
     """Return the ratio of a level's probability to that of "not in the map"."""
     return probability / max(not_in_map, MIN_PROBABILITY)
 
@@ -107,7 +107,7 @@ def _least_odds(
     for impostor in impostors:
         if position < len(impostor.is_right) and impostor.is_right[position] is False:
             probability = impostor.probabilities[position]
-            odds = odds_in_map(probability, impostor.not_in_map)
+            odds = _odds_in_map(probability, impostor.not_in_map)
             kinds[impostor.left_out].append(odds if probability >= least else 0.0)
     most = max(map(len, kinds.values()), default=0)
     if (1 - share) ** most > 1 - LIMIT_CONFIDENCE:

@@ -20,6 +20,7 @@ from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
 
 COLUMNS_SHOWN = 5  # database photos per row
+MAX_NAME_CHARACTERS = 34
 MAX_PIXELS = 200_000_000
 _THUMBNAIL_PREPROCESSING = get_preprocessing("square32")  # only the decoder's thumbnail is used
 
@@ -118,8 +119,8 @@ def _thumbnail_data_uri(path: Path) -> str | None:
     return "data:image/jpeg;base64," + base64.b64encode(thumbnail).decode()
 
 
-def _shorten(name: str, characters: int = 34) -> str:
-    return name if len(name) <= characters else "…" + name[1 - characters :]
+def _shorten(name: str) -> str:
+    return name if len(name) <= MAX_NAME_CHARACTERS else "…" + name[1 - MAX_NAME_CHARACTERS :]
 
 
 def differences_section(result: EvaluationResult, comparison: RunComparison, shown: int) -> str:

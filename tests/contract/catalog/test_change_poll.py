@@ -48,7 +48,7 @@ def test_a_loop_that_waits_by_itself_looks_after_a_commit_and_seldom_without(
     with catalog.write() as session:
         add_map(session)
     assert poll.is_due(0.0)
-    assert poll.is_due(60.0), "as long after the last look as it was told"
+    assert poll.is_due(60.0), "the interval has passed since the last poll"
 
 
 def test_stop_ends_the_wait(catalog: Catalog) -> None:

@@ -16,7 +16,7 @@ from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
 from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
-FILTERS = 25  # asked of each population of photos
+FILTERS = 25  # for each population of photos
 
 
 def store(

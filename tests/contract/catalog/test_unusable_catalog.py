@@ -168,7 +168,7 @@ def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -
     assert client.get("/api/v1/maps").status_code == 200
 
 
-def test_what_a_failing_disk_says_is_no_word_of_being_away() -> None:
+def test_an_error_of_a_failing_disk_is_no_outage() -> None:
     original = sqlite3.OperationalError("disk I/O error")
     original.sqlite_errorname = "SQLITE_IOERR_READ"
     error = to_unavailable(OperationalError("SELECT 1", {}, original))

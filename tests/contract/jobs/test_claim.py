@@ -66,7 +66,7 @@ def test_comparisons_are_claimed_one_at_a_time(catalog: Catalog, map_id: UUID) -
     assert ids(take(catalog, limit=10)) == [second]
 
 
-def test_a_claim_says_who_has_the_jobs_and_until_when(catalog: Catalog, map_id: UUID) -> None:
+def test_a_claim_names_the_worker_and_the_end_of_its_lease(catalog: Catalog, map_id: UUID) -> None:
     queue(catalog, map_id, 2)
     jobs = take(catalog, worker="gpu-1", lease_seconds=30)
     token_of(jobs)

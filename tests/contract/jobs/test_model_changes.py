@@ -123,7 +123,7 @@ def test_a_cancelled_model_change_abandons_what_it_was_building(
 def test_the_jobs_of_a_cancelled_model_change_are_cancelled_in_small_transactions(
     catalog: Catalog, map_id: UUID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("shared.jobs.model_changes", "services.steward.tasks.model_changes"):
+    for module in ("shared.jobs.transitions", "services.steward.tasks.model_changes"):
         monkeypatch.setattr(f"{module}.CANCELLED_PER_TRANSACTION", 2)
     with catalog.write() as session:
         add_generation(session, map_id)

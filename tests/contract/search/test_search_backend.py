@@ -420,7 +420,7 @@ class SearchPortContract:
             response = search.search(one.request(one.query(unit_rows(1, 1)[0]), k=20))
             assert {hit.photo_id for hit in response.hits} == set(one.rows)
 
-    def test_status_tells_rows_versions_and_memory(self, places: SmallMap, port: OpenPort) -> None:
+    def test_status_has_rows_versions_and_memory(self, places: SmallMap, port: OpenPort) -> None:
         photo_ids = places.add(unit_rows(1, 5), dead=1)
         places.delete(photo_ids[2])
         search = port()

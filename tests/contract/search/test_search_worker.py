@@ -259,7 +259,7 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
 
         return open_port
 
-    def test_status_tells_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+    def test_status_has_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
         places.add(unit_rows(1, 40))
         search = port()
         (device,) = search.status().devices

@@ -111,7 +111,7 @@ class TestFolderStore(ObjectStoreContract):
         store.put("a/b", b"kept")
         assert FolderStore(store.root).get("a/b") == b"kept"
 
-    def test_commit_reaches_the_disk_before_it_is_told(
+    def test_commit_reaches_the_disk_before_it_returns(
         self, store: FolderStore, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         order: list[str] = []

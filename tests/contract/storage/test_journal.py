@@ -202,7 +202,7 @@ BACK: dict[str, Callable[[UUID], Any]] = {
         update(Photo).where(Photo.id == id_).values(revision=1, journaled_revision=1)
     ),
     "another state of the same revision": lambda id_: (
-        update(Photo).where(Photo.id == id_).values(place="never said", revision=Photo.revision)
+        update(Photo).where(Photo.id == id_).values(place="never written", revision=Photo.revision)
     ),
     "map not there yet": lambda id_: update(Map).values(revision=0, journaled_revision=0),
 }

@@ -223,7 +223,7 @@ class ObjectStoreContract:
         store.put("a", b"two")
         assert store.get("a") == b"two"
 
-    def test_head_tells_size_and_time(self, store: ObjectStore) -> None:
+    def test_head_returns_size_and_time(self, store: ObjectStore) -> None:
         store.put("a/b", b"12345")
         info = store.head("a/b")
         assert info is not None

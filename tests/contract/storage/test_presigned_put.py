@@ -70,8 +70,8 @@ def test_other_bytes_another_size_and_another_key_are_refused(strict: S3Store) -
     assert put(put_here.url, os.urandom(len(DATA)), put_here.headers) == 400
     assert put(put_here.url, DATA[:-1], {**put_here.headers, **size}) == 403
     assert put(put_here.url.replace("incoming/a", "originals/a"), DATA, put_here.headers) == 403
-    unsaid = {k: v for k, v in put_here.headers.items() if k == "Content-Length"}
-    assert put(put_here.url, DATA, unsaid) == 403
+    unsigned = {k: v for k, v in put_here.headers.items() if k == "Content-Length"}
+    assert put(put_here.url, DATA, unsigned) == 403
     assert urllib3.request("GET", put_here.url, retries=False).status == 403
     assert list(strict.list("")) == []
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from benchmarks.fleet.fault_injection import FaultProxy, ProxyMode
+from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.storage.s3 import S3Store
+from shared.storage.s3 import Bucket, S3Store
 from tests.support.servers import start_moto
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.s3 import S3Server
@@ -56,10 +57,11 @@ def test_answer_whose_body_is_cut_is_no_answer(
     right = call(S3Store(bucket))
     codes: list[str | None] = []
     came = 0
+    variables = server.variables(bucket.name) | {"s3_endpoint": f"127.0.0.1:{proxy.port}"}
+    settings = Settings(**variables)
     for place in range(0, LONGEST_BYTES, STEP_BYTES):
-        fresh = S3Store(server.bucket(bucket.name, s3_endpoint=f"127.0.0.1:{proxy.port}"))
         with proxy.in_mode(ProxyMode.CUT_ANSWER, cut_after_bytes=place):
-            answer, code = _outcome(call, fresh)
+            answer, code = _outcome(call, S3Store(Bucket.from_settings(settings)))
         codes.append(code)
         came = came + 1 if code is None and answer == right else 0
         if came == 3 and place > body_bytes + 100:

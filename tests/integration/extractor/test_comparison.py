@@ -149,7 +149,7 @@ def test_filters_and_least_score_hold_for_what_is_compared(service: Service) -> 
     assert None not in column(answer, "rerank_score")
 
 
-# --- how it is asked -------------------------------------------------------------------------
+# --- parameters ------------------------------------------------------------------------------
 
 
 def test_new_photo_is_described_then_compared_once_whoever_fetches_it(service: Service) -> None:

@@ -199,14 +199,14 @@ def test_a_query_waits_for_one_batch_at_most(averages: Workplace, before_describ
     averages.upload(0)
     averages.drain()
     photo_ids = averages.upload(*range(1, 17))  # four batches
-    asked: list[UUID] = []
+    queries: list[UUID] = []
     done_before: list[tuple[int, JobState]] = []
 
     def watch(pixels: list[Pixels]) -> None:
-        if asked:
-            done_before.append((len(pixels), JobState(averages.job(asked[0]).state)))
+        if queries:
+            done_before.append((len(pixels), JobState(averages.job(queries[0]).state)))
         else:  # in the first batch, when the second one is claimed and decoded already
-            asked.append(averages.ask(photo_bytes(99)))
+            queries.append(averages.ask(photo_bytes(99)))
 
     before_describing(watch)
     averages.drain()
@@ -240,18 +240,18 @@ def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
     photo_id, job_id = averages.upload_bytes(photo_bytes(0))
     set_columns(averages.catalog, job_id, alone=True)
     during: list[JobState] = []
-    asked: list[UUID] = []
+    queries: list[UUID] = []
 
     def ask(_: NDArray[np.uint8]) -> None:
-        if not asked:
-            asked.append(averages.ask(photo_bytes(99)))
+        if not queries:
+            queries.append(averages.ask(photo_bytes(99)))
             time.sleep(3 * worker_module.QUERY_POLL_SECONDS)
-            during.append(JobState(averages.job(asked[0]).state))
+            during.append(JobState(averages.job(queries[0]).state))
 
     before_describing(ask)
     averages.drain()
     assert during == [JobState.QUEUED]
-    assert averages.job(asked[0]).state == JobState.SUCCEEDED
+    assert averages.job(queries[0]).state == JobState.SUCCEEDED
     assert set(averages.rows()) == {photo_id}
 
 
@@ -261,14 +261,14 @@ def test_a_query_goes_between_the_slices_of_a_fit(
     vlads.upload(*range(8))
     vlads.fit()
     job_id = vlads.start(JobKind.FIT, clusters=8, sample=100, seed=1)
-    asked: list[UUID] = []
+    queries: list[UUID] = []
     stages: list[tuple[str | None, JobState]] = []
     real = ModelChangeRunner.run_step
 
     def watch(self: ModelChangeRunner, job: Job) -> None:
-        if asked:
-            stages.append((job.stage, JobState(vlads.job(asked[-1]).state)))
-        asked.append(vlads.ask(photo_bytes(50 + len(asked))))
+        if queries:
+            stages.append((job.stage, JobState(vlads.job(queries[-1]).state)))
+        queries.append(vlads.ask(photo_bytes(50 + len(queries))))
         real(self, job)
 
     monkeypatch.setattr(ModelChangeRunner, "run_step", watch)

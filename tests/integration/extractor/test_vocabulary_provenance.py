@@ -31,7 +31,7 @@ def tiny_features() -> Provenance:
 
 
 def vocabulary_file(**provenance: Any) -> bytes:
-    """Five centres in a file, learnt with the tiny features unless told otherwise."""
+    """Five centres in a file, fitted with the tiny features by default."""
     centres = parse_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
     fields = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
     return VocabularyFile(centres, fields).encode()

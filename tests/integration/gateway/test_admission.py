@@ -277,10 +277,10 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
 def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
     settings: Settings, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
+    looked_at: list[str] = []
 
     def usage(folder: Any) -> Any:
-        asked.append(str(folder))
+        looked_at.append(str(folder))
         return SimpleNamespace(free=5 if "photos" in str(folder) else 9)
 
     monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", usage)
@@ -289,10 +289,10 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
     elsewhere = settings.model_copy(update={"upload_dir": photos})
     assert AdmissionControl(catalog, elsewhere).disk.free_bytes() == 5
     assert AdmissionControl(catalog, settings).disk.free_bytes() == 9
-    asked.clear()
+    looked_at.clear()
     away = settings.model_copy(update={"s3_endpoint": "s3:1", "database_url": "postgresql://db"})
     assert AdmissionControl(catalog, away).disk.free_bytes() is None
-    assert asked == []
+    assert looked_at == []
 
 
 def test_one_gateway_receives_so_many_files_at_once(catalog: Catalog, settings: Settings) -> None:

@@ -60,7 +60,7 @@ def settings_of(examples: int, **more: Any) -> hypothesis.settings:
         database=None,
         derandomize=EXAMPLES <= 2,
         suppress_health_check=list(HealthCheck),
-        # A fault is told as it was found: making it smaller takes minutes.
+        # Failures are reported as found: shrinking them takes minutes.
         phases=(Phase.explicit, Phase.generate),
         **more,
     )
@@ -92,7 +92,7 @@ def each_call(
     examples: int,
     only: Callable[[Any], bool] = lambda operation: True,
 ) -> None:
-    """`check` on made-up cases of every call of the description; all that fails is told."""
+    """`check` on made-up cases of every call of the description; all failures are reported."""
     failures: list[str] = []
     operations = [result.ok() for result in described(door).get_all_operations()]
     assert len(operations) > 40

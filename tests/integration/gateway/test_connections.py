@@ -191,7 +191,7 @@ def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
             assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
             assert b"request_too_slow" in answer
             retained.sendall(ASK)
-            assert b"200 OK" in answer_of(retained), "a kept connection may rest between two calls"
+            assert b"200 OK" in answer_of(retained), "it may be idle between two calls"
             retained.sendall(b"GET /")
             assert b"408 Request Timeout" in read_to_the_end(retained), "not within one"
         assert server.connections.closed[Reason.SLOW_HEAD] == 3

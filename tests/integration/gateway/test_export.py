@@ -58,6 +58,13 @@ def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
     assert gone not in {line["image_id"] for line in table}
 
 
+def test_text_in_the_table_is_no_formula_for_a_spreadsheet(service: Service) -> None:
+    service.indexed(1, latitude=-45.5, longitude=-7.25, place="=1+1", relative_path="@a/1.jpg")
+    _, [line], _ = exported(service)
+    assert (line["place"], line["relative_path"]) == ("'=1+1", "'@a/1.jpg")
+    assert (line["filename"], line["latitude"]) == ("photo.jpg", "-45.5")
+
+
 def test_descriptors_of_a_generation_that_is_not_there_are_not_found(service: Service) -> None:
     service.indexed(1)
     answer = service("GET", f"/generations/{new_id()}/descriptors")

@@ -1,4 +1,4 @@
-"""Photos of role `query`: described and kept like all others, asked with, never found."""
+"""Photos of role `query`: described like all others, used as queries, never found."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_role_is_set_at_upload_and_changed_later(service: Service) -> None:
     service.drain()
     answer = service.json("GET", f"/jobs/{response}/result")
     assert [image["image_id"] for image in answer["similar_images"]] == [stays]
-    service.json("PATCH", f"/uploads/{turns}", json={"role": None})  # null: as if never said
+    service.json("PATCH", f"/uploads/{turns}", json={"role": None})  # null clears the field
     assert found() == {stays, turns}
     listed = service.json("GET", "/search", params={"role": "query"})
     assert [image["image_id"] for image in listed["images"]] == [asking]
@@ -139,7 +139,7 @@ def test_a_role_is_set_at_upload_and_changed_later(service: Service) -> None:
 
 
 def test_a_new_photo_is_compared_with_what_its_own_filter_lets_pass(service: Service) -> None:
-    """The filter waits with the job, and meets the map as it is when the answer is asked."""
+    """The filter waits with the job, and is applied to the map as it is when the answer is read."""
     first, second = service.indexed(1, 2, captured_at="2024-05-06T07:08:09.123456+02:00")
     response = service.ask(
         near_copy(1),

@@ -18,6 +18,7 @@ from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.publish import publish
 from services.gateway.routes import uploads as upload_module
+from services.gateway.similarity.execute import run_similarity_search
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.tasks import delete_maps as delete_maps_module
 from services.steward.tasks.compaction import merge_small_chunks
@@ -41,7 +42,7 @@ from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.storage import FolderStore
 from shared.storage.keys import JOURNAL, TRASH
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import add_job, add_photo, read_job
+from tests.support.catalog_rows import add_job, add_photo, read_job, states
 from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
@@ -306,6 +307,42 @@ def test_jobs_of_a_deleted_map_are_not_taken(service: Service) -> None:
     service.upload(photo_bytes(1), "gone")
     service.json("DELETE", "/maps/gone")
     assert service.worker.drain(threading.Event()).claimed == 0
+
+
+def test_jobs_of_a_deleted_map_are_cancelled_in_small_transactions(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    jobs = [UUID(service.upload(photo_bytes(n), "gone")["job_id"]) for n in range(5)]
+    monkeypatch.setattr("shared.jobs.transitions.CANCELLED_PER_TRANSACTION", 2)
+    service.json("DELETE", "/maps/gone")
+    assert states(catalog, jobs).count(JobState.CANCELLED) == 2
+    remove_all(catalog, store)
+    assert rows(catalog)["jobs"] == 0
+
+
+@pytest.mark.parametrize("params", [{}, {"rerank": 1}])
+def test_a_search_whose_map_is_removed_meanwhile_finds_no_map(
+    service: Service,
+    catalog: Catalog,
+    store: FolderStore,
+    monkeypatch: pytest.MonkeyPatch,
+    params: dict[str, Any],
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone", "extractor": "test-tiny-avg"})
+    photo_id, _ = service.indexed(1, 2, map_name="gone")
+
+    def search_and_remove(*arguments: Any) -> Any:
+        result = run_similarity_search(*arguments)
+        service.json("DELETE", "/maps/gone")
+        remove_all(catalog, store)
+        return result
+
+    module = "rerank" if params else "execute"
+    path = f"services.gateway.similarity.{module}.run_similarity_search"
+    monkeypatch.setattr(path, search_and_remove)
+    answer = service("POST", f"/similarity/{photo_id}", params={"map": "gone", **params})
+    problem(answer, 404, "map_not_found")
 
 
 def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(

@@ -35,7 +35,7 @@ def propose(service: Service, *photos: dict[str, Any], **options: Any) -> list[d
 
 
 @pytest.mark.databases("sqlite")
-def test_the_begin_of_a_photo_says_when_and_by_which_camera_it_was_taken(service: Service) -> None:
+def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) -> None:
     exif = Image.Exif()
     exif[Base.Model] = "Camera"
     exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:00:00"

@@ -1,4 +1,4 @@
-"""How much a key may do: counted across gateways, said in the answers, refused beyond."""
+"""How much a key may do: counted across gateways, returned in headers, rejected beyond."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.support.servers import RedisServer, start_redis
 def settings_of_counts(
     request: pytest.FixtureRequest, settings: Settings, redis: RedisServer
 ) -> Settings:
-    """Where counts are kept: those of one process, or those that several share."""
+    """The counters: of one process, or shared by several."""
     if request.param == "redis":
         return settings.model_copy(update={"redis_url": SecretStr(redis.url)})
     return settings
@@ -153,9 +153,9 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
     all_received = Barrier(uploads)
     real = incoming_module.validate_photo
 
-    def examine_together(*said: Any) -> ValidatedPhoto:
+    def examine_together(*arguments: Any) -> ValidatedPhoto:
         all_received.wait(60)
-        return real(*said)
+        return real(*arguments)
 
     monkeypatch.setattr(upload_module, "validate_photo", examine_together)
     door.app.openapi()  # a route is worked out at its first call, which no two threads may do

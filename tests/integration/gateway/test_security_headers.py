@@ -110,7 +110,7 @@ def test_hsts_is_sent_where_it_is_set(
     assert answer.headers["strict-transport-security"] == "max-age=31536000"
 
 
-def test_a_fault_says_an_id_and_nothing_of_the_code(
+def test_an_unhandled_error_returns_an_id_and_nothing_of_the_code(
     catalog: Catalog, store: FolderStore, settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:
     answer = client_of(catalog, store, settings, Broken()).get("/api/v1/health")

@@ -118,7 +118,7 @@ def test_a_query_photo_has_a_preview_if_not_all_browsers_show_its_format(service
     expected = {"TIFF": (200, (1600, 800)), "JPEG": (404, None)}
     for media, (status, size) in expected.items():
         data = encoded(photo_image(7, 2400, 1200), media)
-        job_id = service.json("POST", "/similarity", 202, files={"file": ("asked", data)})["job_id"]
+        job_id = service.json("POST", "/similarity", 202, files={"file": ("query", data)})["job_id"]
         assert service("GET", f"/jobs/{job_id}/preview").status_code == 404, "not described yet"
         service.drain()
         answer = service("GET", f"/jobs/{job_id}/preview")

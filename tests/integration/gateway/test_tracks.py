@@ -179,12 +179,12 @@ def test_a_late_frame_changes_the_states_after_it(
     street.drain()
     assert read(street, late)["pending"] == 0
     with street.catalog.read() as session:
-        kept = session.scalars(
+        stored = session.scalars(
             select(TrackFrame.captured_at)
             .where(TrackFrame.track_id == UUID(late), TrackFrame.belief.is_not(None))
             .order_by(TrackFrame.captured_at)
         ).all()
-    assert [time.isoformat() for time in kept] == [time_of(1.5), time_of(2), time_of(3)]
+    assert [time.isoformat() for time in stored] == [time_of(1.5), time_of(2), time_of(3)]
 
 
 @pytest.mark.databases("sqlite")

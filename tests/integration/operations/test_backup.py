@@ -142,6 +142,26 @@ def test_restored_catalog_has_the_id_of_its_store_or_else_of_the_backup(
     assert restored_id == (own if is_marked else about.installation_id)
 
 
+def test_progress_has_few_stages(
+    service: Service, other_catalog: Catalog, other_store: FolderStore, tmp_path: Path
+) -> None:
+    service.indexed(1, 2)
+    with service.catalog.write() as session:
+        installation_id = get_or_create_installation(session).id
+    reports: dict[str, list[tuple[int, int]]] = {}
+
+    def report(stage: str, done: int, total: int) -> None:
+        reports.setdefault(stage, []).append((done, total))
+
+    path = tmp_path / "backup"
+    create_backup(service.catalog, service.store, installation_id, path, IMPORTS, report)
+    folder, about = open_backup(path)
+    restore_backup(folder, about, other_catalog, lambda: other_store, IMPORTS, report)
+    assert reports.keys() <= {"objects", "new objects", "rows"}
+    for stage in reports.values():
+        assert stage[-1][0] == stage[-1][1] > 0
+
+
 def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
     service: Service, backed_up: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,7 +49,7 @@ def refused(check: Any, *arguments: Any) -> PlacewiseError:
     return caught.value
 
 
-def test_postgres_tells_its_version_tables_and_clock(
+def test_postgres_that_can_not_be_used_is_refused_with_the_reason(
     deployed: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "schema up to date" in check_postgres(Settings())
@@ -64,7 +64,7 @@ def test_postgres_tells_its_version_tables_and_clock(
     assert refused(check_postgres, Settings()).code == "catalog_unavailable"
 
 
-def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
+def test_redis_that_can_not_be_used_is_refused_with_the_reason(
     redis: RedisServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert refused(check_redis, Settings()).code == "redis_missing"

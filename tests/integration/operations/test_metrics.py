@@ -1,5 +1,4 @@
-"""What Prometheus is told by a Placewise at work; and that nothing it is shown to people by names
-something else."""
+"""The metrics of a Placewise at work; dashboards and alerts use only metrics that exist."""
 
 from __future__ import annotations
 
@@ -119,7 +118,7 @@ def test_every_name_begins_with_its_service_and_no_label_is_anyones_choice(
         }, name
 
 
-def test_a_gateway_tells_of_its_calls_by_route(service: Service) -> None:
+def test_a_gateway_counts_its_calls_by_route(service: Service) -> None:
     file_id = service.indexed(1)[0]
     for _ in range(3):
         service("GET", f"/uploads/{file_id}")
@@ -157,7 +156,7 @@ def test_the_queue_is_counted_by_kind_and_state_with_the_age_of_its_oldest(
     assert all(0 <= group.oldest_seconds < 300 for group in found.values())
 
 
-def test_an_extractor_tells_of_its_batches_stages_and_losses(averages: Workplace) -> None:
+def test_an_extractor_counts_its_batches_stages_and_losses(averages: Workplace) -> None:
     averages.upload(1, 2, 3)
     averages.drain()
     metrics: Any = averages.worker._metrics

@@ -368,7 +368,7 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     )
 
 
-def test_bytes_go_once_the_journal_tells_of_the_deletion(
+def test_bytes_are_deleted_once_the_journal_has_the_deletion(
     service: Service, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "other"})
@@ -392,7 +392,7 @@ def test_bytes_go_once_the_journal_tells_of_the_deletion(
         patched.setattr(journal, "MAX_JOURNAL_WAIT_SECONDS", -1.0)
         assert round_() == 0, "only deleting makes room in a full store"
         with service.catalog.read() as session:
-            assert session.get(Photo, UUID(photos[0])) is not None, "the journal is told later"
+            assert session.get(Photo, UUID(photos[0])) is not None, "the journal is written later"
     assert round_() == 0
     text = json.dumps([info.key for info in store.list(JOURNAL)])
     assert len(list_segments(store)) == 2, text

@@ -105,7 +105,7 @@ def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable
         service.drain()
         job_id = UUID(answer.json()["job_id"])
         with service.catalog.read() as session:
-            kept = session.get_one(Job, job_id).traceparent
+            stored = session.get_one(Job, job_id).traceparent
     done = {span.name: span for span in spans.get_finished_spans()}
     call = next(
         span
@@ -116,7 +116,7 @@ def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable
     assert call.parent is not None
     assert f"{call.parent.span_id:016x}" == caller.split("-")[2]
     assert _attribute(call, "status") == 202
-    assert kept == f"00-{call.context.trace_id:032x}-{call.context.span_id:016x}-01"
+    assert stored == f"00-{call.context.trace_id:032x}-{call.context.span_id:016x}-01"
     for step in ("prepare", "describe", "publish"):
         # A batch of two requests' jobs: linked to both.
         assert call.context.span_id in {link.context.span_id for link in done[step].links}, step

@@ -1,4 +1,4 @@
-"""Search over several machines: what dies, what lags, what is where, and what is said of it."""
+"""Search over several machines: failures, lag, placement, and status."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_killed_replica_is_not_noticed(places: SmallMap, tier_of: OpenTier) ->
     everything = places.brute_force(VECTOR, 100)
     tier.servers[0][0].stop()
     tier.servers[1][1].stop()
-    for _ in range(8):  # whichever is asked first
+    for _ in range(8):  # whichever replica is first
         response = ask(tier, places)
         assert response.missing == ()
         assert_answers(response, everything)
@@ -154,7 +154,7 @@ def test_without_any_worker_search_is_unavailable(places: SmallMap, tier_of: Ope
 
 
 def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[SearchRequest]:
-    """The worker never reaches the version that is asked for; what it was asked."""
+    """Let the worker never reach the requested version; the requests that it gets."""
     requests: list[SearchRequest] = []
 
     def search(request: SearchRequest) -> SearchResponse:
@@ -186,7 +186,7 @@ def test_of_a_replica_that_is_behind_the_other_one_answers(
         response = ask(tier, places)
         assert response.missing == ()
         assert_answers(response, places.brute_force(VECTOR, 100))
-    assert searched, "the replica that is behind was never asked first"
+    assert searched, "the replica that is behind was never tried first"
 
 
 def test_a_shard_that_stays_behind_is_named_at_the_deadline(
@@ -198,7 +198,7 @@ def test_a_shard_that_stays_behind_is_named_at_the_deadline(
     response = ask(tier, places)
     assert response.missing == ("shard 0/2",)
     assert response.hits
-    assert len(searched) > 2, "it was not asked again"
+    assert len(searched) > 2, "it was not retried"
     assert time.monotonic() - started < 5
 
 
@@ -295,7 +295,7 @@ def test_equal_scores_of_all_shards_come_in_the_order_of_the_photos(
     assert [hit.photo_id for hit in response.hits] == sorted(places.rows)[:8]
 
 
-# --- what is said of it ----------------------------------------------------------------------
+# --- status -----------------------------------------------------------------------------------
 
 
 def test_the_gateways_health_names_shards_without_workers_and_stays_ready(

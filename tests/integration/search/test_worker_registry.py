@@ -59,7 +59,7 @@ class HaltingStore(FolderStore):
 
 @dataclass(slots=True)
 class Registered:
-    """A search worker with its entry, which works when it is told to."""
+    """A search worker with its entry, which the test runs step by step."""
 
     worker: SearchWorker
     presence: WorkerHeartbeat
@@ -111,7 +111,7 @@ def entries(catalog: Catalog) -> list[RegisteredSearchWorker]:
 
 
 def age(catalog: Catalog, name: str, seconds: float) -> None:
-    """The worker was last heard of so long ago."""
+    """Set the age of the worker's heartbeat."""
     with catalog.write() as session:
         session.execute(
             update(RegisteredSearchWorker)
@@ -174,7 +174,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         slow_store.go_on.set()
         loading.join()
     fitted.advance()
-    assert fitted.active().id == old.id, "it has loaded, and has not said so yet"
+    assert fitted.active().id == old.id, "it has loaded, and has not reported it yet"
     slow.presence.send_if_due()
     fitted.advance()
     job = fitted.job(job_id)
@@ -340,7 +340,7 @@ def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
 # --- the entries -----------------------------------------------------------------------------
 
 
-def test_a_worker_tells_that_it_lives_and_what_it_has_loaded(
+def test_a_worker_reports_its_heartbeat_and_what_it_has_loaded(
     fitted: Workplace, register: Register, catalog: Catalog
 ) -> None:
     worker = register("worker", "1/3")

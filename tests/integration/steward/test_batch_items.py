@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import func, select
 
 from services.steward.batches import worker as worker_module
+from services.steward.batches.worker import cancel_items_of_ended_batches
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_job_files
 from shared.catalog.batch_items import BatchItem
@@ -202,6 +203,24 @@ def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
     problem(batches.service("POST", f"/jobs/{job_id}/cancel"), 409, "job_finished")
+
+
+def test_a_cancelled_batch_cancels_its_photos_in_small_transactions(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(dict(files(*range(7)))))
+    batches.work(batches.new_worker(batch_ahead_photos=5))
+    monkeypatch.setattr("shared.jobs.transitions.CANCELLED_PER_TRANSACTION", 2)
+    cancelled = batches.service.json("POST", f"/jobs/{job_id}/cancel")
+    assert cancelled["state"] == "cancelled"
+    assert Counter(batches.states(job_id)) == {"cancelled": 4, "running": 3}
+    cancel_items_of_ended_batches(batches.catalog)
+    assert Counter(batches.states(job_id)) == {"cancelled": 6, "running": 1}
+    assert queued_photos(batches.catalog) == 1
+    batches.service.drain()  # which describes the last before it is cancelled
+    for _ in range(2):
+        cancel_items_of_ended_batches(batches.catalog)
+        assert Counter(batches.states(job_id)) == {"cancelled": 6, "succeeded": 1}
 
 
 def test_retry_queues_the_failed_items_again_whose_bytes_are_there(batches: Batches) -> None:

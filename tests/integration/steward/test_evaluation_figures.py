@@ -65,7 +65,7 @@ def test_labelled_queries_are_counted_in_and_out_of_the_map(town: Town) -> None:
             (120, query(place="hall")),  # third, after 100 and 50
             (30, query(**at(45))),  # nowhere
             (210, query(place="kitchen")),  # no such label
-            (60, query()),  # no one knows where: not asked
+            (60, query()),  # without a known place: no query
         ]
     )
     labelled = town.figures()["labelled_queries"]
@@ -87,16 +87,16 @@ def test_labelled_queries_do_not_disturb_leave_one_out(town: Town) -> None:
 
 def test_a_sample_is_of_its_size_and_comes_from_its_seed(town: Town) -> None:
     town.publish([(7 * n, at(n)) for n in range(30)])  # each alone
-    requests = [_asked(town, sample=10, seed=seed) for seed in (1, 1, 2)]
+    requests = [queried_photos(town, sample=10, seed=seed) for seed in (1, 1, 2)]
     # The sample comes first; then the neighbours of the photos that it finds.
     assert requests[0] == requests[1]
     assert set(requests[0][:10]) != set(requests[2][:10])
     assert all(10 <= len(ids) < 30 for ids in requests)
-    assert len(_asked(town, sample=1000, seed=0)) == 30
+    assert len(queried_photos(town, sample=1000, seed=0)) == 30
 
 
-def _asked(town: Town, **params: Any) -> list[UUID]:
-    """Which photos an evaluation asks with; a search may be repeated, deeper."""
+def queried_photos(town: Town, **params: Any) -> list[UUID]:
+    """The photos that an evaluation searches with; a search may be repeated with a larger k."""
     seen: dict[UUID, None] = {}
     search = town.search.search
 
@@ -162,7 +162,7 @@ def _forget(catalog: Catalog, photo_id: UUID) -> None:
 
 
 def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> None:
-    """The photo that is asked with has another reference then: it is looked up once more."""
+    """The query photo has another reference then: it is looked up again."""
     for begin in range(0, len(STREETS), 3):
         town.publish(STREETS[begin : begin + 3])
     before = town.figures()["leave_one_out"]

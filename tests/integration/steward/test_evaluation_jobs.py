@@ -165,7 +165,7 @@ def test_an_evaluation_that_crashes_is_tried_again_and_fails_in_the_end(town: To
 def test_a_damaged_map_is_not_measured_by_its_rest(
     town: Town, order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether the broken chunk holds photos that are asked with or only such as may be found."""
+    """Whether the broken chunk holds query photos, or only photos that may be found."""
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     town.publish(STREETS)
     town.publish(WITHOUT_PLACE)

@@ -1,4 +1,4 @@
-"""What is kept for a while only, and what must not go with it."""
+"""Retention: what expires, and what must not be deleted with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Webhooks: signed deliveries, retries, and no delivery to internal addresses."""
+"""Webhooks: signed deliveries, retries, and no delivery to internal addresses.
+
+The tests of what is delivered, claimed and retried run on SQLite as well.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +48,8 @@ from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
+pytestmark = pytest.mark.databases("postgresql")
+BOTH_DATABASES = pytest.mark.databases("sqlite", "postgresql")
 PHOTOS = 6
 
 
@@ -126,6 +131,30 @@ def hooks(
     return WebhookSetup(door, settings, receiver, make_worker)
 
 
+@pytest.mark.databases("sqlite")
+def test_a_retry_is_sent_when_it_is_due_though_nothing_else_happens(
+    hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(send_module, "RETRY_DELAYS_SECONDS", (2.0, 3600.0))
+    hooks.receiver.status = 500
+    hooks.announce(EventKind.JOB_SUCCEEDED)
+    stop = threading.Event()
+    thread = threading.Thread(target=hooks.sender.run, args=(stop,))
+    thread.start()
+    try:
+        deadline = time.monotonic() + 60
+        times: list[float] = []
+        while len(times) < 2:
+            assert time.monotonic() < deadline
+            if len(hooks.receiver.messages) > len(times):
+                times.append(time.monotonic())
+            time.sleep(0.05)
+    finally:
+        stop.set()
+        thread.join(timeout=60)
+    assert times[1] - times[0] < 8, "less than IDLE_SECONDS"
+
+
 @pytest.fixture
 def localhost_tls(hooks: WebhookSetup, tmp_path: Path) -> ssl.SSLContext:
     return hooks.trust(tmp_path, "localhost")
@@ -166,6 +195,7 @@ def test_a_photo_whose_preview_is_made_again_is_not_delivered_again(hooks: Webho
     assert hooks.send() == 0
 
 
+@BOTH_DATABASES
 def test_only_subscribed_events_are_delivered_and_to_each_webhook_alone(
     hooks: WebhookSetup,
 ) -> None:
@@ -182,6 +212,7 @@ def test_only_subscribed_events_are_delivered_and_to_each_webhook_alone(
     assert hooks.log(switches) == []
 
 
+@BOTH_DATABASES
 def test_failed_deliveries_are_retried_later_under_the_same_id(hooks: WebhookSetup) -> None:
     hooks.photo()
     hooks.receiver.status = 500
@@ -215,6 +246,7 @@ def test_pauses_grow_for_three_days_and_then_it_is_given_up(hooks: WebhookSetup)
     assert 2 * 86_400 < sum(pause or 0 for pause in pauses) < 5 * 86_400
 
 
+@BOTH_DATABASES
 def test_an_attempt_whose_steward_crashed_is_repeated(hooks: WebhookSetup) -> None:
     hooks.photo()
     _, claimed = hooks.sender._claim_due(UUID(hooks.webhook["id"]))  # and then it dies
@@ -367,6 +399,7 @@ def test_over_https_only_the_named_host_gets_deliveries(
             assert "certificate verify failed" in delivery["last_error"].lower()
 
 
+@BOTH_DATABASES
 def test_a_switched_generation_is_delivered_and_its_photos_are_not(
     hooks: WebhookSetup, vlads: Workplace
 ) -> None:
@@ -385,6 +418,7 @@ def test_a_switched_generation_is_delivered_and_its_photos_are_not(
     assert body["generation.switched"]["replaced_generation_id"] == str(before)
 
 
+@BOTH_DATABASES
 def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
     hooks.photo()
     deleted = hooks.door(ADMIN, "DELETE", f"/webhooks/{hooks.webhook['id']}")

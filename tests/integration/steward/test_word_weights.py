@@ -1,4 +1,4 @@
-"""Word weights on a live map: learnt, tried on photos that have not taught them, kept or not."""
+"""Word weights on a live map: fitted, tested on held-out photos, used or not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Rows = NDArray[np.float32]
 
 
 def rows_of_places(places: int, views: int, reported: bool, seed: int = 0) -> Rows:
-    """VLAD-like rows, place by place. Two words are noise from photo to photo. With `told` the
+    """VLAD-like rows, place by place. Two words are noise from photo to photo. With `reported` the
     others show the place, faintly; else nothing does."""
     rng = np.random.default_rng(seed)
     own = np.repeat(rng.standard_normal((places, 2, WIDTH)), views, axis=0)
@@ -145,11 +145,11 @@ def rooms(places: int, views: int = 3) -> list[dict[str, Any]]:
     return [{"place": f"room {place}"} for place in range(places) for _ in range(views)]
 
 
-# --- learnt, and kept or not -----------------------------------------------------------------
+# --- fitted, and used or not ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spots", [street, rooms])
-def test_words_that_tell_places_apart_are_weighted_and_kept(city: City, spots: Any) -> None:
+def test_words_that_distinguish_places_are_weighted(city: City, spots: Any) -> None:
     city.publish(rows_of_places(40, 3, reported=True), spots(40))
     record = city.learn()
     assert record.outcome == Outcome.KEPT

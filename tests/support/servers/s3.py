@@ -99,7 +99,7 @@ def start_moto() -> Iterator[S3Server]:
     port = free_ports(1)[0]
     command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
     url = f"http://127.0.0.1:{port}/moto-api/data.json"
-    process = Daemon("moto", command, new_folder("moto"), lambda: _asked(url) is not None)
+    process = Daemon("moto", command, new_folder("moto"), lambda: _get(url) is not None)
     try:
         process.start()
         yield S3Server(f"127.0.0.1:{port}", ACCESS_KEY, SECRET_KEY, False, process)
@@ -147,15 +147,15 @@ def _daemon() -> tuple[Daemon, int]:
 
 
 def _answers(port: int) -> bool:
-    return _asked(f"http://127.0.0.1:{port}/status") is not None
+    return _get(f"http://127.0.0.1:{port}/status") is not None
 
 
 def _stores(master: int) -> bool:
     """Whether a volume server has registered with the master, which happens after the start."""
-    return b'"DataNodes"' in (_asked(f"http://127.0.0.1:{master}/dir/status") or b"")
+    return b'"DataNodes"' in (_get(f"http://127.0.0.1:{master}/dir/status") or b"")
 
 
-def _asked(url: str) -> bytes | None:
+def _get(url: str) -> bytes | None:
     with contextlib.suppress(urllib3.exceptions.HTTPError):
         answer = urllib3.request("GET", url, timeout=2, retries=False)
         if answer.status == 200:

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.support.processes import forked_program
+
 ROOT = Path(__file__).parents[3]
 TINY = {
     "DEVICE": "cpu",
@@ -16,17 +18,17 @@ TINY = {
     "PHOTOS": "2",
     "SEARCH": "--photos 20 --dimensions 64 --queries 2",
     "TRAIN": "--places 0",  # refused: its row says why
-    "PLACEWISE": str(Path(sys.executable).with_name("placewise")),
     "PYTHON": sys.executable,
     "ALLOW_TEST_EXTRACTORS": "1",
 }
 
 
 def run_script(folder: Path, **variables: str) -> str:
+    placewise = forked_program(folder / "placewise")
     done = subprocess.run(
         [str(ROOT / "benchmarks" / "gpu.sh"), str(folder)],
         cwd=ROOT,
-        env={**os.environ, **TINY, **variables},
+        env={**os.environ, **TINY, "PLACEWISE": str(placewise), **variables},
         capture_output=True,
         text=True,
         check=True,

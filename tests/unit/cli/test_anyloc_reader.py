@@ -186,7 +186,7 @@ def test_the_folder_may_lie_anywhere_below(tmp_path: Path, app: str) -> None:
     assert found.vocabularies == [anyloc.models / "vocabulary" / "c_centers.pt"]
 
 
-def test_files_of_one_name_are_told_apart_by_their_folders(anyloc: AnylocInstallation) -> None:
+def test_files_of_one_name_are_distinguished_by_their_folders(anyloc: AnylocInstallation) -> None:
     (anyloc.uploads / "old").mkdir()
     (anyloc.uploads / "old" / "a.jpg").write_bytes(b"another photo")
     anyloc.add("a.jpg", b"photo")

@@ -65,6 +65,20 @@ def test_the_help_of_a_command_imports_neither_a_database_nor_a_server_nor_torch
     assert run.stdout.split() == []
 
 
+def test_the_collector_never_scans_what_a_command_has_imported() -> None:
+    code = (
+        "import gc, sys\n"
+        "from services.cli.main import run\n"
+        "sys.argv = ['placewise', 'maps', '--help']\n"
+        "try:\n"
+        "    run()\n"
+        "finally:\n"
+        "    print(gc.get_freeze_count() > 10_000, gc.isenabled())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.endswith("True True\n")
+
+
 def test_the_version_is_printed_without_importing_a_command() -> None:
     code = (
         "import sys\n"

@@ -44,7 +44,7 @@ def whole_set(base: Path) -> None:
     street(base, "gsv_xs/train/trt", [0, 1])
 
 
-def test_check_tells_what_is_there(tmp_path: Path) -> None:
+def test_check_lists_what_the_folder_contains(tmp_path: Path) -> None:
     whole_set(tmp_path)
     reported = run_datasets("check", tmp_path, "--decode")
     assert reported["layouts"] == ["gsv_xs", "database and queries folders"]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.testing import CliRunner
 
 from services.cli.maps import app
+from shared.errors import Misconfigured
 from tests.support.api_responses import TIME
 from tests.unit.client.test_client import running_server
 
@@ -48,6 +51,19 @@ def test_create_makes_a_map_with_rows_in_half_precision() -> None:
     assert result.exit_code == 0, result.output
     _, _, body = server.requests[0]
     assert json.loads(body) == {"name": "tower", "rows": "float16"}
+
+
+def test_with_the_settings_of_separate_services_no_server_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PLACEWISE_HOME", str(tmp_path))
+    monkeypatch.setenv("SEARCH_URLS", "http://127.0.0.1:8100")
+    result = CliRunner().invoke(app, ["list"])
+    assert isinstance(result.exception, Misconfigured)
+    assert result.exception.code == "separate_services"
+    assert "PLACEWISE_SERVER" in result.exception.detail
+    assert result.output == "", "it does not say that it starts one"
+    assert not list(tmp_path.iterdir())
 
 
 def test_list_says_whose_labels_are_paths_and_how_rows_are_stored() -> None:

@@ -6,7 +6,7 @@ import pytest
 from rich.progress_bar import ProgressBar
 
 from services.cli.output import Table, print_table, progress_bar
-from services.cli.training.commands import TerminalDisplay
+from services.cli.training.commands import _TerminalDisplay
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
 MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"
@@ -119,6 +119,6 @@ def test_progress_leaves_no_trace_where_stderr_is_not_a_terminal(
 ) -> None:
     with progress_bar() as progress:
         progress.add_task("scanning the folder", total=None)
-    with TerminalDisplay():
+    with _TerminalDisplay():
         pass
     assert capsys.readouterr().err == ""

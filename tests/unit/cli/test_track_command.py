@@ -26,8 +26,12 @@ from services.cli.track.frame_sources import (
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import COLUMNS, check_track_files, write_track_file
-from services.cli.track.track_picture import located_segments
+from services.cli.track.track_files import (
+    COLUMNS,
+    check_track_files,
+    located_segments,
+    write_track_file,
+)
 from shared.errors import InvalidRequest, Misconfigured
 from tests.support.api_responses import PHOTO
 from tests.support.photos import photo_bytes, photo_image
@@ -200,6 +204,13 @@ def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
     with Image.open(file) as picture:
         assert picture.size == (1200, 1200)
     assert located_segments(track_of(None)) == []
+
+
+def test_text_in_a_table_is_no_formula_for_a_spreadsheet(tmp_path: Path) -> None:
+    named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
+    write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}), [])
+    [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())
+    assert row["filename"] == "'-1.jpg"
 
 
 def test_files_that_can_not_be_written_are_refused_before_the_work(

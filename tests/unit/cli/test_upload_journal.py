@@ -47,7 +47,7 @@ def test_a_photo_that_was_taken_is_known_to_the_next_run(path: Path, photo: Loca
         assert journal.done(photo) == TAKEN
 
 
-def test_a_photo_that_has_changed_or_of_which_more_is_said_is_sent_again(
+def test_a_photo_is_sent_again_when_its_bytes_or_its_metadata_have_changed(
     path: Path, photo: LocalPhoto
 ) -> None:
     with UploadJournal(path, "http://a", None) as journal:
@@ -135,7 +135,7 @@ def manifest(tmp_path: Path, *lines: dict[str, Any]) -> bytes:
     return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
 
 
-def test_a_list_names_photos_beside_it_with_what_is_said_of_them(tmp_path: Path) -> None:
+def test_a_list_names_photos_beside_it_with_their_metadata(tmp_path: Path) -> None:
     data = manifest(tmp_path, {"filename": "1.jpg", "tags": ["a", "b"], "role": "query"})
     [found] = read_photo_manifest(tmp_path / "list.jsonl", data)
     fields = {"tags": "a,b", "role": "query"}

@@ -312,9 +312,7 @@ def test_patience_ends_with_the_last_error(server: FakeServer, slept: list[float
     assert slept == [0.5, 1, 2]
 
 
-def test_a_server_that_says_when_to_come_again_is_obeyed_however_long(
-    server: FakeServer, slept: list[float]
-) -> None:
+def test_retry_after_is_obeyed_however_long(server: FakeServer, slept: list[float]) -> None:
     seen: list[tuple[str, float]] = []
     for seconds in (30, 60, 4000):
         refuse(server, TooManyRequests("queue_full", "Full.", retry_after_seconds=seconds))

@@ -300,9 +300,7 @@ def test_an_unknown_dino_model_is_refused_with_the_known_ones(
 
 @pytest.mark.usefixtures("production")
 @pytest.mark.parametrize("name", [name for name in PREDECESSORS if name != "DINO_MODEL"])
-def test_what_says_how_dino_is_used_is_refused_without_it(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_options_of_dino_are_refused_without_it(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     message = refusal(monkeypatch, **{name: PREDECESSORS[name]})
     assert message.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
 

@@ -166,7 +166,7 @@ def test_folder_without_places_says_what_would_be_one(tmp_path: Path) -> None:
     assert code_of(caught) == "no_data_set"
 
 
-def test_fingerprint_tells_places_apart_and_not_the_folder_that_they_lie_in(
+def test_fingerprint_depends_on_the_places_and_not_on_their_folder(
     tmp_path: Path,
 ) -> None:
     for folder, places in (("a", {1: 2, 2: 2}), ("b", {1: 2, 2: 2}), ("c", {1: 2, 2: 3})):

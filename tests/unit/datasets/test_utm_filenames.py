@@ -101,7 +101,7 @@ def test_position_that_is_no_number_names_the_file() -> None:
     assert "@east@2@.jpg" in caught.value.detail
 
 
-def test_spot_is_what_the_name_says_and_nothing_that_it_does_not() -> None:
+def test_spot_has_exactly_the_fields_of_the_file_name() -> None:
     full = parse_utm_file_name(
         "@0660329.93@1522162.46@47@P@013.76438@0100.48301@3TQZ-W_x@@398@@@@201905@4257_Bangkok@.jpg"
     )

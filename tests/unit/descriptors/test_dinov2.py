@@ -144,7 +144,7 @@ def test_nothing_runs_after_the_facet_is_known(
 
 
 def test_unused_weights_are_not_loaded(files: dict[str, Path]) -> None:
-    def kept(facet: str) -> int:
+    def parameters(facet: str) -> int:
         tensors: list[torch.Tensor] = [*load(files["plain"], PLAIN, 1, facet)._vit.parameters()]
         assert all(tensor.device == CPU for tensor in tensors)
         return sum(tensor.untyped_storage().nbytes() for tensor in tensors) // 4
@@ -152,8 +152,8 @@ def test_unused_weights_are_not_loaded(files: dict[str, Path]) -> None:
     width = PLAIN.width
     block = 12 * width**2 + (3 + 1 + 4 + 1) * width + 6 * width
     before = (2 + SIDE * SIDE + 3 * 14 * 14 + 1) * width
-    assert kept("token") == before + 2 * block
-    assert kept("value") == before + block + width**2 + 3 * width
+    assert parameters("token") == before + 2 * block
+    assert parameters("value") == before + block + width**2 + 3 * width
 
 
 def test_photos_are_described_alike_alone_and_together(files: dict[str, Path]) -> None:

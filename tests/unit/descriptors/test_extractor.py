@@ -77,7 +77,7 @@ def test_fingerprint_changes_with_the_vocabulary_and_with_nothing_else(tiny: Ext
     assert spec_fingerprint(tiny.spec(parse_centres(array))) != first
 
 
-def test_fingerprint_tells_extractors_apart(tiny: Extractor) -> None:
+def test_extractors_have_different_fingerprints(tiny: Extractor) -> None:
     average_pooling = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
     assert spec_fingerprint(average_pooling.spec(None)) != spec_fingerprint(tiny.spec(None))
 
@@ -251,7 +251,7 @@ def aspect_kept(efficientnet: Extractor) -> Extractor:
     )
 
 
-def test_default_extractor_tells_places_apart_whatever_the_aspect_ratio(
+def test_default_extractor_distinguishes_places_whatever_the_aspect_ratio(
     aspect_kept: Extractor,
 ) -> None:
     shipped = aspect_kept.shipped_vocabulary()

@@ -85,7 +85,7 @@ def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, compon
     np.testing.assert_allclose(projected(queries, ours) * signs, expected, atol=2e-4)
     np.testing.assert_allclose(ours.variances, theirs.explained_variance_, rtol=1e-4)
     assert ours.explained == pytest.approx(theirs.explained_variance_ratio_.sum(), rel=1e-5)
-    assert (ours.kept, ours.dimension, ours.rows) == (components, dimension, count)
+    assert (ours.components, ours.dimension, ours.rows) == (components, dimension, count)
 
 
 def test_both_ways_give_the_same_projection() -> None:
@@ -226,7 +226,7 @@ def test_more_rows_than_dimensions_are_needed() -> None:
     assert "needs more than 20 described photos" in refusal(
         "pca_too_few_rows", unit_rows(20, 64), 20
     )
-    assert fit_pca(unit_rows(21, 64), 20).kept == 20
+    assert fit_pca(unit_rows(21, 64), 20).components == 20
 
 
 def test_descriptors_do_not_become_longer() -> None:

@@ -72,7 +72,7 @@ def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
             }
 
 
-def test_spec_tells_precisions_apart_and_single_means_what_it_meant() -> None:
+def test_precisions_have_different_specs_and_single_is_unchanged() -> None:
     single = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
     half = single.with_precision("bfloat16")
     assert single.spec(None)["precision"] == "float32"

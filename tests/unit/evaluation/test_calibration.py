@@ -148,7 +148,7 @@ def test_no_confidence_is_learnt_from_too_few_or_of_one_kind() -> None:
     assert fit_confidence([(e, n % 2 == 0) for n, e in enumerate(evidence)]) is not None
 
 
-def test_a_confidence_tells_right_from_wrong_and_stays_between_0_and_1() -> None:
+def test_a_confidence_separates_right_from_wrong_and_stays_between_0_and_1() -> None:
     """Also where both kinds are apart, which a fit without a ridge would follow for ever."""
     for apart in (1.0, 50.0):
         judged = [(e, True) for e in some_evidence(40, 1, apart)]

@@ -36,7 +36,7 @@ def test_hundred_thousand_rows_in_blocks_rank_as_in_the_full_product() -> None:
 
 @pytest.mark.parametrize("rows_a_block", [3, 7, 50, 1000])
 def test_copies_are_ranked_by_index_in_blocks_of_any_size(rows_a_block: int) -> None:
-    """Each row lies there 40 times, more often than candidates are kept."""
+    """Each row lies there 40 times, more often than there are candidates."""
     originals = unit_rows(5, 33, 2)
     database = np.tile(originals, (40, 1))
     found = exact_knn(originals, database, 8, block_bytes=rows_a_block * 33 * 4)
@@ -68,7 +68,7 @@ def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
 def test_progress_ends_at_the_announced_total() -> None:
     reported: list[tuple[int, int]] = []
     rows = unit_rows(10, 4, 7)
-    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: reported.append(heard))
+    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *step: reported.append(step))
     assert reported[-1] == (100, 100)
     assert [done for done, _ in reported] == sorted(done for done, _ in reported)
 

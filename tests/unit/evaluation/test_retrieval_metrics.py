@@ -169,7 +169,7 @@ def test_runs_on_other_queries_are_not_compared() -> None:
         paired_differences(np.ones((3, 1)), np.ones((4, 1)), np.arange(3))
 
 
-def test_score_that_tells_right_from_wrong_is_calibrated_and_ranks_them() -> None:
+def test_score_that_separates_right_from_wrong_is_calibrated_and_ranks_them() -> None:
     random = np.random.default_rng(0)
     chance = random.uniform(0, 1, 4000)
     right = random.uniform(0, 1, 4000) < 1 / (1 + np.exp(-12 * (chance - 0.5)))

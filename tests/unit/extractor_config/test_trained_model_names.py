@@ -30,7 +30,7 @@ def test_what_is_neither_is_refused(name: str) -> None:
     assert caught.value.code == "bad_model_name"
 
 
-def test_only_the_loaded_model_tells_how_photos_are_brought_to_size() -> None:
+def test_only_the_loaded_model_knows_how_photos_are_resized() -> None:
     config = get_extractor_config("gsv:walks", allow_test_extractors=False)
     assert (config.name, config.aggregator) == ("gsv:walks", "none")
     assert (config.width, config.dimension, config.preprocessing) == (None, None, None)

@@ -12,14 +12,22 @@ import httpx2
 import pytest
 from fastapi import FastAPI, Request
 from starlette.datastructures import Headers
+from starlette.testclient import TestClient
 
-from services.gateway.authentication import ApiKeyAuthenticator, Authenticator, Caller
+from services.gateway.authentication import (
+    ADMIN,
+    ApiKeyAuthenticator,
+    AuthenticationMiddleware,
+    Authenticator,
+    Caller,
+)
 from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_connections import ConnectionLimits, Connections
 from services.http_server import PEER_ADDRESS, http_server, listen
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Forbidden, Unauthorized
+from shared.http.problem_details import install_exception_handlers
 from shared.security.api_keys import ALL_SCOPES, Scope, hash_api_key
 
 KEY = "pw_0123456789abcdef"
@@ -62,6 +70,26 @@ def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
     editor = call(sign_in, peer, USER, ("X-Forwarded-Groups", "others, editors"))
     assert editor.scopes == {Scope.READ, Scope.WRITE}
     assert call(sign_in, peer, USER, ("X-Forwarded-Groups", "chiefs")).scopes == ALL_SCOPES
+
+
+def test_a_user_without_the_scope_is_told_where_scopes_of_users_are_set(
+    sign_in: Authenticator,
+) -> None:
+    app = FastAPI()
+    install_exception_handlers(app)
+    app.add_middleware(AuthenticationMiddleware, authenticator=sign_in)
+
+    @app.get("/api/v1/keys", dependencies=[ADMIN])
+    def read_keys() -> None:
+        pass
+
+    async def through_proxy(scope: Any, receive: Any, send: Any) -> None:
+        await app({**scope, PEER_ADDRESS: PROXY}, receive, send)
+
+    client = TestClient(through_proxy, base_url="http://places.example")
+    detail = client.get("/api/v1/keys", headers=[USER]).json()["detail"]
+    assert detail.startswith("This request needs the scope admin; the caller has read.")
+    assert "SIGN_IN_SCOPES" in detail
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_a_picture_that_looks_like_elsewhere_is_named_and_lowers_the_probability
     contradicted = proposed(picture((1500, 0, 0.9), probability=0.9), neighbours)
     assert metres_from(contradicted, 0, 0) < 20
     assert contradicted.probability < alone.probability
-    assert "elsewhere" in contradicted.reason
+    assert "another place" in contradicted.reason
 
 
 def test_between_two_positions_the_photo_is_where_the_walk_was_at_that_time() -> None:
@@ -147,7 +147,12 @@ def test_between_two_positions_the_photo_is_where_the_walk_was_at_that_time() ->
     proposal = proposed(None, None, sides)
     assert metres_from(proposal, 10, 0) < 3
     assert proposal.probability > 0.95
-    assert proposal.reason == "GPX track, 10 s after a point"
+    assert proposal.reason == "GPX track, 10 s from its nearest point"
+
+
+def test_a_photo_of_the_same_second_is_taken_at_the_same_time() -> None:
+    proposal = proposed(None, [known(0, 0, 0, "other.jpg")])
+    assert proposal.reason == "taken at the same time as other.jpg"
 
 
 def test_the_farther_the_known_times_the_less_probable_is_the_position() -> None:

@@ -75,7 +75,7 @@ def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
 
 
 @pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "BMP", "TIFF"])
-def test_every_accepted_format_tells_its_size(media: str) -> None:
+def test_the_size_is_read_from_every_accepted_format(media: str) -> None:
     found = header(encoded(media))
     assert found == PhotoHeader(width=64, height=48)
 
@@ -239,7 +239,7 @@ def png(width: int, height: int, *between: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", size) + b"".join(between)
 
 
-def test_png_tells_its_exif_when_it_stands_before_the_pixels() -> None:
+def test_exif_of_a_png_is_read_where_it_precedes_the_pixels() -> None:
     exif = whole_exif().removeprefix(b"Exif\0\0")
     data = png(30, 20, png_chunk(b"eXIf", exif), png_chunk(b"IDAT", b"no pixels at all"))
     found = header(data)

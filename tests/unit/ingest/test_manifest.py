@@ -8,6 +8,7 @@ from shared.errors import InvalidRequest, PlacewiseError
 from shared.ingest.photo_metadata import (
     MAX_REPORTED_LINES,
     ManifestEntry,
+    escape_csv_text,
     read_csv_manifest,
     read_form_fields,
     read_jsonl_manifest,
@@ -78,6 +79,21 @@ def test_a_wrong_value_is_no_bad_line_but_the_photos_own_error() -> None:
 def test_only_the_first_bad_lines_are_named() -> None:
     error = refused(b"oops\n" * 1000)
     assert len(error.extra["errors"]) == MAX_REPORTED_LINES
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1.jpg", "-1.jpg", "@a", "\tx", "'=1", "''-1"])
+def test_text_that_is_a_formula_in_a_spreadsheet_is_escaped_and_read_as_it_was(text: str) -> None:
+    escaped = escape_csv_text(text)
+    assert escaped == f"'{text}"
+    [entry] = read_csv_manifest(f"file,place\n{escaped},{escaped}\n".encode(), "t")
+    assert (entry.name, entry.fields) == (text, {"place": text})
+
+
+def test_other_text_is_written_and_read_as_it_is() -> None:
+    for text in ("a.jpg", "a=b", "'tis.jpg", "7-1", ""):
+        assert escape_csv_text(text) == text
+    [entry] = read_csv_manifest(b"file,latitude,place\n'tis.jpg,-45,'s hall\n", "t")
+    assert (entry.name, entry.fields) == ("'tis.jpg", {"latitude": "-45", "place": "'s hall"})
 
 
 @pytest.mark.parametrize(

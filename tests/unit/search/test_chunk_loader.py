@@ -214,7 +214,7 @@ def test_codes_that_are_missing_are_made_once(
         monkeypatch.delattr(shared.codes.serialization, "encode_signs", raising=False)
 
 
-@pytest.mark.parametrize("where", ["beside the chunk", "kept here"])
+@pytest.mark.parametrize("where", ["beside the chunk", "in the cache"])
 def test_damaged_codes_are_made_again_and_the_chunk_is_served(
     store: FolderStore, folder: Path, where: str
 ) -> None:
@@ -222,7 +222,7 @@ def test_damaged_codes_are_made_again_and_the_chunk_is_served(
     chunk = written(store, rows)
     key = codes_key(chunk.object_key)
     whole = store.get(key)
-    if where == "kept here":
+    if where == "in the cache":
         loader = ChunkLoader(store, folder)
         loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
         (retained,) = folder.glob("*.codes")

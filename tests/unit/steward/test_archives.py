@@ -15,9 +15,14 @@ from typing import Any
 
 import pytest
 
-from services.steward.archives import ArchiveLimits, ArchiveMember, open_archive
-from services.steward.archives.archive import BoundedFile, MemberKind, RangedFile
-from services.steward.archives.zip_archive import ZipArchive
+from services.steward.archives.archive import (
+    ArchiveLimits,
+    ArchiveMember,
+    BoundedFile,
+    MemberKind,
+    RangedFile,
+)
+from services.steward.archives.readers import ZipArchive, open_archive
 from shared.errors import Gone, PlacewiseError
 from shared.imaging.file_formats import ArchiveFormat, detect_archive_format
 from shared.storage import FolderStore

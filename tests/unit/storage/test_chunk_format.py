@@ -157,7 +157,7 @@ def test_missing_chunk_is_not_found(store: FolderStore) -> None:
         read_chunk(store, chunk_key(GENERATION, CHUNK), "0" * 64)
 
 
-def test_manifest_tells_which_photo_is_which_row(store: FolderStore) -> None:
+def test_manifest_maps_rows_to_photos(store: FolderStore) -> None:
     rows = some_rows()
     photo_ids = [new_id() for _ in rows][::-1]
     chunk = written(store, rows, photo_ids)

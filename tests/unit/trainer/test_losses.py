@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 from pytorch_metric_learning import losses
 
-from services.trainer.losses import LOSSES, AngularLoss, NTXentLoss, make_loss
-from services.trainer.miners import MINERS, make_miner
+from services.trainer.losses import LOSSES, MINERS, AngularLoss, NTXentLoss, make_loss, make_miner
 from shared.errors import Unprocessable
 
 Rows = NDArray[np.float64]

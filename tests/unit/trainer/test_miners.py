@@ -11,8 +11,7 @@ import torch
 from pytorch_metric_learning import miners
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from services.trainer.losses import make_loss
-from services.trainer.miners import MINERS, AngularMiner, batch_accuracy, make_miner
+from services.trainer.losses import MINERS, AngularMiner, batch_accuracy, make_loss, make_miner
 from shared.descriptors.vpr_models.aggregators.base import normalise_rows
 from shared.errors import Unprocessable
 from tests.unit.trainer.test_losses import (

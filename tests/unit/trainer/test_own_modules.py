@@ -11,10 +11,8 @@ import pytest
 import torch
 
 from services.trainer.arguments import TrainingArguments, build_arguments
-from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
-from services.trainer.model_factory import make_model
-from services.trainer.own_modules import register_own_modules
+from services.trainer.losses import make_loss, make_miner
+from services.trainer.model_factory import make_model, register_own_modules
 from services.trainer.run_control import NullDisplay
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state, load_checkpoint

@@ -1,7 +1,7 @@
 // Ask with a photo: which known place is this?
 
 import { Problem, ask, currentMap, get, idempotencyKey } from "../api.js";
-import { bar, button, fill, h, noteError, say } from "../dom.js";
+import { announce, bar, button, fill, h, noteError } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
 import { nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
@@ -13,17 +13,20 @@ const TOP_K = 12;
 const NEWEST = 14;
 const WAIT_SECONDS = 10;
 
+/** A box that contains all photos with coordinates. */
+export const WITH_COORDINATES = "-90,-180,90,180";
+
 export async function showAsk(view, { signal, id }) {
   const answer = h("div", { class: "answer" });
   if (id) {
     const photo = await get(`/uploads/${id}`, { signal });
-    const asked = {
+    const queryPhoto = {
       name: nameOf(photo),
-      picture: () => preview(photo, `The photo asked with: ${nameOf(photo)}`),
+      picture: () => preview(photo, `The query photo: ${nameOf(photo)}`),
       find: (query, onjob) => findSimilar(`/similarity/${id}`, query, null, onjob, signal),
     };
     fill(view, h("h1", {}, "Which photos show this place?"), answer);
-    await showAnswer(answer, asked, signal);
+    await showAnswer(answer, queryPhoto, signal);
     return;
   }
   const map = await get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
@@ -31,13 +34,13 @@ export async function showAsk(view, { signal, id }) {
     const small = shrinkPhoto(file, map.extractor);
     const described = Promise.withResolvers();
     const shown = mayNeedPreview(file) ? described.promise.then((job) => ask(`/jobs/${job}/preview`, { signal })).catch(() => null) : null;
-    const asked = {
+    const queryPhoto = {
       name: file.name,
-      picture: () => localPicture(file, { alt: `The photo asked with: ${file.name}` }, shown),
+      picture: () => localPicture(file, { alt: `The query photo: ${file.name}` }, shown),
       find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal, shown && described.resolve),
     };
-    view.classList.add("asked");
-    return showAnswer(answer, asked, signal);
+    view.classList.add("answered");
+    return showAnswer(answer, queryPhoto, signal);
   }, signal);
   const newest = h("section", { class: "newest" });
   fill(view, entry, answer, newest);
@@ -49,7 +52,10 @@ async function showNewest(newest, signal) {
   const { images } = await get("/search", { query: { limit: NEWEST, role: "database" }, signal });
   fill(newest,
     h("h2", {}, "Or ask with a photo of the map"),
-    h("ul", { class: "mosaic" }, images.map((photo) => h("li", {}, h("a", { href: `#/ask/${photo.image_id}`, "aria-label": `Ask with ${nameOf(photo)}` }, thumbnail(photo, ""))))));
+    h("ul", { class: "mosaic" }, images.map((photo) => {
+      const item = h("li", {}, h("a", { href: `#/ask/${photo.image_id}`, "aria-label": `Ask with ${nameOf(photo)}` }, thumbnail(photo, "", () => item.remove())));
+      return item;
+    })));
 }
 
 function askEntry(map, onfile, signal) {
@@ -110,37 +116,40 @@ export async function findSimilar(path, query, file, onjob, signal, ondescribed 
 
 let questions = 0;
 
-async function showAnswer(answer, asked, signal) {
+async function showAnswer(answer, queryPhoto, signal, filter = {}) {
   const mine = ++questions; // of two that overlap, the later one is shown
   const progress = h("p", { class: "soft" }, "Looking…");
-  fill(answer, h("section", { class: "card asking" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "Looking for the place"), bar("Looking for the place", 0, 0), progress)));
+  fill(answer, h("section", { class: "card asking" }, h("figure", {}, queryPhoto.picture()), h("div", {}, h("h2", {}, "Looking for the place"), bar("Looking for the place", 0, 0), progress)));
   answer.scrollIntoView({ block: "start" });
   let found;
   try {
-    found = await asked.find({ top_k: TOP_K }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
+    found = await queryPhoto.find({ top_k: TOP_K, ...filter }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
     if (mine !== questions) return;
-    fill(answer, h("section", { class: "card refused" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "No answer"), h("p", {}, error.message))));
+    fill(answer, h("section", { class: "card refused" }, h("figure", {}, queryPhoto.picture()), h("div", {}, h("h2", {}, "No answer"), h("p", {}, error.message))));
     return;
   }
   if (mine !== questions) return;
   const photos = byProbability(found.similar_images);
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
-  const open = (index) => compare(asked, photos, index, signal);
+  const open = (index) => compare(queryPhoto, photos, index, signal);
   const located = photos.some((photo) => photo.latitude !== null);
   const ground = h("div", { class: "ground" });
+  const [first] = photos;
+  const unlocated = first && first.latitude === null && first.place === null;
   fill(answer,
     h("section", { class: "result" },
-      h("figure", { class: "query-photo" }, asked.picture(), h("figcaption", {}, asked.name)),
-      verdict(found),
+      h("figure", { class: "query-photo" }, queryPhoto.picture(), h("figcaption", {}, queryPhoto.name)),
+      h("div", { class: "verdict-column" }, verdict(found),
+        unlocated && button("Search only photos with coordinates", () => showAnswer(answer, queryPhoto, signal, { box: WITH_COORDINATES }))),
       located ? ground : null),
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo is similar enough"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
       photos.length > 0 && figures(photos, found.word_weights === "applied")));
-  say(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
+  announce(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
   if (located) await drawAnswer(openMap, ground, found.estimate, photos, open, signal);
 }
 
@@ -174,14 +183,18 @@ function matchCard(photo, index, onclick) {
 
 /** The numbers behind the ranking. */
 function figures(photos, weighted) {
-  const heads = ["", "Photo", "Same place", ...(weighted ? ["Weighted score"] : []), "Similarity"];
+  const likely = photos.some((photo) => photo.match_probability !== null);
+  const order = likely
+    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below.`
+    : "Photos are in the order of their similarity.";
+  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), "Similarity"];
   const numbers = (photo) => [
-    percent(photo.match_probability), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
+    ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
-    h("p", { class: "soft" }, `Photos come in the order of the probability that they show the same place; it is computed from all similarities${weighted ? ", weighted by what this map trusts" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Similarity is the cosine of two descriptors.`),
+    h("p", { class: "soft" }, `${order} Similarity is the cosine of two descriptors.`),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Numbers of the matches" }, h("table", {},
-      h("thead", {}, h("tr", {}, heads.map((name, column) => h("th", { scope: "col", class: column > 1 ? "number" : "" }, name || h("span", { class: "heard" }, "Rank"))))),
+      h("thead", {}, h("tr", {}, heads.map((name, column) => h("th", { scope: "col", class: column > 1 ? "number" : "" }, name || h("span", { class: "visually-hidden" }, "Rank"))))),
       h("tbody", {}, photos.map((photo, index) => h("tr", {},
         h("td", {}, String(index + 1)), h("td", { class: "name" }, nameOf(photo)),
         numbers(photo).map((number) => h("td", { class: "number" }, number))))))));

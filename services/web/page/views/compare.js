@@ -7,7 +7,7 @@ import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
 
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
-export function compare(asked, photos, index, signal) {
+export function compare(queryPhoto, photos, index, signal) {
   const body = h("div", { class: "compare" });
   const { dialog, heading } = openDialog("", body);
   dialog.classList.add("wide");
@@ -23,9 +23,9 @@ export function compare(asked, photos, index, signal) {
     const opacity = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
     opacity.addEventListener("input", () => (overlay.style.opacity = opacity.value / 100));
     overlay.style.opacity = 0.7;
-    const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Asking what makes them similar…"));
+    const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Looking for what makes them similar…"));
     fill(body,
-      h("figure", {}, h("div", { class: "frame" }, asked.picture(), overlay), h("figcaption", {}, asked.name)),
+      h("figure", {}, h("div", { class: "frame" }, queryPhoto.picture(), overlay), h("figcaption", {}, queryPhoto.name)),
       h("figure", {}, h("div", { class: "frame" }, preview(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${whereabouts(photo)}`)),
         photo.latitude !== null && coordinateTools(photo.latitude, photo.longitude)),
       h("div", { class: "compare-words" },
@@ -37,17 +37,17 @@ export function compare(asked, photos, index, signal) {
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
           h("button", { type: "button", onclick: () => show(index + 1) }, "Next →"))));
     try {
-      const found = await asked.find({ top_k: 1, ids: photo.image_id, explain: true }, () => {});
+      const found = await queryPhoto.find({ top_k: 1, ids: photo.image_id, explain: true }, () => {});
       const explanation = found.similar_images[0]?.explanation;
       if (mine !== shown || !explanation) return;
       overlay.src = explanation.overlay;
       overlay.hidden = false;
       fill(why,
-        h("p", { class: "legend" }, h("span", { class: "swatch for" }), "speaks for this match ", h("span", { class: "swatch against" }), "speaks against it"),
+        h("p", { class: "legend" }, h("span", { class: "swatch for" }), "increases the similarity ", h("span", { class: "swatch against" }), "decreases it"),
         h("label", { class: "field inline" }, h("span", {}, "Overlay"), opacity));
     } catch (error) {
       if (mine !== shown || signal.aborted) return;
-      fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "What makes them similar can’t be told now."));
+      fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "The explanation is not available now."));
     }
   }
 

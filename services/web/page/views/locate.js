@@ -1,15 +1,14 @@
 // Locate a folder: proposals for photos without coordinates, in a table and on the map, as CSV or GPX.
 
 import { ask, currentMap, get } from "../api.js";
-import { bar, button, field, fill, h, note, noteError, say } from "../dom.js";
+import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { takesDrops } from "../drop.js";
 import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
-import { findSimilar } from "./ask.js";
+import { WITH_COORDINATES, findSimilar } from "./ask.js";
 
 const HEADER_BYTES = 256 * 1024;
 const SIMILAR = 50;
-const WITH_COORDINATES = "-90,-180,90,180"; // a box that contains all photos that have some
 const AT_ONCE = 3;
 const PER_CALL = 100; // photos without coordinates, as the server allows
 const TRACK_POINTS = 5000;
@@ -113,6 +112,10 @@ async function readPhotos(files, map, progress, signal) {
 }
 
 async function readHeader(photo, signal) {
+  if (photo.file.size === 0) {
+    photo.error = "The file is empty.";
+    return;
+  }
   const response = await ask("/photo-headers", { method: "POST", body: photo.file.slice(0, HEADER_BYTES), headers: { "Content-Type": "application/octet-stream" }, signal });
   const { captured_at: time, time_zone_is_known: zoned, ...header } = await response.json();
   Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned } });
@@ -184,11 +187,15 @@ async function drawResult(result, photos, proposals, least, signal) {
   const errors = new Map(photos.map(({ name, error }) => [name, error]));
   const ground = h("div", { class: "ground browse" });
   const words = `${plural(proposals.length, "photo")} without coordinates, ${count(accepted.length)} accepted`;
+  const chip = (proposal) => {
+    const [words, kind] = accepted.includes(proposal) ? ["accepted", "own"] : errors.get(proposal.name) ? ["failed", "failed"] : ["uncertain", ""];
+    return h("span", { class: `chip ${kind}` }, words);
+  };
   const row = (proposal) => h("tr", {},
     h("td", { class: "name" }, proposal.name),
     h("td", {}, proposal.latitude === null ? "–" : `${degrees(proposal.latitude, proposal.longitude)} ± ${metres(proposal.radius_m)}`),
     h("td", { class: "number" }, percent(proposal.probability)),
-    h("td", {}, h("span", { class: `chip ${accepted.includes(proposal) ? "own" : ""}` }, accepted.includes(proposal) ? "accepted" : "uncertain")),
+    h("td", {}, chip(proposal)),
     h("td", { class: "name" }, errors.get(proposal.name) ?? proposal.reason));
   const known = proposals.some(({ latitude }) => latitude !== null) || located.length > 0;
   fill(result,
@@ -200,9 +207,9 @@ async function drawResult(result, photos, proposals, least, signal) {
           accepted.length > 0 && button("Download GPX", () => download("placewise-locations.gpx", "application/gpx+xml", gpxOf(accepted, photos))))),
       h("p", { class: "soft small" }, `${plural(located.length, "photo")} with coordinates. To write into photos or sidecars, run `, h("code", {}, "placewise locate"), "."),
       h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", { class: "proposals" },
-        h("thead", {}, h("tr", {}, ["Photo", "Position", "Probability", "", "Reason"].map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name || h("span", { class: "heard" }, "Accepted"))))),
+        h("thead", {}, h("tr", {}, ["Photo", "Position", "Probability", "", "Reason"].map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name || h("span", { class: "visually-hidden" }, "Accepted"))))),
         h("tbody", {}, proposals.map(row))))));
-  say(words);
+  announce(words);
   if (!known) return;
   const { openMap } = await import("../map.js");
   const map = await openMap(ground, "The photos with coordinates, and the proposals", { signal });
@@ -214,7 +221,8 @@ async function drawResult(result, photos, proposals, least, signal) {
   map.fit();
 }
 
-const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+// An apostrophe before what a spreadsheet would run as a formula: `placewise index --csv` removes it.
+const quoted = (text) => `"${text.replace(/^(?='*[=+@\t\r-])/, "'").replaceAll('"', '""')}"`;
 const csvOf = (accepted) => ["filename,latitude,longitude", ...accepted.map(({ name, latitude, longitude }) => `${quoted(name)},${latitude},${longitude}`), ""].join("\n");
 
 function gpxOf(accepted, photos) {

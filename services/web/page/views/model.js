@@ -9,9 +9,9 @@ const CHANGES = ["fit", "import_vocabulary", "switch", "pca"];
 const RECALLS = ["R@1", "R@5", "R@10"];
 
 const STANDING = {
-  own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
-  provisional: ["Provisional", "The vocabulary was learnt when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
-  foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
+  own: ["Its own", "The vocabulary was fitted on this map’s photos. Fit it again when you have added many."],
+  provisional: ["Provisional", "The vocabulary was fitted when this map had fewer than 50 photos. Fit it again when it has more: nothing improves the answers as much."],
+  foreign: ["Foreign", "The vocabulary was fitted on photos of other places. Fit one on this map’s photos: nothing improves the answers as much."],
   pending: ["Not yet", "Until this map has a vocabulary, its photos are compared by an average of their features. Fit one: nothing improves the answers as much."],
   none: ["None", "This extractor uses no vocabulary."],
 };
@@ -31,14 +31,14 @@ export async function showModel(view, { signal }) {
   fill(view,
     h("header", { class: "head" }, h("h1", {}, "Model"), advancedTabs("model")),
     h("section", { class: "card standing" },
-      h("div", {}, h("h2", {}, "What answers now"),
+      h("div", {}, h("h2", {}, "Model in use"),
         h("dl", { class: "facts" },
           h("dt", {}, "Extractor"), h("dd", {}, map.extractor),
           h("dt", {}, "Dimension"), h("dd", {}, map.dimension ? count(map.dimension) : "–"),
           h("dt", {}, "Photos"), h("dd", {}, `${count(map.searchable)} of ${count(map.photos)} searchable`),
           h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)))),
       h("div", { class: "standing-words" },
-        h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to learn from."),
+        h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to fit a vocabulary on."),
         map.photos ? fits && button(["own", "provisional"].includes(map.vocabulary) ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos")),
       work),
     comparison(evaluations, generations, vocabularies, () => measure(follow)),
@@ -68,11 +68,11 @@ async function followJob(work, started, words, again, signal) {
 }
 
 async function fitVocabulary(follow) {
-  const clusters = h("input", { type: "number", min: 1, max: 4096, placeholder: "as the extractor says" });
+  const clusters = h("input", { type: "number", min: 1, max: 4096, placeholder: "set by the extractor" });
   const sample = h("input", { type: "number", min: 1, value: "1000" });
   const { dialog, closed } = openDialog("Fit a vocabulary", h("form", { method: "dialog" },
     h("p", {}, "Centres are found in this map’s own photos, and every photo is described again with them. Answers go on meanwhile; the new descriptors take over when all are ready."),
-    h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to learn from, at most", sample)),
+    h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to fit on, at most", sample)),
     h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
   if ((await closed) !== "yes") return;
   const options = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
@@ -92,7 +92,7 @@ function comparison(evaluations, generations, vocabularies, onmeasure) {
   const [after, before] = measured;
   const head = h("header", { class: "head" }, h("h2", {}, before ? "Before and after" : "How good the answers are"), button("Measure now", onmeasure));
   if (!after) {
-    return h("section", { class: "card" }, head, h("p", {}, "Not measured yet. Placewise asks the map about its own photos, each left out once: how often does another photo of the same place come first? It does so by itself once 20 photos have coordinates or a place."));
+    return h("section", { class: "card" }, head, h("p", {}, "Not measured yet. Placewise searches with the map’s own photos, each left out once, and counts how often another photo of the same place comes first. It does so automatically once 20 photos have coordinates or a place."));
   }
   const nameOf = (evaluation) => nameGeneration(generations.find((one) => one.generation_id === evaluation.generation_id), vocabularies);
   const sets = [["labelled_queries", "Test photos"], ["leave_one_out", "The map’s own photos, each left out once"]];
@@ -146,7 +146,7 @@ function vocabulariesTable(vocabularies, generations, follow) {
   const active = generations.find((one) => one.state === "active");
   return h("section", { class: "card" }, h("h2", {}, "Vocabularies"),
     h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Vocabularies" }, h("table", {},
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number wide-only" }, "Clusters"), h("th", { scope: "col", class: "wide-only" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number wide-only" }, "Clusters"), h("th", { scope: "col", class: "wide-only" }, "Fitted on"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
       h("tbody", {}, vocabularies.map((one) => h("tr", {},
         h("td", {}, nameVocabulary(one)), h("td", { class: "number wide-only" }, count(one.clusters)),
         h("td", { class: "wide-only" }, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),

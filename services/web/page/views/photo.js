@@ -1,4 +1,4 @@
-// One photo: large, where it is, what is said of it, and changing that.
+// One photo: large, where it is, its metadata, and changing them.
 
 import { ask, currentMap, get } from "../api.js";
 import { button, confirmed, field, fill, h, note, time } from "../dom.js";
@@ -10,11 +10,12 @@ import { readTags } from "./photos.js";
 
 export async function showPhoto(view, { signal, id }) {
   const photo = await get(`/uploads/${id}`, { signal });
+  const job = photo.searchable || !photo.job_id ? null : await get(`/jobs/${photo.job_id}`, { signal });
   document.title = `${nameOf(photo)} · ${currentMap()} · Placewise`;
   const ground = h("div", { class: "ground" });
   const form = editForm(photo);
   const remove = async () => {
-    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} is gone from every answer at once, and can’t be brought back.`, "Delete"))) return;
+    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} disappears from all answers at once. This can’t be undone.`, "Delete"))) return;
     await ask(`/uploads/${id}`, { method: "DELETE" });
     note(`${nameOf(photo)} is deleted.`);
     location.hash = "#/photos";
@@ -30,7 +31,7 @@ export async function showPhoto(view, { signal, id }) {
       h("div", { class: "beside" },
         h("section", { class: "card" }, form.element),
         h("section", { class: "card" }, ground, h("p", { class: "soft small" }, "Click into the map to move the photo there, then save.")),
-        h("section", { class: "card" }, facts(photo)))));
+        h("section", { class: "card" }, facts(photo, job)))));
   const map = await openMap(ground, "Where this photo was taken; click to move it", { onpick: (latitude, longitude) => {
     form.setPoint(latitude, longitude);
     draw();
@@ -49,10 +50,11 @@ export async function showPhoto(view, { signal, id }) {
   draw(true);
 }
 
-function facts(photo) {
+function facts(photo, job) {
+  const state = photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet";
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
-    line("Searchable", photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet"),
+    line("Searchable", job?.state === "failed" ? h("span", { class: "bad" }, `no. ${job.error.detail}`) : state),
     photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
@@ -60,11 +62,15 @@ function facts(photo) {
     Object.entries(photo.metadata).map(([name, value]) => line(name, typeof value === "string" ? value : JSON.stringify(value))));
 }
 
+// A centimetre: more digits are rounding errors of the EXIF's degrees, minutes and seconds.
+const DIGITS = 7;
+const rounded = (degrees) => (degrees === null ? "" : String(Number(degrees.toFixed(DIGITS))));
+
 const numberOf = (input) => (input.value.trim() === "" ? null : Number(input.value));
 
 function editForm(photo) {
-  const latitude = h("input", { type: "number", min: -90, max: 90, step: "any", value: photo.latitude ?? "" });
-  const longitude = h("input", { type: "number", min: -180, max: 180, step: "any", value: photo.longitude ?? "" });
+  const latitude = h("input", { type: "number", min: -90, max: 90, step: "any", value: rounded(photo.latitude) });
+  const longitude = h("input", { type: "number", min: -180, max: 180, step: "any", value: rounded(photo.longitude) });
   const place = h("input", { maxlength: 500, value: photo.place ?? "", autocomplete: "off" });
   const tags = h("input", { value: photo.tags.join(", "), autocomplete: "off" });
   const role = h("select", {}, h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photo"));
@@ -81,7 +87,7 @@ function editForm(photo) {
     saving.click();
   } },
     h("div", { class: "pair" }, field("Latitude", latitude), field("Longitude", longitude)),
-    field("Place", place, "A label, where coordinates say little: a room, a shelf"),
+    field("Place", place, "A label, such as a room or a shelf"),
     field("Tags", tags, "Separated by commas"),
     field("Use", role, "A test photo is never found: the map is measured with it"));
   const saving = button("Save", save, "primary");

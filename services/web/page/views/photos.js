@@ -58,16 +58,21 @@ export async function showPhotos(view, { signal }) {
   }
 
   function card(photo) {
-    const box = h("input", { type: "checkbox", "aria-label": `Choose ${nameOf(photo)}` });
+    const box = h("input", { type: "checkbox", "aria-label": `Select ${nameOf(photo)}` });
     box.addEventListener("change", () => {
       if (box.checked) chosen.set(photo.image_id, photo);
       else chosen.delete(photo.image_id);
       drawTools();
     });
+    const corner = h("span", { class: "chip corner", hidden: photo.role !== "query" }, "test photo");
+    const onundescribed = () => {
+      corner.textContent = "not searchable";
+      corner.classList.add("foreign");
+      corner.hidden = false;
+    };
     return h("article", { class: "photo-card" },
-      h("a", { href: `#/photo/${photo.image_id}`, "aria-label": nameOf(photo) }, thumbnail(photo, "")),
-      box,
-      photo.role === "query" && h("span", { class: "chip corner" }, "test photo"),
+      h("a", { href: `#/photo/${photo.image_id}`, "aria-label": nameOf(photo) }, thumbnail(photo, "", onundescribed)),
+      box, corner,
       h("p", { class: "photo-name", title: nameOf(photo) }, photo.place ?? nameOf(photo)),
       h("p", { class: "soft" }, photo.latitude === null && photo.place ? time(photo.captured_at ?? photo.upload_time) : whereabouts({ ...photo, place: null })),
       photo.tags.length > 0 && h("p", { class: "chips" }, photo.tags.map((tag) => h("span", { class: "chip" }, tag))));
@@ -76,9 +81,9 @@ export async function showPhotos(view, { signal }) {
   function drawTools() {
     tools.hidden = chosen.size === 0;
     fill(tools, chosen.size > 0 && [
-      h("strong", {}, plural(chosen.size, "photo") + " chosen"),
+      h("strong", {}, plural(chosen.size, "photo") + " selected"),
       button("Tag…", tagChosen), button("Delete…", deleteChosen, "danger"),
-      button("Choose none", () => {
+      button("Clear selection", () => {
         for (const box of grid.querySelectorAll("input:checked")) box.checked = false;
         chosen.clear();
         drawTools();
@@ -97,7 +102,7 @@ export async function showPhotos(view, { signal }) {
   }
 
   async function deleteChosen() {
-    if (!(await confirmed(`Delete ${plural(chosen.size, "photo")}?`, "They are gone from every answer at once, and can’t be brought back.", "Delete"))) return;
+    if (!(await confirmed(`Delete ${plural(chosen.size, "photo")}?`, "They disappear from all answers at once. This can’t be undone.", "Delete"))) return;
     await each((photo) => ask(`/uploads/${photo.image_id}`, { method: "DELETE" }), "deleted");
   }
 
@@ -141,7 +146,7 @@ export const readTags = (text) => text.split(",").map((tag) => tag.trim()).filte
 
 function nothing(filtered) {
   return filtered
-    ? h("section", { class: "card empty" }, h("h2", {}, "No photo passes the filter"), h("p", {}, "Take away a part of it: every field narrows."))
+    ? h("section", { class: "card empty" }, h("h2", {}, "No photo matches the filter"), h("p", {}, "Clear a field: a photo must match all of them."))
     : h("section", { class: "card empty" }, h("img", { src: "/console/place.svg", alt: "", width: "176", height: "144" }), h("h2", {}, "This map has no photos yet"), h("p", {}, "Add photos whose place is known: from a phone, whose photos carry coordinates, or with a place of your own."), h("a", { class: "button primary", href: "#/add" }, "Add photos"));
 }
 

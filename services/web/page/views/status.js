@@ -14,7 +14,7 @@ export async function showStatus(view, { signal }) {
     const [health, stats, { jobs }, { searches }] = await Promise.all([
       // 503 with the same answer, where a part is away.
       get("/health", { signal, also: [503] }), get("/database/stats", { signal }),
-      get("/jobs", { query: { limit: 12 }, signal }), get("/searches", { query: { limit: 12 }, signal }),
+      get("/jobs", { query: { limit: 12, kind: Object.keys(KINDS) }, signal }), get("/searches", { query: { limit: 12 }, signal }),
     ]);
     drawHealth(drawn.health, health);
     drawFigures(drawn.figures, stats);
@@ -54,7 +54,8 @@ function drawFigures(card, stats) {
       tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")));
 }
 
-const KINDS = { index: "Photo", batch: "Batch", describe: "Question", compare: "Comparison", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", add_model: "New model", evaluate: "Evaluation", reindex: "Describe again", word_weights: "Word weights" };
+// Those that a search starts are listed as questions.
+const KINDS = { index: "Photo", batch: "Batch", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", add_model: "New model", evaluate: "Evaluation", word_weights: "Word weights" };
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {
@@ -62,9 +63,9 @@ function drawJobs(card, jobs, look) {
     return;
   }
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
-      h("td", {}, KINDS[job.kind] ?? job.kind),
+      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, KINDS[job.kind]) : KINDS[job.kind]),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
       h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
       h("td", {}, time(job.created_at)),
@@ -80,9 +81,9 @@ function drawSearches(card, searches) {
   }
   const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number wide-only" }, "Best"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number wide-only" }, "Similarity"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
-      const [words, tone] = verdict[one.in_map] ?? ["Open", ""];
+      const [words, tone] = verdict[one.in_map] ?? ["No estimate", ""];
       return h("tr", {},
         h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
         h("td", {}, h("span", { class: `chip ${tone}` }, words)),

@@ -22,10 +22,10 @@ export function verdict(found) {
       h("dl", { class: "facts" },
         estimate.confidence !== null && [h("dt", {}, "Confidence"), h("dd", {}, percent(estimate.confidence))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
-        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity of the words that this map trusts" : "similarity"),
+        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
-    found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
+    found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
     found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
     found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
 }

@@ -15,7 +15,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
 from placewise.answers import Similar
-from services.cli.locate import command, exif_writers
+from services.cli.locate import command, writers
 from services.cli.locate.folder import FolderPhoto, read_folder, read_gpx
 from services.cli.locate.sidecars import add_position, read_position
 from services.cli.main import build_app
@@ -225,7 +225,7 @@ def test_a_missing_exif_writer_is_named_with_the_ways_to_get_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
-    monkeypatch.setattr(exif_writers, "find_spec", lambda name: None)
+    monkeypatch.setattr(writers, "find_spec", lambda name: None)
     result = run(folder, "--write", "exif")
     assert result.exit_code == 1
     for words in ("no_exif_writer", "exiftool", "uv pip install '.[exif]'", "--write sidecar"):
@@ -263,6 +263,14 @@ def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path)
     assert float(point.attrib["lat"]) == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
     assert run(folder, "--undo").exit_code == 0
     assert not list(folder.glob("placewise-locations*"))
+
+
+def test_a_name_in_a_table_is_no_formula_for_a_spreadsheet(folder: Path) -> None:
+    (folder / "day 1" / "2.jpg").rename(folder / "=2.jpg")
+    assert run(folder, "--write", "csv").exit_code == 0
+    table = (folder / "placewise-locations.csv").read_bytes()
+    assert b"\n'=2.jpg," in table
+    assert [entry.name for entry in read_csv_manifest(table, "table")] == ["=2.jpg"]
 
 
 def answer(**changes: Any) -> Similar:

@@ -305,7 +305,7 @@ def test_the_predecessors_checkpoints_are_read_under_our_names(
     state = {"state_dict": tensors, "hyper_parameters": parameters, "epoch": 29}
     found = load_checkpoint(saved(tmp_path / "theirs.ckpt", state))
     assert found.config.image_size == size
-    assert found.config.layers_to_freeze == -1  # what it asked for froze nothing
+    assert found.config.layers_to_freeze == -1  # its setting froze nothing
     assert found.about == {
         "lr": 2e-4,
         "loss_name": "MultiSimilarityLoss",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shared.evaluation.baselines import BASELINE_DESCRIPTORS, average_colour, thumbnail
+from services.cli.datasets.baselines import BASELINE_DESCRIPTORS, average_colour, thumbnail
 from tests.support.photos import photo_image
 
 

@@ -1,4 +1,4 @@
-"""Sizes in environment variables: bytes, or a number with a unit."""
+"""Values in environment variables: sizes (bytes, or a number with a unit) and lists."""
 
 from __future__ import annotations
 
@@ -26,3 +26,8 @@ Size = Annotated[int, BeforeValidator(_parse_size)]
 def format_megabytes(size_bytes: int) -> str:
     """Return a size in MB (10^6 bytes), as messages write it: 100 MB, 10.4858 MB."""
     return f"{size_bytes / 1e6:.6g} MB"
+
+
+def split_list(value: str | None) -> list[str]:
+    """Split a setting at commas and blanks; an unset one is an empty list."""
+    return (value or "").replace(",", " ").split()
