@@ -1,8 +1,9 @@
 """Preparation and description of batches: reading, decoding, and the forward pass.
 
 `prepare_batch` reads and decodes the photos of claimed jobs on the CPU; `describe_batch` computes
-their descriptor rows. A batch that is reindexed into a generation with PCA needs no photos if the
-active generation has the same unprojected spec: its stored rows are read and projected.
+their descriptor rows. A batch that is reindexed needs no photos if its rows follow from those of
+the active generation: with the same spec before PCA, they are projected; with the same spec and
+more precision, they are rounded.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from services.extractor.decoder_pool import DecoderPool
 from services.extractor.generation_resolver import ResolvedGeneration
 from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import active_generation
+from shared.catalog.generations import RowType, active_generation
 from shared.catalog.photos import Photo, get_live_photos
 from shared.descriptors.extractor import not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
+from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import NotFound, PlacewiseError
 from shared.imaging.decode import DecodedPhoto
 from shared.imaging.file_formats import Previews
@@ -64,29 +66,41 @@ def read_stored_rows(
     return rows
 
 
-def _read_rows_to_project(
+def _read_reusable_rows(
     catalog: Catalog, store: ObjectStore, jobs: list[Job], target: ResolvedGeneration
-) -> tuple[list[Job], Rows] | None:
-    """Return REINDEX jobs into a generation with PCA, and their unprojected (jobs, dimension) rows.
+) -> tuple[list[Job], Rows, PcaProjection | None] | None:
+    """Return REINDEX jobs, their stored (jobs, dimension) rows, and the projection that they need.
 
     Jobs whose photo was deleted are left out. Returns None if the photos have to be described
-    instead: the active generation has another spec, or lacks the row of a photo.
+    instead: the target's rows do not follow from those of the active generation, or the row of a
+    photo is missing.
     """
-    if target.projection is None or jobs[0].kind != JobKind.REINDEX:
+    if jobs[0].kind != JobKind.REINDEX:
         return None
     photo_ids = [job.photo_id for job in jobs if job.photo_id is not None]
     with catalog.read() as session:
         source = active_generation(session, jobs[0].map_id)
         live = get_live_photos(session, photo_ids).keys()
-    if source is None or source.spec != target.extractor.spec(target.centres):
+    if source is None:
+        return None
+    row_types = (source.row_type, target.generation.row_type)
+    if source.spec == target.spec and row_types == (RowType.FLOAT32, RowType.FLOAT16):
+        projection = None
+    elif target.projection and source.spec == target.extractor.spec(target.centres):
+        projection = target.projection
+    else:
         return None
     rows = read_stored_rows(catalog, store, source.id, photo_ids)
     if live - rows.keys():
         return None
     jobs_with_rows = [(job, rows[job.photo_id]) for job in jobs if job.photo_id in rows]
     if not jobs_with_rows:
-        return [], np.empty((0, target.projection.dimension), np.float32)
-    return [job for job, _ in jobs_with_rows], np.stack([row for _, row in jobs_with_rows])
+        return [], np.empty((0, source.dimension), np.float32), projection
+    return (
+        [job for job, _ in jobs_with_rows],
+        np.stack([row for _, row in jobs_with_rows]),
+        projection,
+    )
 
 
 PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
@@ -107,7 +121,9 @@ class DescribeBatch:
     deleted: list[Job] = field(default_factory=list)
     """Jobs whose photo was deleted meanwhile."""
     stored_rows: Rows | None = None
-    """Unprojected rows of `ready`, to be projected instead of decoding photos."""
+    """Stored rows of `ready`, used instead of decoding photos."""
+    projection: PcaProjection | None = None
+    """Projection of the stored rows; None if they stay as they are."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Duration of each stage."""
 
@@ -146,13 +162,13 @@ def prepare_batch(
 
     Query photos get a preview if their format is one that not all browsers show.
 
-    Where possible, stored rows are read instead (`_read_rows_to_project`).
+    Where possible, stored rows are read instead (`_read_reusable_rows`).
     """
     batch = DescribeBatch(jobs=jobs, target=target)
     started = time.perf_counter()
-    rows_to_project = _read_rows_to_project(catalog, store, jobs, target)
-    if rows_to_project is not None:
-        batch.ready, batch.stored_rows = rows_to_project
+    reusable = _read_reusable_rows(catalog, store, jobs, target)
+    if reusable is not None:
+        batch.ready, batch.stored_rows, batch.projection = reusable
         batch.deleted = [job for job in jobs if job not in batch.ready]
         batch.seconds["read"] = time.perf_counter() - started
         return batch
@@ -233,8 +249,9 @@ def describe_batch(batch: DescribeBatch) -> Rows:
         started = time.perf_counter()
         try:
             if batch.stored_rows is not None:
-                assert target.projection is not None
-                rows = target.projection.project(batch.stored_rows)
+                rows = batch.stored_rows
+                if batch.projection is not None:
+                    rows = batch.projection.project(rows)
             else:
                 pixels = [decoded.pixels for decoded in batch.decoded]
                 rows = target.extractor.describe(pixels, target.centres, target.projection)

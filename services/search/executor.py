@@ -132,14 +132,13 @@ def sign_codes_pay_off(selected: int, k: int) -> bool:
     return selected > 64 + 4 * k
 
 
-def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
+def int8_codes_pay_off(selected: int, k: int, dimension: int, row_bytes: int) -> bool:
     """Whether a search by int8 codes reads fewer bytes than a dense scan of the selected rows.
 
-    It reads all codes and about 2 k full rows.
+    It reads all codes and about 2 k full rows, of `row_bytes` each.
     """
     from shared.codes.rotation import get_rotation
 
-    row_bytes = 4 * dimension  # of float32; float16 rows are half as long, but are converted
     code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
 
@@ -166,7 +165,9 @@ class _Query:
             scored is None
             and options.mode != Mode.DENSE
             and snapshot.has_int8_codes
-            and int8_codes_pay_off(selected, options.k, snapshot.dimension)
+            and int8_codes_pay_off(
+                selected, options.k, snapshot.dimension, snapshot.chunks[0].rows.strides[0]
+            )
         ):
             scored = self._search_by_int8()
         if scored is None:

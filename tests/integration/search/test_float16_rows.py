@@ -16,6 +16,7 @@ from shared.catalog.database.session import Catalog
 from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
+from tests.integration.conftest import LentDecoders
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import stored_rows
 from tests.support.photos import photo_bytes
@@ -109,7 +110,43 @@ def test_an_old_map_keeps_its_rows_until_its_next_generation(
     assert generation(service)["rows"] == "float32"
     assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float32)}
     before = answers(service, photos[0])
+    reindex(service, catalog)
+    assert generation(service)["rows"] == "float16"
+    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float16)}
+    after = answers(service, photos[0])
+    assert [photo_id for photo_id, _ in after] == [photo_id for photo_id, _ in before]
+    np.testing.assert_allclose([s for _, s in after], [s for _, s in before], atol=1e-3)
+
+
+def test_rows_are_rounded_without_their_photos_and_described_again_for_more_precision(
+    service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "half", "extractor": "test-tiny-avg"})
+    photos = service.indexed(1, 2, 3, map_name="half")
+    full = rows_of(service)
+    service.json("PATCH", "/maps/half", json={"rows": "float16"})
+    service.json("DELETE", f"/uploads/{photos[0]}", params={"map": "half"})
+    with monkeypatch.context() as patched:
+        patched.setattr(LentDecoders, "decode", _refuse_decoding)
+        reindex(service, catalog)
+    rounded = rows_of(service)
+    assert set(rounded) == {UUID(photo_id) for photo_id in photos[1:]}
+    assert all((row == full[photo_id].astype("float16")).all() for photo_id, row in rounded.items())
+    service.json("PATCH", "/maps/half", json={"rows": "float32"})
+    reindex(service, catalog)
+    again = rows_of(service)
+    assert all((row == full[photo_id]).all() for photo_id, row in again.items())
+    assert {row.dtype for row in again.values()} == {np.dtype(np.float32)}
+
+
+def _refuse_decoding(*_: Any, **__: Any) -> None:
+    raise AssertionError("a photo was decoded")
+
+
+def reindex(service: Service, catalog: Catalog) -> None:
+    """Describe the map `half` into a new generation, and switch to it."""
     service.search.sync()
+    before = generation(service)["generation_id"]
     service.json(
         "POST", "/generations", 202, params={"map": "half"}, json={"extractor": "test-tiny-avg"}
     )
@@ -118,11 +155,7 @@ def test_an_old_map_keeps_its_rows_until_its_next_generation(
         service.search.sync()
         advance_model_changes(catalog, InProcessWakeups())
     assert generation(service)["state"] == "active"
-    assert generation(service)["rows"] == "float16"
-    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float16)}
-    after = answers(service, photos[0])
-    assert [photo_id for photo_id, _ in after] == [photo_id for photo_id, _ in before]
-    np.testing.assert_allclose([s for _, s in after], [s for _, s in before], atol=1e-3)
+    assert generation(service)["generation_id"] != before
 
 
 def test_an_unknown_type_of_rows_is_refused(service: Service) -> None:

@@ -30,7 +30,7 @@ DIMENSION = 512
 
 @pytest.fixture(autouse=True)
 def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executor, "int8_codes_pay_off", lambda selected, k, dimension: True)
+    monkeypatch.setattr(executor, "int8_codes_pay_off", lambda *_: True)
 
 
 @settings(max_examples=60, deadline=None)
@@ -129,20 +129,29 @@ def test_statistical_search_is_not_used_where_no_error_is_allowed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("selected", "k", "dimension", "worth"),
+    ("selected", "k", "dimension", "number_bytes", "worth"),
     [
-        (100_000, 10, 512, True),
-        (100_000, 90_000, 512, False),
-        (20, 10, 512, False),
-        (100_000, 10, 12, False),  # 64 bytes and the figures against 48
-        (10_000, 10, 98_304, True),
+        (100_000, 10, 512, 4, True),
+        (100_000, 10, 512, 2, True),
+        (100_000, 90_000, 512, 4, False),
+        (60, 10, 512, 4, True),
+        (60, 10, 512, 2, False),
+        (20, 10, 512, 4, False),
+        (100_000, 10, 12, 4, False),  # 64 bytes and the figures against 48
+        (10_000, 10, 98_304, 4, True),
+        (10_000, 10, 98_304, 2, True),
     ],
 )
 def test_int8_codes_are_used_where_they_are_less_to_read(
-    monkeypatch: pytest.MonkeyPatch, selected: int, k: int, dimension: int, worth: bool
+    monkeypatch: pytest.MonkeyPatch,
+    selected: int,
+    k: int,
+    dimension: int,
+    number_bytes: int,
+    worth: bool,
 ) -> None:
     monkeypatch.undo()
-    assert int8_codes_pay_off(selected, k, dimension) == worth
+    assert int8_codes_pay_off(selected, k, dimension, number_bytes * dimension) == worth
 
 
 @pytest.mark.parametrize("most_rows", [0, 1, 5, 12])
