@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.estimates import DescribedPhotos, TrialMap, describe_set
+from benchmarks.places.estimates import DescribedPhotos, TrialMap, describe_set
 from services.cli.output import console
 from shared.evaluation.places.evidence import PhotoLocation, is_same_place
 from shared.evaluation.places.fit import (

@@ -102,7 +102,7 @@ def pipeline(
     """Measure CPU time per photo outside the model, and upload throughput."""
 
 
-@_benchmark("extract")
+@_benchmark("descriptors.extract")
 def extract(
     extractor: ExtractorOption = "anyloc-vits14",
     photos: Annotated[int, typer.Option(min=1)] = 32,
@@ -120,7 +120,7 @@ def extract(
     """
 
 
-@_benchmark("precision")
+@_benchmark("descriptors.precision")
 def precision(
     extractor: ExtractorOption = "efficientnet-lite0-vlad",
     places: Annotated[
@@ -134,7 +134,7 @@ def precision(
     """Compare patches, descriptors and recall in bfloat16 with those in float32."""
 
 
-@_benchmark("train")
+@_benchmark("descriptors.train")
 def train(
     places: PlacesOption = 300,
     epochs: Annotated[int, typer.Option(min=1)] = 20,
@@ -152,7 +152,7 @@ def train(
     """Measure training throughput, data loading stalls and the recall that training achieves."""
 
 
-@_benchmark("estimates")
+@_benchmark("places.estimates")
 def estimates(
     folders: Annotated[
         list[Path] | None,
@@ -179,7 +179,7 @@ def query_latency(
     """Measure query latency while thousands of uploads are queued."""
 
 
-@_benchmark("rerank")
+@_benchmark("descriptors.rerank")
 def rerank(
     places: PlacesOption = 150,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the city.")] = 0,
@@ -232,7 +232,7 @@ def search(
     )
 
 
-@_benchmark("rivals")
+@_benchmark("search.rivals")
 def rivals(
     photos: Annotated[int, typer.Option(min=100, help="Number of photos in the map.")] = 10_000,
     dimension: Annotated[
@@ -363,6 +363,6 @@ def _load_benchmark(name: str) -> Any:
             raise
         raise Misconfigured(
             "no_benchmarks",
-            f"`placewise bench {name}` requires a checkout of Placewise with the dev extra: "
+            "`placewise bench` requires a checkout of Placewise with the dev extra: "
             f"{error}. In the checkout, run make setup, then .venv/bin/placewise bench.",
         ) from error

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import dataclass
 from uuid import UUID
 
 import numpy as np
@@ -54,13 +55,13 @@ READ_BATCH_BYTES = 16_000_000  # of descriptor rows read at once
 SEED = 0
 
 
+@dataclass(frozen=True, slots=True)
 class PcaFitJob:
     """Fits a PCA whitening, one step at a time."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
-        self._catalog = catalog
-        self._store = store
-        self._models = models
+    catalog: Catalog
+    store: ObjectStore
+    models: ModelRegistry
 
     def run_step(self, job: Job) -> None:
         """Run the next step of the job's stage; PlacewiseError if it can't continue."""
@@ -73,7 +74,7 @@ class PcaFitJob:
 
     def _plan(self, job: Job) -> None:
         """Choose the rows to fit on: those of database photos, never of queries."""
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             source = get_pca_source_generation(session, job.map_id)
             photo_ids = session.scalars(
                 select(Descriptor.photo_id)
@@ -90,9 +91,9 @@ class PcaFitJob:
         check_pca_fittable(len(photo_ids), source.dimension, dimension)
         chosen = sample_rows(len(photo_ids), sample_size(source.dimension, dimension), SEED)
         plan = [str(photo_ids[index]) for index in chosen]
-        self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        self.store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
         checkpoint_and_release(
-            self._catalog,
+            self.catalog,
             job,
             stage="gather",
             params={
@@ -123,14 +124,14 @@ class PcaFitJob:
     def _source_pipeline(self, source: Generation) -> DescriptorPipeline:
         vocabulary = None
         if source.vocabulary_id is not None:
-            with self._catalog.read() as session:
+            with self.catalog.read() as session:
                 vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
-        return self._models.pipeline_of_generation(source, vocabulary, None)
+        return self.models.pipeline_of_generation(source, vocabulary, None)
 
     def _gather(self, job: Job) -> None:
         """Copy the next rows of the plan, for about a second."""
         params = job.params
-        plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
+        plan = json.loads(self.store.get(job_work_key(job.id, "plan.json")))
         batch_rows = max(1, READ_BATCH_BYTES // (4 * params["dimension"]))
         sample = self._gathered_rows(job)
         position = params["looked_at"]
@@ -138,13 +139,13 @@ class PcaFitJob:
             if position >= len(plan):
                 break
             photo_ids = [UUID(photo_id) for photo_id in plan[position : position + batch_rows]]
-            stored = read_stored_rows(self._catalog, self._store, UUID(params["source"]), photo_ids)
+            stored = read_stored_rows(self.catalog, self.store, UUID(params["source"]), photo_ids)
             if stored:
                 rows = np.stack([stored[photo_id] for photo_id in photo_ids if photo_id in stored])
                 sample.add(rows[usable_rows(rows)])
             position += len(photo_ids)
         checkpoint_and_release(
-            self._catalog,
+            self.catalog,
             job,
             stage="gather" if position < len(plan) else "reduce",
             params={**params, "looked_at": position, "rows": sample.count},
@@ -163,8 +164,8 @@ class PcaFitJob:
                 self._write_part(job, fit.parts - 1, part)
 
         if not run_fit_steps(
-            self._catalog,
-            self._store,
+            self.catalog,
+            self.store,
             job,
             fit,
             step,
@@ -172,7 +173,7 @@ class PcaFitJob:
             progress_done=params["looked_at"],
         ):
             return
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             source = session.get_one(Generation, UUID(params["source"]))
         whitening = fit.whitening(
             [self._read_part(job, number) for number in range(block_count(sample))]
@@ -180,8 +181,8 @@ class PcaFitJob:
         pipeline = self._source_pipeline(source)
         projection = PcaProjection(whitening, pipeline.extractor.backbone.device)
         start_whitened_generation(
-            self._catalog,
-            self._store,
+            self.catalog,
+            self.store,
             job,
             DescriptorPipeline(pipeline.extractor, pipeline.centres, projection),
             PcaWhiteningFile(whitening, source.spec),
@@ -192,14 +193,14 @@ class PcaFitJob:
     def _gathered_rows(self, job: Job) -> StoredColumns:
         prefix, params = job_work_key(job.id, "rows-"), job.params
         shape = (params["dimension"], params["width"], params["rows"])
-        return StoredColumns(self._store, prefix, *shape)
+        return StoredColumns(self.store, prefix, *shape)
 
     def _write_part(self, job: Job, number: int, part: PcaBlock) -> None:
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, mean=part.mean, directions=part.directions)
-        self._store.put(job_work_key(job.id, f"part-{number:05d}.npz"), buffer.getvalue())
+        self.store.put(job_work_key(job.id, f"part-{number:05d}.npz"), buffer.getvalue())
 
     def _read_part(self, job: Job, number: int) -> PcaBlock:
-        data = self._store.get(job_work_key(job.id, f"part-{number:05d}.npz"))
+        data = self.store.get(job_work_key(job.id, f"part-{number:05d}.npz"))
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
             return PcaBlock(saved["mean"], saved["directions"])

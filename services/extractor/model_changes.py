@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from uuid import UUID
 
 from sqlalchemy import select
@@ -54,26 +55,19 @@ from shared.storage import ObjectStore
 from shared.storage.keys import job_work_key
 
 
+@dataclass(frozen=True, slots=True)
 class VocabularyFitJob:
     """Fits a vocabulary on the map's own photos, one step at a time."""
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        store: ObjectStore,
-        models: ModelRegistry,
-        decoders: DecoderPool,
-        settings: Settings,
-    ) -> None:
-        self._catalog = catalog
-        self._store = store
-        self._models = models
-        self._decoders = decoders
-        self._settings = settings
+    catalog: Catalog
+    store: ObjectStore
+    models: ModelRegistry
+    decoders: DecoderPool
+    settings: Settings
 
     def run_step(self, job: Job) -> None:
         """Run the next step of the job's stage; PlacewiseError if it can't continue."""
-        extractor = map_extractor(self._catalog, self._models, job)
+        extractor = map_extractor(self.catalog, self.models, job)
         if not extractor.config.needs_vocabulary:
             raise Unprocessable(
                 "vocabulary_unfit",
@@ -89,7 +83,7 @@ class VocabularyFitJob:
 
     def _plan(self, job: Job, extractor: Extractor) -> None:
         """Choose the photos to sample, reproducibly from the seed and the photos' ids."""
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             photo_ids = session.scalars(
                 select(Photo.id)
                 .where(
@@ -108,10 +102,10 @@ class VocabularyFitJob:
             len(photo_ids), job.params["sample"], extractor.backbone.width, job.params["seed"]
         )
         plan = [str(photo_ids[number]) for number in chosen]
-        self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        self.store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
         clusters = job.params["clusters"] or extractor.config.clusters
         checkpoint_and_release(
-            self._catalog,
+            self.catalog,
             job,
             stage="sample",
             params={
@@ -126,14 +120,14 @@ class VocabularyFitJob:
 
     def _sample(self, job: Job, extractor: Extractor) -> None:
         """Sample patches of the next photos of the plan."""
-        plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
+        plan = json.loads(self.store.get(job_work_key(job.id, "plan.json")))
         start = job.params["sampled"]
         photo_ids = [
-            UUID(photo_id) for photo_id in plan[start : start + self._settings.batch_photos]
+            UUID(photo_id) for photo_id in plan[start : start + self.settings.batch_photos]
         ]
         decoded = [
             outcome
-            for outcome in self._decoders.decode(
+            for outcome in self.decoders.decode(
                 self._read_photos(photo_ids), extractor.preprocessing
             )
             if not isinstance(outcome, PlacewiseError)
@@ -143,7 +137,7 @@ class VocabularyFitJob:
             self._patch_store(job, extractor).add(features, start, len(plan), job.params["seed"])
         sampled = start + len(photo_ids)
         checkpoint_and_release(
-            self._catalog,
+            self.catalog,
             job,
             stage="sample" if sampled < len(plan) else "cluster",
             params={
@@ -156,12 +150,12 @@ class VocabularyFitJob:
 
     def _read_photos(self, photo_ids: list[UUID]) -> Iterator[bytes]:
         """Yield the bytes of the photos that have not been deleted since the plan."""
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             live = get_live_photos(session, photo_ids)
         for photo_id in photo_ids:
             if photo_id in live:
                 with contextlib.suppress(NotFound):
-                    yield self._store.get(live[photo_id].object_key)
+                    yield self.store.get(live[photo_id].object_key)
 
     def _cluster(self, job: Job, extractor: Extractor) -> None:
         """Run steps of the fit; when it is finished, create the vocabulary and its generation."""
@@ -169,8 +163,8 @@ class VocabularyFitJob:
         patches = self._patch_store(job, extractor).open()
         fit = VocabularyFit(patches, params["clusters"], params["seed"])
         if not run_fit_steps(
-            self._catalog,
-            self._store,
+            self.catalog,
+            self.store,
             job,
             fit,
             fit.step,
@@ -190,8 +184,8 @@ class VocabularyFitJob:
         # A fit that the previous release has planned does not have the parameter.
         provenance["provisional"] = params.get("provisional", False)
         start_generation_with_new_vocabulary(
-            self._catalog,
-            self._store,
+            self.catalog,
+            self.store,
             job,
             extractor,
             centres,
@@ -201,16 +195,16 @@ class VocabularyFitJob:
         )
 
     def _patch_store(self, job: Job, extractor: Extractor) -> PatchStore:
-        return PatchStore(self._store, job_work_key(job.id, "patches-"), extractor.backbone.width)
+        return PatchStore(self.store, job_work_key(job.id, "patches-"), extractor.backbone.width)
 
 
+@dataclass(frozen=True, slots=True)
 class _VocabularySwitchJob:
     """Switches a map to an imported or stored vocabulary; one step each."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
-        self._catalog = catalog
-        self._store = store
-        self._models = models
+    catalog: Catalog
+    store: ObjectStore
+    models: ModelRegistry
 
     def import_file(self, job: Job) -> None:
         """Import the vocabulary file at `object_key`.
@@ -218,12 +212,12 @@ class _VocabularySwitchJob:
         Raises:
             Unprocessable: `vocabulary_unfit` if the map's extractor can't use it.
         """
-        extractor = map_extractor(self._catalog, self._models, job)
-        imported = decode_vocabulary(self._store.get(job.params["object_key"]))
+        extractor = map_extractor(self.catalog, self.models, job)
+        imported = decode_vocabulary(self.store.get(job.params["object_key"]))
         check_vocabulary_fits(imported.provenance, imported.centres, extractor)
         start_generation_with_new_vocabulary(
-            self._catalog,
-            self._store,
+            self.catalog,
+            self.store,
             job,
             extractor,
             imported.centres,
@@ -244,16 +238,16 @@ class _VocabularySwitchJob:
         """
         if job.params.get("extractor") is None:
             current = active_extractor if job.params["vocabulary_id"] is None else map_extractor
-            extractor = current(self._catalog, self._models, job)
+            extractor = current(self.catalog, self.models, job)
             shipped = None
         else:
-            extractor = self._models.extractor(job.params["extractor"])
+            extractor = self.models.extractor(job.params["extractor"])
             shipped = extractor.shipped_vocabulary()
         if job.params["vocabulary_id"] is None:
             if shipped is not None:
                 start_generation_with_new_vocabulary(
-                    self._catalog,
-                    self._store,
+                    self.catalog,
+                    self.store,
                     job,
                     extractor,
                     shipped[0],
@@ -269,9 +263,9 @@ class _VocabularySwitchJob:
                 )
             self._start_generation(job, extractor, None, None)
             return
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             vocabulary = get_vocabulary(session, job.map_id, UUID(job.params["vocabulary_id"]))
-        centres = self._models.centres(vocabulary)
+        centres = self.models.centres(vocabulary)
         check_vocabulary_fits(vocabulary.provenance, centres, extractor)
         self._start_generation(job, extractor, centres, vocabulary.id)
 
@@ -290,16 +284,16 @@ class _VocabularySwitchJob:
         whitening_id = job.params.get("whitening_id")
         if whitening_id is None:
             start_generation_with_stored_vocabulary(
-                self._catalog, job, DescriptorPipeline(extractor, centres), vocabulary_id
+                self.catalog, job, DescriptorPipeline(extractor, centres), vocabulary_id
             )
             return
-        with self._catalog.read() as session:
+        with self.catalog.read() as session:
             stored = session.get_one(StoredWhitening, UUID(whitening_id))
-        whitening_file = decode_whitening(self._store.get(stored.object_key))
+        whitening_file = decode_whitening(self.store.get(stored.object_key))
         whitening_file.check_compatible(extractor.spec(centres))
-        pipeline = DescriptorPipeline(extractor, centres, self._models.projection(stored))
+        pipeline = DescriptorPipeline(extractor, centres, self.models.projection(stored))
         start_generation_with_stored_vocabulary(
-            self._catalog, job, pipeline, vocabulary_id, stored.id
+            self.catalog, job, pipeline, vocabulary_id, stored.id
         )
 
 

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +40,18 @@ class RowBlocks:
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> RowBlocks:
         """Create them from chunks, one block each."""
+        return cls.with_codes(chunks)
+
+    @classmethod
+    def with_codes(cls, chunks: Sequence[LoadedChunk], **codes: Any) -> Self:
+        """Create them from chunks; `codes` are the fields that a subclass adds."""
         return cls(
             dimension=chunks[0].rows.shape[1],
             first_rows=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
             row_addresses=array_addresses(chunk.rows for chunk in chunks),
             number_bytes=np.array([chunk.rows.itemsize for chunk in chunks]),
             keep_alive=chunks,
+            **codes,
         )
 
     def __len__(self) -> int:

@@ -47,13 +47,8 @@ class Int8Blocks(RowBlocks):
         codes = [chunk.int8 for chunk in chunks if chunk.int8 is not None]
         if len(codes) < len(chunks):
             raise ValueError("a chunk has no int8 codes")
-        rows = RowBlocks.of(chunks)
-        return cls(
-            dimension=rows.dimension,
-            first_rows=rows.first_rows,
-            row_addresses=rows.row_addresses,
-            number_bytes=rows.number_bytes,
-            keep_alive=rows.keep_alive,
+        return cls.with_codes(
+            chunks,
             code_addresses=array_addresses(code.numbers for code in codes),
             row_params=np.concatenate(
                 [np.stack([code.scales, code.errors, code.lengths]) for code in codes], axis=1

@@ -70,14 +70,9 @@ class SignCodeBlocks(RowBlocks):
         codes = [chunk.codes for chunk in chunks if chunk.codes is not None]
         if len(codes) < len(chunks):
             raise ValueError("a chunk has no sign codes")
-        rows = RowBlocks.of(chunks)
         norms = np.concatenate([code.norms for code in codes])
-        return cls(
-            dimension=rows.dimension,
-            first_rows=rows.first_rows,
-            row_addresses=rows.row_addresses,
-            number_bytes=rows.number_bytes,
-            keep_alive=rows.keep_alive,
+        return cls.with_codes(
+            chunks,
             level_addresses=np.stack(
                 [array_addresses(parts) for parts in zip(*(c.levels for c in codes), strict=True)]
             ),

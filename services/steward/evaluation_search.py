@@ -101,6 +101,7 @@ RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
 """`EvaluationSearch.rank_similar` with its weights bound."""
 
 
+@dataclass(frozen=True, slots=True)
 class EvaluationSearch:
     """Searches one generation of a map with its stored photos.
 
@@ -108,19 +109,11 @@ class EvaluationSearch:
     photos by id, for the locations of results.
     """
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        search: SearchBackend,
-        generation: Generation,
-        version: int,
-        photos: Mapping[UUID, GeotaggedPhoto],
-    ) -> None:
-        self._catalog = catalog
-        self._search = search
-        self._generation = generation
-        self._version = version
-        self._photos = photos
+    catalog: Catalog
+    search: SearchBackend
+    generation: Generation
+    version: int
+    photos: Mapping[UUID, GeotaggedPhoto]
 
     def rank_similar(
         self,
@@ -141,23 +134,23 @@ class EvaluationSearch:
             Unavailable: `search_incomplete`: a shard did not answer.
         """
         for attempt in range(1, MAX_READ_ATTEMPTS + 1):
-            with self._catalog.read() as session:
-                location = find_descriptor(session, self._generation.id, query.photo_id)
+            with self.catalog.read() as session:
+                location = find_descriptor(session, self.generation.id, query.photo_id)
             if location is None:
                 return None
             descriptor, chunk = location
             request = SearchRequest(
-                map_id=self._generation.map_id,
-                generation_id=self._generation.id,
+                map_id=self.generation.map_id,
+                generation_id=self.generation.id,
                 object_key=chunk.object_key,
                 row=descriptor.row,
-                min_version=self._version,
+                min_version=self.version,
                 k=k,
                 exclude=(query.photo_id, *excluded_photos),
                 word_weights=weights,
             )
             try:
-                answer = self._search.search(request)
+                answer = self.search.search(request)
             except Gone:  # its chunk was merged into another one between the two calls
                 if attempt == MAX_READ_ATTEMPTS:
                     raise
@@ -178,7 +171,7 @@ class EvaluationSearch:
         raise AssertionError("the last attempt returns or raises")
 
     def _location(self, hit: SearchHit) -> PhotoLocation:
-        photo = self._photos.get(hit.photo_id)
+        photo = self.photos.get(hit.photo_id)
         return photo.spot if photo else UNKNOWN_LOCATION
 
 

@@ -34,13 +34,12 @@ from services.steward.tasks.maintenance import (
     update_statistics_of_large_maps,
 )
 from services.steward.tasks.model_changes import (
-    QueuedChunks,
     advance_model_changes,
     auto_fit_vocabularies,
-    cancel_jobs_of_abandoned_generations,
     remove_dead_search_workers,
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
+from services.steward.tasks.reindex_jobs import QueuedChunks, cancel_jobs_of_abandoned_generations
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.schema import sqlite_file
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll

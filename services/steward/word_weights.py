@@ -12,6 +12,7 @@ Descriptor rows are read in batches, to bound the memory.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from uuid import UUID
 
 import numpy as np
@@ -116,25 +117,18 @@ VALIDATION_RANKS = 10  # results per query, for R@10
 MAX_BURST_PHOTOS = 200
 
 
+@dataclass(frozen=True, slots=True)
 class WordWeightsFit:
     """Fits and validates the word weights of one generation, whose vocabulary has `words` words.
 
     The evaluation of the generation gives its photos and its search client.
     """
 
-    def __init__(
-        self,
-        catalog: Catalog,
-        store: ObjectStore,
-        generation: Generation,
-        words: int,
-        evaluation: MapEvaluation,
-    ) -> None:
-        self._catalog = catalog
-        self._store = store
-        self._generation = generation
-        self._words = words
-        self._evaluation = evaluation
+    catalog: Catalog
+    store: ObjectStore
+    generation: Generation
+    words: int
+    evaluation: MapEvaluation
 
     def fit(self, sample: Sequence[GeotaggedPhoto], seed: int, searchable: int) -> WordWeights:
         """Fit the weights, and validate them with the photos of the sample.
@@ -148,8 +142,8 @@ class WordWeightsFit:
             Conflict, Unavailable: As `EvaluationSearch.rank_similar` and
                 `_accumulate_pair_statistics`.
         """
-        photos = self._evaluation.database.photos
-        row_bytes = self._generation.dimension * np.dtype(np.float32).itemsize
+        photos = self.evaluation.database.photos
+        row_bytes = self.generation.dimension * np.dtype(np.float32).itemsize
         batch_photos = max(MIN_BATCH_ROWS, ROW_BATCH_BYTES // row_bytes)
         split = sample_pairs([photo.spot for photo in photos], seed, batch_photos)
         halves = self._fit_halves(split)
@@ -179,22 +173,22 @@ class WordWeightsFit:
             }
         )
         if is_better:
-            result = self._evaluation.evaluate(sample, weights)
+            result = self.evaluation.evaluate(sample, weights)
             record = record.model_copy(update={"calibration": result.calibration})
         return record
 
     def _fit_halves(self, split: PairSplit) -> tuple[PairStatistics, PairStatistics]:
-        ids = [photo.photo_id for photo in self._evaluation.database.photos]
+        ids = [photo.photo_id for photo in self.evaluation.database.photos]
 
         def fit_half(half: int) -> PairStatistics:
             return _accumulate_pair_statistics(
-                self._catalog,
-                self._store,
-                self._generation.id,
+                self.catalog,
+                self.store,
+                self.generation.id,
                 ids,
                 split.batches[half],
-                self._words,
-                self._evaluation.on_query,
+                self.words,
+                self.evaluation.on_query,
             )
 
         return fit_half(0), fit_half(1)
@@ -205,7 +199,7 @@ class WordWeightsFit:
         """Search with each photo that is not alone at its place, without and with its weights."""
         without, weighted, better, worse = RecallCounter(), RecallCounter(), 0, 0
         for query, weights in queries:
-            self._evaluation.on_query()
+            self.evaluation.on_query()
             burst = self._photos_to_exclude(query, by)
             if burst is None:
                 continue
@@ -228,7 +222,7 @@ class WordWeightsFit:
     def _photos_to_exclude(self, query: GeotaggedPhoto, by: PairSource) -> tuple[UUID, ...] | None:
         """Return the photos to exclude with the query; None if no photo of its place would remain
         or the burst is too large."""
-        database, radius_m = self._evaluation.database, self._evaluation.radius_m
+        database, radius_m = self.evaluation.database, self.evaluation.radius_m
         if by == PairSource.PLACES:
             # The count includes the query itself.
             return () if database.count_at_place(query.spot, radius_m) > 1 else None
@@ -240,10 +234,10 @@ class WordWeightsFit:
         self, query: GeotaggedPhoto, weights: tuple[float, ...], excluded: tuple[UUID, ...]
     ) -> list[bool] | None:
         """Return for each rank whether it shows the query's place; None for a deleted query."""
-        ranking = self._evaluation.search.rank_similar(query, VALIDATION_RANKS, weights, excluded)
+        ranking = self.evaluation.search.rank_similar(query, VALIDATION_RANKS, weights, excluded)
         if ranking is None:
             return None
-        return [is_same_place(query.spot, spot, self._evaluation.radius_m) for _, spot in ranking]
+        return [is_same_place(query.spot, spot, self.evaluation.radius_m) for _, spot in ranking]
 
 
 def _rounded_weights(statistics: PairStatistics) -> tuple[float, ...]:

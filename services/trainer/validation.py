@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,23 +23,17 @@ BATCH_PHOTOS = 32
 ProgressCallback = Callable[[str, int, int], None]
 
 
+@dataclass(frozen=True, slots=True)
 class Validator:
     """Computes the recalls of a network on evaluation sets.
 
     Validation photos are resized to `val_image_size`, test photos to `test_image_size`.
     """
 
-    def __init__(
-        self,
-        arguments: TrainingArguments,
-        device: Device,
-        on_progress: ProgressCallback,
-        stop: StopRequest,
-    ) -> None:
-        self._arguments = arguments
-        self._device = device
-        self._on_progress = on_progress
-        self._stop = stop
+    arguments: TrainingArguments
+    device: Device
+    on_progress: ProgressCallback
+    stop: StopRequest
 
     def measure(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
@@ -55,26 +49,26 @@ class Validator:
         Raises:
             RunStopped: a stop was requested; also raises what describing and searching raise.
         """
-        size = self._test_size() if for_tests else self._arguments.evaluation_size
+        size = self._test_size() if for_tests else self.arguments.evaluation_size
         describe = ModelDescriber(
             model,
-            self._device.torch_device,
+            self.device.torch_device,
             size,
-            interpolation=self._arguments.interpolation,
+            interpolation=self.arguments.interpolation,
             batch_photos=1 if size is None else BATCH_PHOTOS,
         )
         evaluations = {}
         for each in sets:
 
             def on_progress(what: str, done: int, total: int, name: str = each.name) -> None:
-                self._stop.check()
-                self._on_progress(f"{name}: {what}", done, total)
+                self.stop.check()
+                self.on_progress(f"{name}: {what}", done, total)
 
             evaluations[each.name] = evaluate_recall(
                 describe,
                 each,
                 ks=VALIDATION_KS,
-                faiss_gpu=self._device.faiss_gpu,
+                faiss_gpu=self.device.faiss_gpu,
                 on_progress=on_progress,
             )
         return evaluations
@@ -99,9 +93,9 @@ class Validator:
             self.measure(model, truncated)
 
     def _test_size(self) -> tuple[int, int] | None:
-        size = self._arguments.test_image_size
+        size = self.arguments.test_image_size
         if size == "same":
-            return self._arguments.evaluation_size
+            return self.arguments.evaluation_size
         return None if size == "native" else size
 
 

@@ -43,6 +43,18 @@ def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
     return list(newest.values())
 
 
+def test_a_comparison_stays_on_a_narrow_phone(visitor: Visitor) -> None:
+    def two_generations(route: Route) -> None:
+        [after, *_] = route.fetch().json()["evaluations"]
+        route.fulfill(json={"evaluations": [after, {**after, "generation_id": "another"}]})
+
+    visitor.page.route("**/api/v1/evaluations?*", two_generations)
+    visitor.page.set_viewport_size({"width": 320, "height": 640})
+    page = visitor.visit("model")
+    expect(page.get_by_role("heading", name="Before and after")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 320
+
+
 def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("status")
     expect(page.locator(".parts li")).to_have_count(5)

@@ -43,6 +43,7 @@ STATEMENT_SECONDS = 2.0
 ANSWER_SECONDS = 12.0
 RECOVERY_SECONDS = 60.0
 UPLOADERS = 3
+WAITING_PARTS = ("steward", "worker extractor", "worker evaluator")
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +168,9 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     acknowledged, refused, strange = {first}, threading.Event(), []
     stop = threading.Event()
 
+    def waits(part: str) -> list[str]:
+        return [r.message for r in caplog.records if f"the {part} waits" in r.message]
+
     def upload(numbers: Iterator[int]) -> None:
         for number in numbers:
             while not stop.is_set():
@@ -197,6 +201,10 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
         parts = deployment.call("GET", f"{API}/health")
         assert (parts.status_code, parts.json()["parts"]["catalog"]["status"]) == (503, "unhealthy")
         assert deployment.search.search(request).hits, "search answers from memory"
+        deadline = time.monotonic() + ANSWER_SECONDS
+        while not all(waits(part) for part in WAITING_PARTS):
+            assert time.monotonic() < deadline, "a part has not met the outage"
+            time.sleep(0.1)
         time.sleep(3.0)  # every loop meets it several times
     finally:
         breakable.process.start()
@@ -208,9 +216,8 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     deployment.wait_for(31)
     assert deployment.call("GET", "/readyz").status_code == 200
     assert not deployment.crashed.is_set(), "a part ended"
-    for part in ("steward", "worker extractor", "worker evaluator"):
-        messages = [r.message for r in caplog.records if f"the {part} waits" in r.message]
-        assert len(messages) == 1, f"once per outage: {messages}"
+    for part in WAITING_PARTS:
+        assert len(waits(part)) == 1, f"once per outage: {waits(part)}"
 
 
 def test_silent_catalog_is_given_up_within_seconds(

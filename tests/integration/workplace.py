@@ -15,7 +15,8 @@ from sqlalchemy import select
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.model_changes import QueuedChunks, advance_model_changes
+from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.reindex_jobs import QueuedChunks
 from shared.catalog.chunks import count_searchable
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (

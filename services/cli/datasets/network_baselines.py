@@ -125,15 +125,6 @@ class NetworkBaselines:
             with Image.open(path) as image:
                 return np.asarray(self.extractor.preprocessing.apply(image.convert("RGB")))
 
-        def read_batch(start: int) -> NDArray[np.uint8]:
-            return np.stack([read(path) for path in paths[start : start + BATCH_PHOTOS]])
-
-        with ThreadPoolExecutor(1) as reader:  # prefetches the next batch
-            pending = None
+        with ThreadPoolExecutor() as readers:
             for start in range(0, len(paths), BATCH_PHOTOS):
-                upcoming = reader.submit(read_batch, start)
-                if pending is not None:
-                    yield pending.result()
-                pending = upcoming
-            if pending is not None:
-                yield pending.result()
+                yield np.stack(list(readers.map(read, paths[start : start + BATCH_PHOTOS])))

@@ -56,11 +56,10 @@ if TYPE_CHECKING:
     from shared.descriptors.weight_files import OnProgress
 
 
-AddedModelName = Annotated[
-    str, typer.Argument(metavar="NAME", help="Name of an added model; see `models added`.")
-]
+app = typer.Typer(help="Manage extractor weights and trained models.")
 
 
+@app.command("add")
 def add(
     checkpoint: Annotated[
         Path,
@@ -112,6 +111,7 @@ def add(
     )
 
 
+@app.command("added")
 def list_added(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
@@ -137,8 +137,11 @@ def list_added(
     print_table(table)
 
 
+@app.command("remove")
 def remove(
-    name: AddedModelName,
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of an added model; see `models added`.")
+    ],
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -147,12 +150,6 @@ def remove(
     with connect(server, None, key) as client:
         removed = client.remove_model(name)
     print_result(removed, as_json, removed.message)
-
-
-app = typer.Typer(help="Manage extractor weights and trained models.")
-app.command("add")(add)
-app.command("added")(list_added)
-app.command("remove")(remove)
 
 
 @app.command("list")

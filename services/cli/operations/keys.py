@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from uuid import UUID
 
 import typer
 
-from placewise.answers import CreatedKey, Key
+from placewise.answers import Key
 from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -28,16 +28,11 @@ from services.cli.output import (
 )
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
-from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
-    from shared.catalog.api_keys import ApiKey
-    from shared.catalog.database.session import Catalog
-    from shared.catalog.maps import Map
+    from services.cli.operations.catalog_keys import CatalogKeys
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
-
-SECONDS_PER_DAY = 86_400.0
 
 
 @app.command("create")
@@ -135,72 +130,17 @@ def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:
         )
 
 
-class _CatalogKeys:
-    """The calls of the client about keys, on the catalog itself."""
-
-    def __init__(self, catalog: Catalog) -> None:
-        self._catalog = catalog
-
-    def create_key(
-        self,
-        name: str,
-        scopes: Sequence[Scope],
-        days: float | None,
-        maps: list[str] | None,
-        **limits: int | None,
-    ) -> CreatedKey:
-        from shared.catalog.api_keys import KeyLimits, create_api_key
-
-        life_seconds = None if days is None else days * SECONDS_PER_DAY
-        with self._catalog.write() as session:
-            row, secret = create_api_key(
-                session,
-                name,
-                set(scopes),
-                life_seconds=life_seconds,
-                limits=KeyLimits(**limits),
-                maps=maps,
-            )
-            return CreatedKey(**_key_fields(row), key=secret)
-
-    def keys(self) -> list[Key]:
-        from shared.catalog.api_keys import list_api_keys
-
-        with self._catalog.read() as session:
-            return [Key(**_key_fields(row)) for row in list_api_keys(session)]
-
-    def maps(self) -> list[Map]:
-        from shared.catalog.maps import list_maps
-
-        with self._catalog.read() as session:
-            return list_maps(session)
-
-    def revoke_key(self, key_id: UUID) -> Key:
-        from shared.catalog.api_keys import revoke_api_key
-
-        with self._catalog.write() as session:
-            return Key(**_key_fields(revoke_api_key(session, key_id)))
-
-
 @contextlib.contextmanager
-def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _CatalogKeys]:
+def _open_keys(server: str | None, key: str | None) -> Iterator[Client | CatalogKeys]:
     """Connect to a server, or open the catalog if none is given."""
     if server:
         with Client(server, key=key) as client:
             yield client
         return
-    # Imported here: the clients of a server need no database.
-    from shared.catalog.database.schema import wait_for_schema
-    from shared.catalog.tables import open_catalog
+    from services.cli.operations.catalog_keys import open_catalog_keys  # needs the database
 
-    settings = read_settings()
-    configure_logging(settings, "keys", to_file=False)
-    catalog = open_catalog(settings, "keys")
-    try:
-        wait_for_schema(catalog, 0)
-        yield _CatalogKeys(catalog)
-    finally:
-        catalog.close()
+    with open_catalog_keys(read_settings()) as keys:
+        yield keys
 
 
 def _resolve_key_id(id_or_prefix: str, keys: list[Key]) -> UUID:
@@ -214,10 +154,6 @@ def _resolve_key_id(id_or_prefix: str, keys: list[Key]) -> UUID:
     if len(found) > 1:
         raise Conflict("key_ambiguous", f"Several keys begin with {prefix}. Use the ID instead.")
     return found[0]
-
-
-def _key_fields(row: ApiKey) -> dict[str, Any]:
-    return {name: getattr(row, name) for name in Key.model_fields}
 
 
 def _key_status(key: Key) -> str:

@@ -17,7 +17,7 @@ from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from services.steward.tasks.model_changes import adopt_failed_reindex_jobs, delete_done_reindex_jobs
+from services.steward.tasks.reindex_jobs import adopt_failed_reindex_jobs, delete_done_reindex_jobs
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog

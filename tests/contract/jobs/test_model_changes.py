@@ -13,10 +13,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy import event, select
 
-from services.steward.tasks.model_changes import (
-    advance_model_changes,
-    cancel_jobs_of_abandoned_generations,
-)
+from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.reindex_jobs import cancel_jobs_of_abandoned_generations
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job
@@ -123,7 +121,7 @@ def test_a_cancelled_model_change_abandons_what_it_was_building(
 def test_the_jobs_of_a_cancelled_model_change_are_cancelled_in_small_transactions(
     catalog: Catalog, map_id: UUID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("shared.jobs.transitions", "services.steward.tasks.model_changes"):
+    for module in ("shared.jobs.transitions", "services.steward.tasks.reindex_jobs"):
         monkeypatch.setattr(f"{module}.CANCELLED_PER_TRANSACTION", 2)
     with catalog.write() as session:
         add_generation(session, map_id)

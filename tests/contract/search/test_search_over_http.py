@@ -1,4 +1,7 @@
-"""Search over HTTP, with one shard and with three, keeps the contract of a search backend."""
+"""Search over HTTP, with three shards, keeps the contract of a search backend.
+
+tests/e2e/test_search_service.py serves a map on SQLite with one.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,16 @@ from shared.storage import FolderStore
 from tests.contract.search.test_search_backend import OpenPort, SearchPortContract
 from tests.support.search_tier import SearchTier
 
+pytestmark = pytest.mark.databases("postgresql")
+REPLICAS = (2, 1, 1)  # of each shard
+
 
 class TestSearchOverHttp(SearchPortContract):
     """The same promises, with HTTP between and the map's slots spread over workers."""
 
     @pytest.fixture
-    def replicas(self, catalog_kind: str) -> tuple[int, ...]:
-        """Of each shard: one shard on SQLite, three on PostgreSQL, the first of them twice."""
-        return (1,) if catalog_kind == "sqlite" else (2, 1, 1)
-
-    @pytest.fixture
     def port(
         self,
-        replicas: tuple[int, ...],
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
@@ -38,7 +38,7 @@ class TestSearchOverHttp(SearchPortContract):
                 wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
                 patience = {"search_timeout_seconds": max(10.0, 5 * wait)}
                 own = settings.model_copy(update=patience | changes)
-                tier = SearchTier(catalog, store, own, replicas)
+                tier = SearchTier(catalog, store, own, REPLICAS)
                 tier.follow()  # a search brings only one replica of a shard up to date
                 return running.enter_context(tier).port
 

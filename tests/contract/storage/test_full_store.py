@@ -103,6 +103,7 @@ def test_what_a_bucket_refuses_has_its_meaning(
     assert isinstance(caught.value, StorageFull) == (refusal[3] == 507)
 
 
+@pytest.mark.databases("sqlite")  # which is the same to a store that is full
 @pytest.mark.parametrize("path", ["/upload", "/similarity"])
 def test_nothing_is_acknowledged_that_was_not_stored(
     full: S3Store,

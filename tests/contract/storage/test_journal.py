@@ -27,9 +27,11 @@ from tests.support.catalog_rows import delete as delete_photo
 from tests.support.servers import S3Server
 
 
-@pytest.fixture(params=["folder", "s3"])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
-    if request.param == "folder":
+@pytest.fixture
+def store(catalog_kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
+    """A folder beside SQLite and a bucket beside PostgreSQL, unless the test names one."""
+    beside = "folder" if catalog_kind == "sqlite" else "s3"
+    if getattr(request, "param", beside) == "folder":
         return FolderStore(tmp_path / "objects")
     server: S3Server = request.getfixturevalue("s3")
     return S3Store(server.new_bucket())

@@ -12,9 +12,10 @@ import pytest
 from services.extractor import checkpointed_steps
 from services.extractor.model_changes import VocabularyFitJob
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks import model_changes
+from services.steward.tasks import model_changes, reindex_jobs
 from services.steward.tasks.garbage_collection import collect_garbage
-from services.steward.tasks.model_changes import advance_model_changes, delete_done_reindex_jobs
+from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs
 from shared.catalog.chunks import list_live_chunks
 from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import WaitingFor
@@ -367,8 +368,8 @@ def test_a_steward_that_forgot_what_it_queued_queues_nothing_twice(fitted: Workp
 def test_what_a_switch_leaves_is_completed_in_small_transactions(
     fitted: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(model_changes, "REINDEX_JOBS_PER_TRANSACTION", 2)
-    monkeypatch.setattr(model_changes, "DELETED_JOBS_PER_TRANSACTION", 2)
+    monkeypatch.setattr(reindex_jobs, "REINDEX_JOBS_PER_TRANSACTION", 2)
+    monkeypatch.setattr(reindex_jobs, "DELETED_JOBS_PER_TRANSACTION", 2)
     job_id, new = fitted.build(seed=1)
     bad = photo_ids(fitted)[:3]
     for photo_id in bad:

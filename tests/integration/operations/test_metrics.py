@@ -34,6 +34,9 @@ from tests.support.catalog_rows import add_job, add_map, expire_lease, take
 from tests.support.metrics import ADDED, exported, read
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_operations.py reads the metrics of a Placewise on SQLite.
+pytestmark = pytest.mark.databases("postgresql")
+
 DEPLOY = Path(__file__).parents[3] / "deploy"
 NAME = re.compile(r"\b(?:placewise_\w+|up)\b(?!\()")
 # PromQL's words and the labels that Prometheus itself gives.
@@ -136,6 +139,7 @@ def test_a_gateway_counts_its_calls_by_route(service: Service) -> None:
     assert text["placewise_gateway_requests_under_way"][()] == 1, "the scrape itself"
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_the_queue_is_counted_by_kind_and_state_with_the_age_of_its_oldest(
     catalog: Catalog,
 ) -> None:

@@ -150,8 +150,15 @@ def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
     vlads.fit()
     (key,) = vlads.keys("vocabularies/")
     vlads.store.put(key, vlads.store.get(key)[:-4] + b"\0\0\0\0")
-    found = verify_store(vlads.catalog, vlads.store, originals=False)
+    stages: set[str] = set()
+    found = verify_store(
+        vlads.catalog,
+        vlads.store,
+        originals=False,
+        progress=lambda what, done, total: stages.add(what),
+    )
     assert faults(found) == {("damaged", "vocabulary")}
+    assert "vocabularies" in stages
 
 
 def test_every_table_that_names_objects_is_looked_at() -> None:

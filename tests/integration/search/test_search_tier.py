@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, BinaryIO
@@ -205,9 +206,11 @@ def test_a_shard_that_stays_behind_is_named_at_the_deadline(
 def test_a_worker_that_hangs_costs_its_own_shard_alone(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tier = tier_of(1, 1, search_timeout_seconds=0.5)
-    monkeypatch.setattr(tier.servers[1][0].worker, "search", lambda request: time.sleep(1.5))
+    tier = tier_of(1, 1, search_timeout_seconds=2.0)  # enough for the other one on a busy machine
+    released = threading.Event()
+    monkeypatch.setattr(tier.servers[1][0].worker, "search", lambda request: released.wait(60))
     response = ask(tier, places)
+    released.set()
     assert response.missing == ("shard 1/2",)
     assert response.hits
 

@@ -41,7 +41,11 @@ from tests.support.catalog_rows import (
     upload,
 )
 
+# tests/e2e runs the scheduler on SQLite, in every embedded server.
+pytestmark = pytest.mark.databases("postgresql")
 
+
+@pytest.mark.databases("sqlite", "postgresql")
 def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: Settings) -> None:
     retained = sum_of(chunk_map.chunks(2, 2))
     merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
@@ -109,6 +113,7 @@ def test_a_long_task_with_a_thread_of_its_own_delays_no_other(
     steward.run(stop)
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_each_duty_is_done_by_the_loop(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +185,7 @@ def test_a_lost_hint_is_sent_again_while_there_is_work(chunk_map: ChunkMap) -> N
     assert not wakeups.wait(0)
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_jobs_of_an_abandoned_generation_vanish_after_the_grace(
     chunk_map: ChunkMap, store: FolderStore
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.train import measure_gain
+from benchmarks.descriptors.train import measure_gain
 from services.trainer import run
 from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything

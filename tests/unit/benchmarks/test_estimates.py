@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks import estimates
-from benchmarks.estimates import (
+from benchmarks.places import estimates
+from benchmarks.places.estimates import (
     DescribedPhotos,
     add_answers,
     add_left_out,

@@ -9,8 +9,8 @@ from rich.progress import Progress
 from torch.nn.functional import normalize
 from typer.testing import CliRunner
 
-from benchmarks import extract, precision
-from benchmarks.extract import vlad_in_loops
+from benchmarks.descriptors import extract, precision
+from benchmarks.descriptors.extract import vlad_in_loops
 from benchmarks.report import Report
 from services.cli.bench import app
 from shared.descriptors.aggregation import vlad

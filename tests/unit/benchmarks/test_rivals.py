@@ -9,7 +9,14 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
-from benchmarks.rivals import FaissFlat, FaissFlatPca, Placewise, PlacewiseFloat16, measure, recall
+from benchmarks.search.rivals import (
+    FaissFlat,
+    FaissFlatPca,
+    Placewise,
+    PlacewiseFloat16,
+    measure,
+    recall,
+)
 from shared.errors import Misconfigured
 
 

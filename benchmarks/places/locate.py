@@ -1,7 +1,7 @@
 """`placewise locate` on generated walks: photos proposed, and how many of them are right.
 
     placewise datasets synth CITY --places 300 --rides 500 --no-ladder --no-train
-    python -m benchmarks.locate CITY [--seeds 10] [--share 0.15]
+    python -m benchmarks.places.locate CITY [--seeds 10] [--share 0.15]
 
 The rides of the city are slowed down to walks; where a ride jumps to another street, half an hour
 passes. A photo is taken at a random share of the frames, and a random half of the photos loses its
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.estimates import CERTAINTY, TrialMap, describe_set
+from benchmarks.places.estimates import CERTAINTY, TrialMap, describe_set
 from services.cli.output import Table, print_table, progress_bar
 from shared.datasets.dataset import DatasetPhoto
 from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.extract import BenchmarkedExtractor, fit_or_load_centres
+from benchmarks.descriptors.extract import BenchmarkedExtractor, fit_or_load_centres
 from benchmarks.generated_city import generate_city, load_pixels
 from benchmarks.report import Report
 from shared.descriptors.inference import PRECISIONS, Precision

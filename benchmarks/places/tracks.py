@@ -1,6 +1,6 @@
 """The filter of tracks without photos: time of a step on a large map, and a hard railway.
 
-    python -m benchmarks.tracks [--photos 100000] [--frames 300]
+    python -m benchmarks.places.tracks [--photos 100000] [--frames 300]
 
 *City*: photos at random positions of streets 100 m apart; each frame has 200 hits, of which a few
 are near the camera. *Railway*: a map of 3,576 photos without coordinates; the scores of a frame are

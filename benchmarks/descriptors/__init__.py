@@ -1,0 +1,1 @@
+"""Speed and quality of descriptors: extraction, precision, reranking, training."""

@@ -1,0 +1,1 @@
+"""Place estimates, located photos and tracks."""
