@@ -20,10 +20,18 @@ import logging
 import resource
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
-from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from ipaddress import (
+    IPv4Address,
+    IPv4Network,
+    IPv6Address,
+    IPv6Network,
+    ip_address,
+    ip_network,
+)
 from typing import Any, Self, cast
 
 import h11
@@ -90,8 +98,7 @@ class ConnectionLimits:
 
     def of_address(self, address: str) -> int:
         """Return the maximum number of connections of an address; 0 if it is unlimited."""
-        trusted = address and any(ip_address(address) in net for net in self.trusted_proxies)
-        return 0 if trusted else self.per_address
+        return 0 if is_in_networks(address, self.trusted_proxies) else self.per_address
 
 
 class Connections:
@@ -339,15 +346,26 @@ def address_group(address: str) -> str:
 
     One customer or machine usually has a whole /64.
     """
+    parsed = _parse_address(address)
+    if isinstance(parsed, IPv6Address):
+        return str(ip_network((int(parsed), 64), strict=False))
+    return str(parsed or address)  # a proxy may have set a name
+
+
+def is_in_networks(address: str, networks: Iterable[IPv4Network | IPv6Network]) -> bool:
+    """Return whether the address is an IP address in one of the networks."""
+    parsed = _parse_address(address)
+    return parsed is not None and any(parsed in network for network in networks)
+
+
+def _parse_address(address: str) -> IPv4Address | IPv6Address | None:
     try:
         parsed = ip_address(address.partition("%")[0])
-    except ValueError:  # a name that a proxy has set
-        return address
-    if isinstance(parsed, IPv6Address):
-        if parsed.ipv4_mapped is None:
-            return str(ip_network((int(parsed), 64), strict=False))
-        parsed = parsed.ipv4_mapped
-    return str(parsed)
+    except ValueError:
+        return None
+    # A server that listens on :: sees 10.0.0.5 as ::ffff:10.0.0.5.
+    mapped = parsed.ipv4_mapped if isinstance(parsed, IPv6Address) else None
+    return mapped or parsed
 
 
 def _raise_file_limit() -> int:

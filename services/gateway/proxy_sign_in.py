@@ -9,11 +9,12 @@ also through the proxy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from ipaddress import IPv4Network, IPv6Network, ip_network
 
 from starlette.datastructures import Headers
 
 from services.gateway.authentication import Authenticator, Caller, check_same_origin
+from services.http_connections import is_in_networks
 from shared.config.settings import Settings
 from shared.errors import Unauthorized
 from shared.security.api_keys import Scope, expand_scopes
@@ -47,7 +48,7 @@ class _ProxySignIn:
         if (
             "authorization" in headers
             or self.user_header not in headers
-            or not self._is_trusted(peer)
+            or not is_in_networks(peer or "", self.networks)
         ):
             return await self.keys.authenticate(headers, peer)
         names = headers.getlist(self.user_header)
@@ -71,16 +72,6 @@ class _ProxySignIn:
 
     async def record_use(self, caller: Caller) -> None:
         await self.keys.record_use(caller)
-
-    def _is_trusted(self, peer: str | None) -> bool:
-        try:
-            address = ip_address(peer or "")
-        except ValueError:  # no IP address: a Unix socket, or a test
-            return False
-        # A server that listens on :: sees 10.0.0.5 as ::ffff:10.0.0.5.
-        if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
-            address = address.ipv4_mapped
-        return any(address in network for network in self.networks)
 
 
 def with_proxy_sign_in(keys: Authenticator, settings: Settings) -> Authenticator:

@@ -327,6 +327,17 @@ def test_an_ipv6_customer_counts_as_one_address(address: str, group: str) -> Non
     assert address_group(address) == group
 
 
+@pytest.mark.parametrize(
+    ("address", "limit"),
+    [("10.0.0.5", 0), ("::ffff:10.0.0.5", 0), ("10.0.1.5", 2), ("2001:db8::1", 2), ("", 2)],
+)
+def test_a_trusted_proxy_is_unlimited_on_a_server_for_ipv4_and_ipv6(
+    address: str, limit: int
+) -> None:
+    limits = ConnectionLimits(9, 2, 1.0, 0, trusted_proxies=(ip_network("10.0.0.0/24"),))
+    assert limits.of_address(address) == limit
+
+
 def test_the_limit_in_all_holds_while_many_connect_at_once() -> None:
     with serving(total=30, per_address=0) as server, contextlib.ExitStack() as held:
         clients = [held.enter_context(server.connect()) for _ in range(300)]
