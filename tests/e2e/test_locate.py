@@ -71,8 +71,9 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     assert by_time["latitude"] == pytest.approx(3 * DEGREES_APART, abs=4e-4)
     assert by_time["probability"] < by_both["position"]["probability"]
 
-    (trip / "broken.jpg").unlink()
-    del before["broken.jpg"]
+    for unreadable in ("broken.jpg", "empty.jpg"):
+        (trip / unreadable).unlink()
+        del before[unreadable]
     written = locate("--accept", "0.9", "--write", "sidecar")
     assert written.returncode == 0, written.stderr
     assert "of the map.jpg" in written.stdout
