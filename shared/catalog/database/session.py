@@ -230,7 +230,7 @@ def _changed_rows(session: Session) -> int:
 
 # The longest pause of a loop without changes: what depends on time alone, such as an expired lease,
 # is seen then.
-IDLE_SECONDS = 30.0
+IDLE_SECONDS = 20.0
 STOP_CHECK_SECONDS = 0.5
 
 
