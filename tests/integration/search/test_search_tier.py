@@ -193,14 +193,14 @@ def test_of_a_replica_that_is_behind_the_other_one_answers(
 def test_a_shard_that_stays_behind_is_named_at_the_deadline(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tier = tier_of(1, 1, search_timeout_seconds=0.5)
+    tier = tier_of(1, 1, search_timeout_seconds=2.0)  # enough for the other one on a busy machine
     searched = behind(tier.servers[0][0], monkeypatch)
     started = time.monotonic()
     response = ask(tier, places)
     assert response.missing == ("shard 0/2",)
     assert response.hits
     assert len(searched) > 2, "it was not retried"
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 10
 
 
 def test_a_worker_that_hangs_costs_its_own_shard_alone(
