@@ -163,10 +163,10 @@ def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> 
 
 
 def test_photo_that_takes_too_long_harms_only_itself(settings: Settings) -> None:
-    with pool_with(settings, decode_timeout_seconds=0.3) as pool:
+    with pool_with(settings, decode_timeout_seconds=2.0) as pool:
         pool.decode([GOOD], POISONED)
         first, poison, last = pool.decode([GOOD, photo_of(HANGS), GOOD], POISONED)
-    assert "within 0.3 s" in refusal(poison)
+    assert "within 2 s" in refusal(poison)
     assert is_good(first)
     assert is_good(last)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from typing import Any
 
 import pytest
 
 from services.extractor.publish import publish
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.maintenance import release_expired_leases
 from shared.descriptors.extractor import Extractor
 from shared.jobs import JobState
 from shared.storage import FolderStore
@@ -91,18 +91,25 @@ def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
         assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
 
 
-def test_batch_that_waits_to_be_published_keeps_its_lease(
+def test_leases_of_batches_that_wait_to_be_published_are_extended(
     averages: Workplace, gate: Gate, make_worker: Callable[[], ExtractorWorker]
 ) -> None:
-    averages.upload(*range(2 * BATCH))
+    photo_ids = averages.upload(*range(2 * BATCH))
     worker = make_worker()
-    lease_seconds = 1.5
-    worker._settings = worker._settings.model_copy(update={"lease_seconds": lease_seconds})
+    lease = timedelta(seconds=1.5)
+    changes = {"lease_seconds": lease.total_seconds()}
+    worker._settings = worker._settings.model_copy(update=changes)
+
+    def leases() -> list[datetime]:
+        found = [averages.job_of(photo_id).lease_until for photo_id in photo_ids]
+        return [lease_until for lease_until in found if lease_until is not None]
+
     draining, results = in_thread(lambda: worker.drain(threading.Event()))
     gate.await_seen("describe 4", "describe 4")
-    until = time.monotonic() + 2 * lease_seconds
-    while time.monotonic() < until:
-        assert release_expired_leases(averages.catalog, 3) == 0
+    extended = max(leases()) + 2 * lease
+    until = time.monotonic() + WAIT_SECONDS
+    while min(leases()) < extended:
+        assert time.monotonic() < until, "not all leases were extended"
         time.sleep(0.1)
     gate.open.set()
     draining.join()

@@ -181,7 +181,7 @@ def test_a_trusted_proxy_has_any_number_of_connections_and_says_who_calls() -> N
 
 
 def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
-    with serving(head_seconds=0.3) as server:
+    with serving(head_seconds=1.0) as server:
         with server.connect() as silent, server.connect() as slow, server.connect() as retained:
             slow.sendall(b"GET /whoami HT")
             retained.sendall(ASK)

@@ -96,7 +96,7 @@ def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
     begun = time.monotonic()
     for _ in range(100):
         wakeups.send()
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < BROKER_TIMEOUT_SECONDS
     own_redis.process.start()
 
     def arrived() -> bool:
