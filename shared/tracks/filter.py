@@ -160,15 +160,16 @@ class TrackFilter:
             frames: In the order of time.
             start: The belief before the first frame; None if nothing is known.
         """
+        count = max(self._graph.photo_count, 1)
         steps: list[_Step] = []
         smoothed: list[Belief] = []
         for frame in frames:
             before = steps[-1].belief if steps else start or _start(frame.time)
             steps.append(self._step(before, frame))
             if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
-                smoothed += _backward(steps, self._graph.photo_count)[:SMOOTHED_AT_ONCE]
+                smoothed += _backward(steps, count)[:SMOOTHED_AT_ONCE]
                 del steps[:SMOOTHED_AT_ONCE]
-        return smoothed + _backward(steps, self._graph.photo_count)
+        return smoothed + _backward(steps, count)
 
     def _step(self, before: Belief, evidence: FrameEvidence) -> _Step:
         seconds = (evidence.time - before.time).total_seconds()

@@ -43,11 +43,12 @@ def estimate_place(
         compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
     )
     if evidence is None:
-        reason = (
-            "No photo of the map matches the filter."
-            if not ranking
-            else "The most similar photo has neither coordinates nor a place."
-        )
+        if ranking:
+            reason = "The most similar photo has neither coordinates nor a place."
+        elif unfiltered_ranking:
+            reason = "No photo of the map matches the filter."
+        else:
+            reason = "The map has no searchable photos yet."
         return EstimateResponse(calibration=state, reason=reason)
     accepted = calibration.accepts(evidence) if calibration else None
     confidence = (

@@ -16,6 +16,8 @@ const VIEWS = {
   status: { title: "Status", show: async (...view) => (await import("./views/status.js")).showStatus(...view) },
 };
 const TAB_OF = { locate: "add", photo: "photos", tracks: "model" };
+// Where to go from an address that names nothing.
+const LIST_OF = { photo: ["#/photos", "All photos"], tracks: ["#/tracks", "All tracks"], ask: ["#/ask", "Ask with a photo"] };
 const NEW_MAP = "\n"; // no map's name
 
 const main = document.getElementById("main");
@@ -45,7 +47,9 @@ async function route() {
     await view.show(element, { signal, id: id && decodeURIComponent(id) });
   } catch (error) {
     if (signal.aborted) return;
-    fill(element, h("section", { class: "card empty" }, h("h1", {}, "This can't be shown"), h("p", {}, error.message), h("button", { type: "button", onclick: route }, "Try again")));
+    const [href, list] = (id && error.status === 404 && LIST_OF[name]) || [];
+    fill(element, h("section", { class: "card empty" }, h("h1", {}, "This can’t be shown"), h("p", {}, error.message),
+      href ? h("a", { class: "button", href }, list) : h("button", { type: "button", onclick: route }, "Try again")));
   }
 }
 

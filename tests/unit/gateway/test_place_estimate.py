@@ -275,11 +275,17 @@ def test_labelled_queries_give_a_confidence() -> None:
 
 
 def test_nothing_found_differs_from_nothing_known() -> None:
-    assert answer(None).reason == "No photo of the map matches the filter."
+    assert answer(None).reason == "The map has no searchable photos yet."
     assert (
         "neither coordinates nor a place"
         in answer(None, (0.9, PhotoLocation(None, None, None))).reason
     )
+
+
+def test_a_filter_that_nothing_passes_differs_from_an_empty_map() -> None:
+    everything = ranking((0.5, north(0)))
+    filtered = estimate_place(None, [], everything, RADIUS_M)
+    assert filtered.reason == "No photo of the map matches the filter."
 
 
 def test_a_filter_that_leaves_no_rival_makes_nobody_sure() -> None:

@@ -332,3 +332,10 @@ def test_a_belief_survives_its_serialisation_between_two_frames() -> None:
     assert again.photos == direct.photos
     assert again.probabilities.tolist() == direct.probabilities.tolist()
     assert replace(again, photos=(), probabilities=np.zeros(0), seen={}).time == direct.time
+
+
+def test_frames_in_a_map_without_photos_are_smoothed_to_elsewhere() -> None:
+    frames = [frame(0.0, []), frame(1.0, [])]
+    for belief in TrackFilter(line_map(0), WALK).smooth(frames):
+        assert belief.photos == ()
+        assert belief.elsewhere + belief.outside == pytest.approx(1)

@@ -206,7 +206,7 @@ async function drawResult(result, photos, proposals, least, signal) {
           accepted.length > 0 && button("Download CSV", () => download("placewise-locations.csv", "text/csv", csvOf(accepted)), "primary"),
           accepted.length > 0 && button("Download GPX", () => download("placewise-locations.gpx", "application/gpx+xml", gpxOf(accepted, photos))))),
       h("p", { class: "soft small" }, `${plural(located.length, "photo")} with coordinates. To write into photos or sidecars, run `, h("code", {}, "placewise locate"), "."),
-      h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", { class: "proposals" },
+      h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", { class: "stacked" },
         h("thead", {}, h("tr", {}, ["Photo", "Position", "Probability", "", "Reason"].map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name || h("span", { class: "visually-hidden" }, "Accepted"))))),
         h("tbody", {}, proposals.map(row))))));
   announce(words);

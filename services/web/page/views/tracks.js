@@ -1,8 +1,8 @@
 // Tracks: a list, and one track on the map with its uncertainty and its frames.
 
-import { ask, get } from "../api.js";
-import { advancedTabs, button, confirmed, field, fill, h, time } from "../dom.js";
-import { count, degrees, metres, percent, plural } from "../format.js";
+import { ask, currentMap, get } from "../api.js";
+import { advancedTabs, button, confirmed, fill, h, noteError, time } from "../dom.js";
+import { count, degrees, metres, percent, plural, when } from "../format.js";
 
 const PHOTOS_SHOWN = 1000; // of the map, behind the track
 const FRAMES_SHOWN = 500; // in the table
@@ -15,21 +15,21 @@ export async function showTracks(view, { signal, id }) {
 
 const chip = (status) => h("span", { class: `chip ${TONES[status] ?? ""}` }, status);
 const statusOf = (frame) => frame.state?.status ?? frame.status;
-const heads = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col", class: ["Frames", "Probability"].includes(name) ? "number" : "" }, name))));
-const table = (label, head, rows) => h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": label }, h("table", {}, head, h("tbody", {}, rows)));
+const heads = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name))));
+const table = (label, head, rows) => h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": label }, h("table", { class: "stacked" }, head, h("tbody", {}, rows)));
 
 async function showList(view, signal) {
   const { tracks } = await get("/tracks", { query: { limit: 100 }, signal });
-  const none = h("section", { class: "card empty" }, h("h2", {}, "No tracks yet"), h("p", {}, "A track follows a camera through the map, frame by frame: ", h("code", {}, "placewise track PHOTOS_OR_VIDEO"), ", or ", h("code", {}, "POST /tracks"), "."));
+  const none = h("section", { class: "card empty" }, h("h2", {}, "No tracks yet"), h("p", {}, "A track follows a camera through the map, frame by frame: ", h("code", {}, `placewise track PHOTOS_OR_VIDEO --map ${currentMap()}`), ", or ", h("code", {}, "POST /tracks"), " of the API."));
   const rows = tracks.map((track) => h("tr", {},
     h("td", {}, h("a", { href: `#/tracks/${track.track_id}` }, time(track.created_at))),
-    h("td", { class: "number" }, count(track.version)),
+    h("td", {}, plural(track.version, "frame")),
     h("td", {}, track.state ? chip(track.state.status) : "–"),
     h("td", { class: "number" }, percent(track.state?.probability)),
     h("td", { class: "name" }, whereabouts(track.state))));
   fill(view,
     h("header", { class: "head" }, h("h1", {}, "Tracks"), advancedTabs("tracks")),
-    tracks.length ? h("section", { class: "card" }, table("Tracks", heads("Begun", "Frames", "Status", "Probability", "Last place"), rows)) : none);
+    tracks.length ? h("section", { class: "card" }, table("Tracks", heads("Begun", "Length", "Status", "Probability", "Last place"), rows)) : none);
 }
 
 async function showTrack(view, id, signal) {
@@ -37,42 +37,45 @@ async function showTrack(view, id, signal) {
   const drawn = h("div", { class: "view" });
   const draw = async () => {
     const track = await get(`/tracks/${id}`, { query: { smoothed: smoothed.checked }, signal });
-    await drawTrack(drawn, track, signal);
+    await drawTrack(drawn, track, draw, signal);
   };
-  smoothed.addEventListener("change", () => draw().catch(() => {}));
+  smoothed.addEventListener("change", () => draw().catch((error) => {
+    smoothed.checked = !smoothed.checked;
+    noteError(error);
+  }));
   const remove = button("Delete…", async () => {
     if (!(await confirmed("Delete this track?", "Its frames and states are deleted. The photos of the map stay.", "Delete"))) return;
     await ask(`/tracks/${id}`, { method: "DELETE" });
     location.hash = "#/tracks";
   }, "danger");
-  const choice = field("Use later frames, too", smoothed, "Each state given the whole track, not only the frames before it");
-  choice.classList.add("inline");
+  const choice = h("label", { class: "check" }, smoothed, h("span", {}, "Use later frames, too", h("small", {}, "Each state given the whole track, not only the frames before it")));
   fill(view, h("header", { class: "head" }, h("h1", {}, "Track"), h("div", { class: "row" }, h("a", { class: "button", href: "#/tracks" }, "All tracks"), remove)), choice, drawn);
   await draw();
 }
 
-async function drawTrack(element, track, signal) {
+async function drawTrack(element, track, again, signal) {
   const { frames } = track;
   const located = frames.filter(({ state }) => state && state.latitude !== null);
   const ground = h("div", { class: "ground browse" });
   const cut = h("p", { class: "soft small" });
   const followed = frames.filter((frame) => statusOf(frame) === "tracking").length;
   const rows = frames.slice(-FRAMES_SHOWN).reverse().map((frame) => h("tr", {},
-    h("td", {}, new Date(frame.captured_at).toLocaleTimeString("en-GB")),
     h("td", { class: "name" }, frame.filename),
+    h("td", {}, h("time", { datetime: frame.captured_at, title: when(frame.captured_at) }, new Date(frame.captured_at).toLocaleTimeString("en-GB"))),
     h("td", {}, chip(statusOf(frame)), frame.error && h("p", { class: "bad small" }, frame.error.detail)),
     h("td", { class: "number" }, percent(frame.state?.probability)),
     h("td", { class: "name" }, whereabouts(frame.state)),
     h("td", {}, frame.state?.image_id ? h("a", { href: `#/photo/${frame.state.image_id}` }, "Nearest photo") : "–")));
   const shown = frames.length > FRAMES_SHOWN ? `; the last ${count(FRAMES_SHOWN)} are listed` : "";
   fill(element,
-    h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, track.pending > 0 && `${plural(track.pending, "frame")} wait.`),
+    h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, frames.length > 0 && `${when(frames[0].captured_at)} to ${when(frames.at(-1).captured_at)}.`),
+    track.pending > 0 && h("p", { class: "row" }, `${plural(track.pending, "frame")} not described yet.`, button("Refresh", again)),
     located.length > 0 && [ground, cut],
-    h("section", { class: "card" }, h("h2", {}, "Frames"), table("Frames", heads("Time", "Photo", "Status", "Probability", "Place", "On the map"), rows)));
+    h("section", { class: "card" }, h("h2", {}, "Frames"), table("Frames", heads("Photo", "Time", "Status", "Probability", "Place", "On the map"), rows)));
   if (located.length) await drawPath(ground, cut, frames, signal);
 }
 
-/** The track over the map's photos: a circle of 68 % and a point for each frame, and lines between those that are not lost. */
+/** The track over the map's photos: a point for each frame; lines and circles of 68 % for those that are not lost: the others' circles would hide the track. */
 async function drawPath(ground, cut, frames, signal) {
   const [{ openMap }, { images, next_cursor: more, total_found: total, total_is_exact: exact }] = await Promise.all([
     import("../map.js"),
@@ -88,7 +91,7 @@ async function drawPath(ground, cut, frames, signal) {
   for (const frame of [...frames, null]) {
     const state = frame?.state;
     const known = state && state.latitude !== null;
-    if (known && state.radius_68_m !== null) map.circle(state.latitude, state.longitude, state.radius_68_m, "uncertainty");
+    if (known && state.status !== "lost" && state.radius_68_m !== null) map.circle(state.latitude, state.longitude, state.radius_68_m, "uncertainty");
     if (known && state.status !== "lost") {
       segment.push([state.latitude, state.longitude]);
     } else if (frame === null || frame.state) {
