@@ -78,10 +78,13 @@ PATHS = [
     {**UNPLACED, "place": "tower/floor 7/elevator", "probability": 0.61},
     {**UNPLACED, "place": "tower/floor 7", "probability": 0.97},
 ]
+SURE_PATHS = [PATHS[0] | {"probability": 0.96}, PATHS[1]]
 
 
 FINEST = "At a certainty of 95 %, the finest answer is"
 NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most probable is"
+STRONGER = "stronger evidence that the place is in the map"
+FINER = f"Finer levels require {STRONGER}."
 
 
 @pytest.mark.parametrize(
@@ -109,7 +112,15 @@ NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most prob
             0.2,
             "Best guess",
             "tower/floor 7/elevator",
-            f"{NONE_CERTAIN} “tower/floor 7”, with 97.0 %.",
+            f"{NONE_CERTAIN} “tower/floor 7”, with 97.0 %, but it requires {STRONGER}.",
+        ),
+        (
+            SURE_PATHS,
+            1,
+            0.02,
+            "In this map",
+            "tower/floor 7",
+            f"{FINEST} “tower/floor 7”, with a probability of 97.0 %. {FINER}",
         ),
         (
             CIRCLES,
@@ -120,7 +131,7 @@ NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most prob
             "The map probably has no photo of this place (62.0 %).",
         ),
     ],
-    ids=["circle", "path", "no certain level", "not in the map"],
+    ids=["circle", "path", "no certain level", "probable finer level", "not in the map"],
 )
 def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
     visitor: Visitor,

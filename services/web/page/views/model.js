@@ -5,7 +5,7 @@ import { advancedTabs, bar, button, field, fill, h, note, noteError, openDialog,
 import { count, percent, plural } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 
-const CHANGES = ["fit", "import_vocabulary", "switch", "pca"];
+const CHANGES = { fit: "Fitting a vocabulary", import_vocabulary: "Importing a vocabulary", switch: "Switching the vocabulary", pca: "Fitting a PCA" };
 const RECALLS = ["R@1", "R@5", "R@10"];
 
 const STANDING = {
@@ -21,7 +21,7 @@ export async function showModel(view, { signal }) {
   const [map, generations, vocabularies, { evaluations }, { jobs }] = await Promise.all([
     get(path, { signal }), get("/generations", { signal }), get("/vocabularies", { signal }),
     get("/evaluations", { query: { limit: 50 }, signal }),
-    get("/jobs", { query: { kind: [...CHANGES, "evaluate"], state: ["queued", "running"] }, signal }),
+    get("/jobs", { query: { kind: Object.keys(CHANGES), state: ["queued", "running"] }, signal }),
   ]);
   const again = () => showModel(view, { signal });
   const work = h("div", { class: "work" });
@@ -44,7 +44,7 @@ export async function showModel(view, { signal }) {
     comparison(evaluations, generations, vocabularies, () => measure(follow)),
     generationsTable(generations, vocabularies),
     vocabulariesTable(vocabularies, generations, follow));
-  for (const job of jobs.filter((one) => one.kind !== "evaluate").slice(0, 1)) follow(job, `A model change (${job.kind})`);
+  for (const job of jobs.slice(0, 1)) follow(job, CHANGES[job.kind]);
 }
 
 /** The bar of a job that changes the model; `again` draws the view anew when it has ended. */
@@ -55,7 +55,8 @@ async function followJob(work, started, words, again, signal) {
   fill(work, h("div", { class: "job" }, h("p", { role: "status" }, h("strong", {}, words)), progress, h("div", { class: "row" }, state, cancel)));
   const draw = (job) => {
     fill(progress, bar(words, job.progress.done, job.progress.total));
-    fill(state, stateInWords(job), job.progress.total ? `: ${count(job.progress.done)} of ${count(job.progress.total)}` : "");
+    // Its stages count different things: a share says how far it is.
+    fill(state, stateInWords(job), job.state === "running" && job.progress.total ? `: ${percent(job.progress.done / job.progress.total)}` : "");
   };
   try {
     const job = await watchJob(started.job_id, draw, signal);
@@ -76,7 +77,7 @@ async function fitVocabulary(follow) {
     h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
   if ((await closed) !== "yes") return;
   const options = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
-  follow(await post("/vocabularies", { json: options }), "Fitting a vocabulary");
+  follow(await post("/vocabularies", { json: options }), CHANGES.fit);
 }
 
 async function measure(follow) {
@@ -152,7 +153,7 @@ function vocabulariesTable(vocabularies, generations, follow) {
         h("td", { class: "wide-only" }, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),
         h("td", { class: "row end" },
           button("Download", () => download(one)),
-          active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), "Switching the vocabulary")))))))));
+          active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), CHANGES.switch)))))))));
 }
 
 async function download(vocabulary) {

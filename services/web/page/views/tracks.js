@@ -48,7 +48,7 @@ async function showTrack(view, id, signal) {
     await ask(`/tracks/${id}`, { method: "DELETE" });
     location.hash = "#/tracks";
   }, "danger");
-  const choice = h("label", { class: "check" }, smoothed, h("span", {}, "Use later frames, too", h("small", {}, "Each state given the whole track, not only the frames before it")));
+  const choice = h("label", { class: "check" }, smoothed, h("span", {}, "Use later frames, too", h("small", {}, "The place given the whole track, not only the frames before it. The status stays that of the moment.")));
   fill(view, h("header", { class: "head" }, h("h1", {}, "Track"), h("div", { class: "row" }, h("a", { class: "button", href: "#/tracks" }, "All tracks"), remove)), choice, drawn);
   await draw();
 }
@@ -68,7 +68,7 @@ async function drawTrack(element, track, again, signal) {
     h("td", {}, frame.state?.image_id ? h("a", { href: `#/photo/${frame.state.image_id}` }, "Nearest photo") : "–")));
   const shown = frames.length > FRAMES_SHOWN ? `; the last ${count(FRAMES_SHOWN)} are listed` : "";
   fill(element,
-    h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, frames.length > 0 && `${when(frames[0].captured_at)} to ${when(frames.at(-1).captured_at)}.`),
+    h("p", {}, `${plural(frames.length, "frame")}, ${count(followed)} of them tracked${shown}. `, frames.length > 0 && `The first is of ${when(frames[0].captured_at)}.`),
     track.pending > 0 && h("p", { class: "row" }, `${plural(track.pending, "frame")} not described yet.`, button("Refresh", again)),
     located.length > 0 && [ground, cut],
     h("section", { class: "card" }, h("h2", {}, "Frames"), table("Frames", heads("Photo", "Time", "Status", "Probability", "Place", "On the map"), rows)));
@@ -86,12 +86,14 @@ async function drawPath(ground, cut, frames, signal) {
   for (const photo of images) {
     if (photo.latitude !== null) map.point(photo.latitude, photo.longitude, { kind: "behind", radius: 3 });
   }
+  for (const { state } of frames) {
+    if (state && state.latitude !== null && state.status !== "lost" && state.radius_68_m !== null) map.circle(state.latitude, state.longitude, state.radius_68_m, "uncertainty");
+  }
   map.bounds = []; // the track is shown, not the whole map
   let segment = [];
   for (const frame of [...frames, null]) {
     const state = frame?.state;
     const known = state && state.latitude !== null;
-    if (known && state.status !== "lost" && state.radius_68_m !== null) map.circle(state.latitude, state.longitude, state.radius_68_m, "uncertainty");
     if (known && state.status !== "lost") {
       segment.push([state.latitude, state.longitude]);
     } else if (frame === null || frame.state) {

@@ -6,6 +6,9 @@ import { coordinateTools } from "../places.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
 
+/** A share without the zero of a whole percentage. */
+const short = (share) => `${Number((100 * share).toFixed(1))} %`;
+
 /** The card with the estimate of a similarity search. */
 export function verdict(found) {
   const { estimate } = found;
@@ -50,10 +53,10 @@ function whereabouts(estimate) {
   const [share, ring] = RINGS.find(([, radius]) => estimate[radius] !== null) ?? [];
   const level = estimate.levels[ring ? 0 : estimate.answer_level ?? 0] ?? estimate;
   const { place, latitude, longitude } = level;
-  const error = ring ? `${metres(estimate[ring])} (${100 * share} %)` : metres(level.radius_m);
+  const [radius, probability] = ring ? [estimate[ring], share] : [level.radius_m, level.probability];
   return [
     place && h("p", { class: "place" }, place),
-    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${error}`)),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${metres(radius)}`, probability !== undefined && ` (${short(probability)})`)),
     latitude !== null && coordinateTools(latitude, longitude),
   ];
 }
@@ -61,11 +64,13 @@ function whereabouts(estimate) {
 /** Why the estimate answers at its level, or does not answer: one sentence. */
 function reason({ levels, answer_level: answer, certainty, not_in_map_probability: outside, reason: withoutLevels }) {
   if (!levels.length) return withoutLevels;
-  const required = `${Number((100 * certainty).toFixed(1))} %`;
-  if (answer !== null) return `At a certainty of ${required}, the finest answer is ${quoted(levels[answer])}, with a probability of ${percent(levels[answer].probability)}.`;
+  const required = short(certainty);
+  // An answer that is finer than the coarsest level also requires odds against “not in this map”.
+  const unsure = levels.slice(0, answer ?? levels.length).some(({ probability }) => probability >= certainty);
+  if (answer !== null) return `At a certainty of ${required}, the finest answer is ${quoted(levels[answer])}, with a probability of ${percent(levels[answer].probability)}.${unsure ? " Finer levels require stronger evidence that the place is in the map." : ""}`;
   if (outside > 0.5) return `The map probably has no photo of this place (${percent(outside)}).`;
   const coarsest = levels.at(-1);
-  return `No level is certain enough at a certainty of ${required}; the most probable is ${quoted(coarsest)}, with ${percent(coarsest.probability)}.`;
+  return `No level is certain enough at a certainty of ${required}; the most probable is ${quoted(coarsest)}, with ${percent(coarsest.probability)}${unsure ? ", but it requires stronger evidence that the place is in the map" : ""}.`;
 }
 
 const named = (level) => level.place ?? `Within ${metres(level.radius_m)}`;
