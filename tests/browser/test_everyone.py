@@ -106,3 +106,19 @@ def test_views_are_named_and_marked_as_the_current_one(visitor: Visitor) -> None
     page.get_by_role("link", name="Tracks").press("Enter")
     expect(page.get_by_role("heading", name="Tracks", exact=True)).to_be_visible()
     expect(page.locator(".tabs [aria-current=page]")).to_have_text("Advanced")
+
+
+def test_a_server_that_goes_away_is_named_and_found_again(visitor: Visitor) -> None:
+    page = visitor.visit("status")
+    expect(page.locator(".card .chip.healthy")).to_be_visible()
+    page.route("**/api/**", lambda route: route.abort())
+    page.route("**/console/views/**", lambda route: route.abort())
+    expect(page.get_by_text("be reached. Is it running?")).to_be_visible()
+    expect(page.locator(".card .chip.healthy")).to_have_count(0)
+    page.get_by_role("link", name="Photos").click()
+    expect(page.get_by_text("be reached. Is it running?")).to_be_visible()
+    page.unroute_all()
+    page.get_by_role("button", name="Try again").click()
+    expect(page.locator(".photo-card").first).to_be_visible()
+    page.goto(f"{visitor.url}/#/tracks/no-track")
+    expect(page.get_by_role("link", name="All tracks")).to_be_visible()

@@ -59,3 +59,17 @@ def test_the_key_is_remembered_on_this_device_until_it_is_forgotten(page: Page) 
     another_tab.get_by_role("button", name="Forget the key").click()
     expect(another_tab.get_by_role("dialog")).to_contain_text("needs a key")
     assert KEY not in another_tab.evaluate("JSON.stringify([localStorage, sessionStorage])")
+
+
+def test_a_key_that_only_reads_is_told_what_it_lacks(page: Page, locked: ServerProcess) -> None:
+    made = locked.client.post("/api/v1/keys", json={"name": "reader", "scopes": ["read"]})
+    assert made.status_code == 201, made.text
+    give(page, made.json()["key"])
+    page.get_by_role("link", name="Photos").click()
+    page.locator(".photo-card input").check()
+    for _ in range(2):
+        page.get_by_role("button", name="Delete…").click()
+        page.get_by_role("button", name="Delete", exact=True).click()
+        expect(page.locator(".note")).to_have_count(1)
+        expect(page.locator(".note")).to_contain_text("requires the scope “write”")
+        page.locator(".photo-card input").check()

@@ -65,6 +65,18 @@ def test_streets_are_loaded_once_the_visitor_agrees_and_until_they_are_hidden(
     assert visiting.faults == []
 
 
+def test_the_graticule_stays_where_no_streets_can_be_loaded(
+    context: BrowserContext, town: Town
+) -> None:
+    context.route(TILES + "**", lambda route: route.abort())
+    page = open_map(Visitor(context, town.url), town)
+    page.get_by_role("button", name="Streets").click()
+    page.get_by_role("button", name="Load streets").click()
+    expect(page.locator(".note.bad")).to_contain_text("be loaded from tile.openstreetmap.org")
+    expect(page.locator(".graticule-label").first).to_be_visible()
+    expect(page.get_by_role("button", name="Streets")).to_have_attribute("aria-pressed", "false")
+
+
 def test_the_policy_lets_images_of_the_tile_server_through_and_nothing_else(
     visiting: Visitor, town: Town
 ) -> None:

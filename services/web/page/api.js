@@ -5,11 +5,12 @@ import { field, h, openDialog } from "./dom.js";
 const KEY = "placewise-key";
 const MAP = "placewise-map";
 const ROOT = "/api/v1";
+export const UNREACHABLE = "The server can’t be reached. Is it running?";
 
 /** What the server refused, by its RFC 9457 problem. */
 export class Problem extends Error {
   constructor(status, body, retryAfter) {
-    super(body.detail ?? `The server answered ${status}.`);
+    super(body.code === "scope_missing" ? forbidden(body.needed) : body.detail ?? `The server answered ${status}.`);
     this.name = "Problem";
     this.status = status;
     this.code = body.code ?? "unknown";
@@ -17,6 +18,8 @@ export class Problem extends Error {
     this.retryAfter = retryAfter;
   }
 }
+
+const forbidden = (scopes) => `You may not do this: it requires the scope “${scopes.join("”, “")}”. Get a key with it from an administrator${hasKey() ? ", and enter it after “Forget the key” on Status" : ""}.`;
 
 const REFUSALS = [400, 403, 413, 415, 422];
 
@@ -98,7 +101,7 @@ export async function ask(path, { method = "GET", query, json, body, headers, si
       });
     } catch (error) {
       if (error.name === "AbortError") throw error;
-      throw new Error("The server can't be reached. Is it running?", { cause: error });
+      throw new Error(UNREACHABLE, { cause: error });
     }
     if (response.ok || response.status === 304 || also.includes(response.status)) return response;
     const problem = await problemOf(response);

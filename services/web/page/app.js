@@ -1,19 +1,29 @@
 // The frame: which view is shown, of which map.
 
-import { chooseMap, currentMap, get, post } from "./api.js";
+import { UNREACHABLE, chooseMap, currentMap, get, post } from "./api.js";
 import { field, fill, h, noteError, openDialog } from "./dom.js";
 import { showAsk } from "./views/ask.js";
+
+/** The page's own files can't be loaded. A browser does not import a module again that has failed: the page must be. */
+class Unloaded extends Error {}
+
+const onDemand = (load, name) => async (...view) => {
+  const module = await load().catch((cause) => {
+    throw new Unloaded(UNREACHABLE, { cause });
+  });
+  await module[name](...view);
+};
 
 // The first view comes with the page; the others are loaded on demand.
 const VIEWS = {
   ask: { title: "Ask", show: showAsk },
-  photos: { title: "Photos", show: async (...view) => (await import("./views/photos.js")).showPhotos(...view) },
-  photo: { title: "Photo", show: async (...view) => (await import("./views/photo.js")).showPhoto(...view) },
-  tracks: { title: "Tracks", show: async (...view) => (await import("./views/tracks.js")).showTracks(...view) },
-  add: { title: "Add", show: async (...view) => (await import("./views/add.js")).showAdd(...view) },
-  locate: { title: "Locate a folder", show: async (...view) => (await import("./views/locate.js")).showLocate(...view) },
-  model: { title: "Model", show: async (...view) => (await import("./views/model.js")).showModel(...view) },
-  status: { title: "Status", show: async (...view) => (await import("./views/status.js")).showStatus(...view) },
+  photos: { title: "Photos", show: onDemand(() => import("./views/photos.js"), "showPhotos") },
+  photo: { title: "Photo", show: onDemand(() => import("./views/photo.js"), "showPhoto") },
+  tracks: { title: "Tracks", show: onDemand(() => import("./views/tracks.js"), "showTracks") },
+  add: { title: "Add", show: onDemand(() => import("./views/add.js"), "showAdd") },
+  locate: { title: "Locate a folder", show: onDemand(() => import("./views/locate.js"), "showLocate") },
+  model: { title: "Model", show: onDemand(() => import("./views/model.js"), "showModel") },
+  status: { title: "Status", show: onDemand(() => import("./views/status.js"), "showStatus") },
 };
 const TAB_OF = { locate: "add", photo: "photos", tracks: "model" };
 // Where to go from an address that names nothing.
@@ -49,7 +59,7 @@ async function route() {
     if (signal.aborted) return;
     const [href, list] = (id && error.status === 404 && LIST_OF[name]) || [];
     fill(element, h("section", { class: "card empty" }, h("h1", {}, "This can’t be shown"), h("p", {}, error.message),
-      href ? h("a", { class: "button", href }, list) : h("button", { type: "button", onclick: route }, "Try again")));
+      href ? h("a", { class: "button", href }, list) : h("button", { type: "button", onclick: () => (error instanceof Unloaded ? location.reload() : route()) }, "Try again")));
   }
 }
 

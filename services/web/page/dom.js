@@ -63,10 +63,12 @@ export function bar(label, done, total) {
   return h("progress", { "aria-label": label, max: known ? total : null, value: known ? done : null });
 }
 
-/** A short message at the lower edge; read out by screen readers. */
+/** A short message at the lower edge, in the place of an equal one; read out by screen readers. */
 export function note(text, kind = "") {
+  const notes = document.getElementById("notes");
+  for (const earlier of [...notes.children]) if (earlier.firstChild.data === text) earlier.remove();
   const line = h("p", { class: `note ${kind}` }, text, h("button", { type: "button", class: "bare", "aria-label": "Close this message", onclick: () => line.remove() }, "×"));
-  document.getElementById("notes").append(line);
+  notes.append(line);
   setTimeout(() => line.remove(), kind === "bad" ? 12000 : 5000);
 }
 

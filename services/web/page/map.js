@@ -1,6 +1,6 @@
 // The map: Leaflet with a graticule, or with streets once the visitor has agreed to load them.
 
-import { confirmed, h, noteError } from "./dom.js";
+import { confirmed, h, note, noteError } from "./dom.js";
 import { serverSettings } from "./settings.js";
 
 const STREETS = "placewise-streets"; // the origin of the tiles that this device may load
@@ -134,6 +134,14 @@ function addGround(map, element, settings) {
       if (map.getSize().x) drawLines();
     }
   };
+  // A server that gives no tile at all leaves the graticule; where it lacks some, the others are shown.
+  let given = false;
+  tiles.on("tileload", () => (given = true));
+  tiles.on("load", () => {
+    if (given) return;
+    show(false);
+    note(`The streets can’t be loaded from ${new URL(origin).host}. The map shows latitude and longitude instead.`, "bad");
+  });
   toggle.addEventListener("click", async () => {
     try {
       if (map.hasLayer(tiles)) {

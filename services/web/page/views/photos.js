@@ -115,7 +115,7 @@ export async function showPhotos(view, { signal }) {
         changed += 1;
       }
     } finally {
-      note(`${plural(changed, "photo")} ${done}${changed < photos.length ? ` of ${count(photos.length)}` : ""}.`);
+      if (changed) note(`${changed < photos.length ? `${count(changed)} of ` : ""}${plural(photos.length, "photo")} ${done}.`);
       await reload();
     }
   }

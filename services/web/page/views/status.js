@@ -25,9 +25,17 @@ export async function showStatus(view, { signal }) {
   fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(await serverSettings())));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
-    if (!document.hidden && !drawn.jobs.contains(document.activeElement)) look().catch(() => {});
+    if (!document.hidden && !drawn.jobs.contains(document.activeElement)) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
   }, LOOK_SECONDS * 1000);
   signal.addEventListener("abort", () => clearInterval(timer));
+}
+
+/** Health that can't be read; the other cards stay as they were. */
+function drawUnreachable(card, error) {
+  fill(card,
+    h("h2", {}, "Health ", h("span", { class: "chip unhealthy" }, "unknown")),
+    h("p", {}, error.message),
+    h("p", { class: "soft" }, "What you see here is of the last answer. The page keeps trying."));
 }
 
 const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", extractors: "Extractors", uploads: "Uploads" };
