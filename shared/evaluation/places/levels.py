@@ -209,7 +209,8 @@ def place_votes(
     else:
         points = [(location.latitude, location.longitude) for location in locations]
         degrees = np.array(points, np.float64).reshape(-1, 2)
-        metres = [distances_m(*point, degrees[:, 0], degrees[:, 1]) for point in degrees]
+        latitudes, longitudes = degrees.T
+        metres = [distances_m(lat, lon, latitudes, longitudes) for lat, lon in degrees]
         together = np.array(metres) <= level.radius_m
     return np.maximum(votes, together @ votes)
 
