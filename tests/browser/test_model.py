@@ -43,6 +43,22 @@ def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
     return list(newest.values())
 
 
+def test_a_second_model_change_is_refused_in_words_of_the_page(visitor: Visitor) -> None:
+    refused = {"code": "model_change_running", "detail": "Cancel it: POST /api/v1/jobs/1/cancel."}
+    visitor.page.route(
+        "**/api/v1/vocabularies?*",
+        lambda route: (
+            route.fulfill(status=409, json=refused)
+            if route.request.method == "POST"
+            else route.fallback()
+        ),
+    )
+    page = visitor.visit("model")
+    page.get_by_role("button", name="Fit").first.click()
+    page.get_by_role("button", name="Fit it", exact=True).click()
+    expect(page.locator(".note.bad")).to_contain_text("cancel it under Advanced")
+
+
 def test_a_comparison_stays_on_a_narrow_phone(visitor: Visitor) -> None:
     def two_generations(route: Route) -> None:
         [after, *_] = route.fetch().json()["evaluations"]

@@ -10,7 +10,7 @@ export const UNREACHABLE = "The server can’t be reached. Is it running?";
 /** What the server refused, by its RFC 9457 problem. */
 export class Problem extends Error {
   constructor(status, body, retryAfter) {
-    super(body.code === "scope_missing" ? forbidden(body.needed) : body.detail ?? `The server answered ${status}.`);
+    super(WORDS[body.code]?.(body) ?? body.detail ?? `The server answered ${status}.`);
     this.name = "Problem";
     this.status = status;
     this.code = body.code ?? "unknown";
@@ -19,7 +19,11 @@ export class Problem extends Error {
   }
 }
 
-const forbidden = (scopes) => `You may not do this: it requires the scope “${scopes.join("”, “")}”. Get a key with it from an administrator${hasKey() ? ", and enter it after “Forget the key” on Status" : ""}.`;
+// What the page says instead of the API's details, which name its own ways.
+const WORDS = {
+  scope_missing: ({ needed }) => `You may not do this: it requires the scope “${needed.join("”, “")}”. Get a key with it from an administrator${hasKey() ? ", and enter it after “Forget the key” on Status" : ""}.`,
+  model_change_running: () => "The model of this map is being changed. Wait until that has ended, or cancel it under Advanced.",
+};
 
 const REFUSALS = [400, 403, 413, 415, 422];
 

@@ -146,7 +146,7 @@ async function showAnswer(answer, queryPhoto, signal, filter = {}) {
         unlocated && button("Search only photos with coordinates", () => showAnswer(answer, queryPhoto, signal, { box: WITH_COORDINATES }))),
       located ? ground : null),
     h("section", {},
-      h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo is similar enough"),
+      h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
       photos.length > 0 && figures(photos, found.word_weights === "applied")));
   announce(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);

@@ -14,6 +14,7 @@ export function verdict(found) {
   const { estimate } = found;
   const { levels } = estimate;
   const [kind, title] = judge(estimate);
+  const anyFound = found.similar_images.length > 0;
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
     kind === "unknown" ? null : whereabouts(estimate),
@@ -28,8 +29,8 @@ export function verdict(found) {
         h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
-    found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
-    found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
+    anyFound && found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
+    anyFound && found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
     found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
 }
 
