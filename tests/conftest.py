@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 # Before NumPy and PyTorch are imported. Tests and the processes that they start share few cores:
@@ -17,6 +17,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 from sqlalchemy.engine import make_url
 
+from services.cli.imports import collection_paused
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
@@ -48,6 +49,13 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     for each core."""
     waiting = config.getoption("numprocesses") == "auto"
     return (os.cpu_count() or 1) + int(waiting)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import the test modules without garbage collection: a third of the time that it takes."""
+    with collection_paused():
+        return (yield)
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` reads the markers
