@@ -116,9 +116,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
     The extractor is loaded in its own thread, because importing torch takes seconds: at once, or
     with `lazy_extractor` when the first of its jobs is queued.
 
-    Locks PLACEWISE_HOME and releases the leases of a killed process first. If HOST is not a
-    loopback address, or ADMIN_KEY is set, every request needs a key; the first admin key is created
-    if there is none.
+    Locks PLACEWISE_HOME first. If the catalog is in that folder, the leases and registrations of a
+    killed process are deleted; with DATABASE_URL they may be those of running services, and expire.
+    If HOST is not a loopback address, or ADMIN_KEY is set, every request needs a key; the first
+    admin key is created if there is none.
 
     Raises:
         Misconfigured: `home_in_use` if another server uses the folder, `address_in_use`,
@@ -128,9 +129,8 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
     if settings.search_worker_urls:
         raise Misconfigured(
             "separate_services",
-            "SEARCH_URLS is set, but the embedded server searches in its own process and releases "
-            "the leases of all other workers. Unset SEARCH_URLS, or run placewise gateway, "
-            "extractor and steward.",
+            "SEARCH_URLS is set, but the embedded server searches in its own process. Unset "
+            "SEARCH_URLS, or run placewise gateway, extractor and steward.",
         )
     home = settings.placewise_home
     with contextlib.ExitStack() as stack:
@@ -148,10 +148,12 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             get_or_create_default_map(
                 session, settings.new_map_extractor, RowType(settings.descriptor_rows)
             )
+        if settings.database_url is None:
             # The lock proves that no other worker is alive: rows are left from a killed process.
-            delete_dead_search_workers(session, all_workers=True)
-            delete_processes(session, "extractor")
-        release_expired_leases(catalog, settings.max_attempts, all_leases=True)
+            with catalog.write() as session:
+                delete_dead_search_workers(session, all_workers=True)
+                delete_processes(session, "extractor")
+            release_expired_leases(catalog, settings.max_attempts, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]

@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from shared.catalog.database.errors import to_unavailable
+from shared.catalog.database.errors import reason_of, to_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.ids import new_id
 from shared.telemetry.tracing import REQUEST_ID_HEADER
@@ -160,7 +160,9 @@ async def _handle_database_error(request: Request, error: Exception) -> JSONResp
     unavailable = to_unavailable(error)
     if unavailable is None:  # a bug, which a retry would not fix
         return await handle_unexpected_error(request, error)
-    return await _handle_placewise_error(request, unavailable)
+    # The driver's reason is for the operator: it names the host and the database.
+    log.error("%s %s: %s: %s", request.method, request.url.path, unavailable.code, reason_of(error))
+    return problem_response(unavailable, request)
 
 
 async def _handle_client_disconnect(request: Request, error: Exception) -> Response:

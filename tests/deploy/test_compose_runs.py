@@ -104,9 +104,11 @@ def test_compose_file_makes_a_placewise_that_works_and_ends_in_time(
             for n in range(2, 30)
         ]
         assert machine.stop("extractor") == 0, machine.log("extractor")
+        (machine.folder("extractor") / "heartbeat").unlink(missing_ok=True)
         machine.start("extractor")
         for job in jobs:
             assert ended(client, job["job_id"])["state"] == "succeeded"
+        machine.wait_until_healthy("extractor")  # it may have found nothing left to do
 
         assert client.get("/api/v1/health").json()["status"] == "healthy"
         machine.stop("search-1")

@@ -40,7 +40,7 @@ from tests.support.servers import PostgresServer, start_postgres
 API = "/api/v1"
 STATEMENT_SECONDS = 2.0
 # A statement, a ping or a connection that is given up, on a busy machine.
-ANSWER_SECONDS = 12.0
+ANSWER_SECONDS = 20.0
 RECOVERY_SECONDS = 60.0
 UPLOADERS = 3
 WAITING_PARTS = ("steward", "worker extractor", "worker evaluator")

@@ -26,7 +26,7 @@ from shared.catalog.database.session import PoolConfig, TransactionTimeouts
 
 # Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
 ANSWER_MARGIN_SECONDS = 2.0
-PING_TIMEOUT_SECONDS = 2.0
+PING_TIMEOUT_SECONDS = 5.0  # a busy server may take seconds for a BEGIN
 # A connection that was in use a moment ago is not pinged: a server that went away since then would
 # have ended that request as well.
 PING_AFTER_UNUSED_SECONDS = 1.0

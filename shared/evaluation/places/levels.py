@@ -29,6 +29,7 @@ from shared.evaluation.places.evidence import (
     distance_between_m,
     estimate_location,
 )
+from shared.geodesy import distances_m
 from shared.place_paths import is_within_level, label_levels
 
 VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
@@ -191,6 +192,27 @@ def _vote_for_places(
 def photos_inside(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> Mask:
     """Return (k,) bool: which photos of a ranking lie in a level."""
     return np.array([level.contains(r.location) for r in ranking], dtype=bool)
+
+
+def place_votes(
+    level: CandidateLevel, ranking: Sequence[RankedPhoto], votes: FloatArray
+) -> FloatArray:
+    """Return (k,) for each photo of a ranking the votes of all photos of its place.
+
+    They are those with its label or, if the level is a circle, within the radius around the photo;
+    only the photo itself if it has no label or coordinates.
+    """
+    locations = [r.location for r in ranking]
+    if level.radius_m is None:
+        labels = [location.place for location in locations]
+        together = np.array([[a is not None and a == b for b in labels] for a in labels])
+    else:
+        points = [(location.latitude, location.longitude) for location in locations]
+        degrees = np.array(points, np.float64).reshape(-1, 2)
+        latitudes, longitudes = degrees.T
+        metres = [distances_m(lat, lon, latitudes, longitudes) for lat, lon in degrees]
+        together = np.array(metres) <= level.radius_m
+    return np.maximum(votes, together @ votes)
 
 
 FEATURES = (

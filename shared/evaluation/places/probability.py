@@ -26,6 +26,7 @@ from shared.evaluation.places.levels import (
     LevelScheme,
     candidate_levels,
     photos_inside,
+    place_votes,
     ranking_spread,
     vote_weights,
 )
@@ -247,11 +248,17 @@ def _match_probabilities(
     not_in_map: float,
     votes: FloatArray,
 ) -> list[float]:
-    """Give the photos of the finest level its probability; the others share the rest by votes."""
+    """Return the probability of each photo of a ranking that it shows the query's place.
+
+    The finest level's for the photos in it. The places of the others share by votes what it and
+    `not_in_map` leave, but none of them is more probable than the finest level.
+    """
     inside = photos_inside(finest, ranking)
     remaining = max(0.0, 1 - probability - not_in_map)
-    shares = remaining * votes / max(float(votes[~inside].sum()), 1e-12)
-    matches: list[float] = np.where(inside, probability, shares).tolist()
+    other_votes = np.where(inside, 0.0, votes)
+    shares = place_votes(finest, ranking, other_votes) / max(float(other_votes.sum()), 1e-12)
+    others = np.minimum(remaining * shares, probability)
+    matches: list[float] = np.where(inside, probability, others).tolist()
     return matches
 
 

@@ -156,9 +156,35 @@ def test_a_level_is_never_less_probable_than_a_finer_one() -> None:
         assert estimate is not None
         assert list(estimate.probabilities) == sorted(estimate.probabilities)
         assert estimate.probabilities[0] + estimate.not_in_map <= 1 + 1e-12
-        inside = [estimate.levels[0].contains(r.location) for r in ranked]
-        others = [p for p, i in zip(estimate.match_probabilities, inside, strict=True) if not i]
-        assert sum(others) + estimate.probabilities[0] + estimate.not_in_map <= 1 + 1e-9
+
+
+def test_places_outside_the_finest_level_share_what_it_leaves_and_none_exceeds_it() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        scores = np.sort(rng.random(40))[::-1].tolist()
+        labels = [label(f"{a}/1") for a in rng.integers(0, 8, 40)]
+        spots = [north(1000.0 * a) for a in rng.integers(0, 8, 40)]
+        for scheme, locations in ((PATHS, labels), (PLAIN, spots)):
+            ranked = ranking(*zip(scores, locations, strict=True))
+            estimate = PlaceModel().estimate(ranked, ranked[1:], scheme, 0.9, 25.0)
+            assert estimate is not None
+            places = dict(zip(locations, estimate.match_probabilities, strict=True))
+            assert [places[r.location] for r in ranked] == pytest.approx(
+                estimate.match_probabilities
+            ), "photos of one place are equally probable"
+            assert max(places.values()) == estimate.probabilities[0]
+            assert sum(places.values()) + estimate.not_in_map <= 1 + 1e-9
+
+
+def test_a_match_without_a_location_has_its_own_votes_only() -> None:
+    nowhere = PhotoLocation(None, None, None)
+    spots = (label("a/1"), nowhere, nowhere, label("b/1"), label("b/1"))
+    ranked = ranking(*((0.9 - n / 100, spot) for n, spot in enumerate(spots)))
+    estimate = PlaceModel().estimate(ranked, ranked[1:], PATHS, 0.9, 25.0)
+    assert estimate is not None
+    _, one, other, *places = estimate.match_probabilities
+    assert one > other > 0
+    assert places[0] == places[1]
 
 
 def test_the_error_radius_lies_between_the_levels_that_enclose_its_share() -> None:
