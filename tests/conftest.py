@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 # Before NumPy and PyTorch are imported. Tests and the processes that they start share few cores:
@@ -17,10 +17,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 from sqlalchemy.engine import make_url
 
+from services.cli.imports import collection_paused
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
+from tests.support.compiled_statements import share_compiled_statements
 from tests.support.servers import (
     PostgresServer,
     RedisServer,
@@ -48,6 +50,13 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     for each core."""
     waiting = config.getoption("numprocesses") == "auto"
     return (os.cpu_count() or 1) + int(waiting)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Import the test modules without garbage collection: a third of the time that it takes."""
+    with collection_paused():
+        return (yield)
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` reads the markers
@@ -184,7 +193,9 @@ def catalog(catalog_kind: str, request: pytest.FixtureRequest, tmp_path: Path) -
         else:
             spare: SpareDatabases = request.getfixturevalue("spare_databases")
             url = stack.enter_context(spare.one())
-        yield stack.enter_context(contextlib.closing(Catalog(url)))
+        opened = stack.enter_context(contextlib.closing(Catalog(url)))
+        share_compiled_statements(opened.engine)
+        yield opened
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ one request at a time and has no threads, as a fork would copy the locks that th
 from __future__ import annotations
 
 import atexit
-import gc
 import importlib
 import json
 import os
@@ -24,6 +23,7 @@ from typing import Any, cast
 from sqlalchemy.orm import configure_mappers
 
 import services.cli
+from services.cli.imports import collection_paused
 from shared.config.settings import Settings
 
 # Beside the command's own modules: what they import when they run. A module that is missing here is
@@ -164,12 +164,11 @@ def _import() -> None:
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests, which then end this
     listener = socket.socket(fileno=int(sys.argv[1]))
-    _import()
+    with collection_paused():  # which leaves these pages shared with the children's collections
+        _import()
     assert threading.active_count() == 1, threading.enumerate()
     tasks = list(Path("/proc/self/task").iterdir())
     assert len(tasks) == 1, [task.joinpath("comm").read_text() for task in tasks]
-    gc.collect()
-    gc.freeze()  # children's collections leave these pages shared
     request = serve(listener)
     if request is not None:
         run(request)

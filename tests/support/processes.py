@@ -34,6 +34,7 @@ READ_AT_FIRST_USE = frozenset({"CUDA_VISIBLE_DEVICES"})
 ANSWER_BYTES = 1024
 # In Linux's abstract namespace, which needs no file; the same for all workers of pytest-xdist.
 ADDRESS = f"\0placewise-tests-{os.environ.get('PYTEST_XDIST_TESTRUNUID', os.getpid())}"
+FORK_SERVER = (sys.executable, "-m", "tests.support.fork_server")
 LOOK_SECONDS = 0.01
 
 
@@ -167,7 +168,7 @@ class ForkServer:
             listener.bind(ADDRESS)
             listener.listen()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.fork_server", str(listener.fileno())],
+                [*FORK_SERVER, str(listener.fileno())],
                 # OpenBLAS starts its threads at import.
                 env={**environment, "OPENBLAS_NUM_THREADS": "1"},
                 cwd=REPOSITORY,

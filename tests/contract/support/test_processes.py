@@ -90,11 +90,15 @@ def test_what_a_library_may_read_at_its_import_is_executed(tmp_path: Path) -> No
 
 
 def test_it_ends_with_tests_that_are_killed(tmp_path: Path) -> None:
+    # Its imports take 12 CPU seconds, and this server forks once.
+    bare = "from tests.support import fork_server as s; s._import = lambda: None; s.main()"
     script = (
         "import sys, time\n"
         "from pathlib import Path\n"
+        "from tests.support import processes\n"
         "from tests.support.processes import PLACEWISE, start\n"
         "from tests.support.server import environment\n"
+        "processes.FORK_SERVER = (sys.executable, '-c', sys.argv[2])\n"
         "cwd = Path(sys.argv[1])\n"
         "log = (cwd / 'log').open('wb')\n"
         "env = environment(cwd / 'home')\n"
@@ -103,7 +107,7 @@ def test_it_ends_with_tests_that_are_killed(tmp_path: Path) -> None:
         "time.sleep(600)\n"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path)],
+        [sys.executable, "-c", script, str(tmp_path), bare],
         cwd=REPOSITORY,
         env={**os.environ, "PYTEST_XDIST_TESTRUNUID": str(tmp_path)},  # of another run
         stdout=subprocess.PIPE,

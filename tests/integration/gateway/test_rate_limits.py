@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from threading import Barrier, Event
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,6 +31,14 @@ from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import RedisServer, start_redis
+
+
+@pytest.fixture(autouse=True)
+def _one_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No minute ends between two calls, in which a counter of this process begins a new window."""
+    stopped = SimpleNamespace(time=lambda now=time.time(): now)
+    monkeypatch.setattr("limits.storage.memory.time", stopped)
+    monkeypatch.setattr("limits.strategies.time", stopped)
 
 
 @pytest.fixture(params=["in this process", "redis"])

@@ -1,6 +1,6 @@
-"""A process that fits a vocabulary to patches as ViT-S makes them, and says what memory it took:
+"""A process that fits vocabularies to patches as ViT-S makes them, and prints the memory it took:
 
-python -m tests.unit.descriptors.vocabularies.fit_memory PHOTOS
+python -m tests.unit.descriptors.vocabularies.fit_memory PHOTOS...
 """
 
 from __future__ import annotations
@@ -51,30 +51,29 @@ class ManyPatches:
         return 1, PATCHES
 
 
-def main(photos: int) -> None:
+def main(counts: list[int]) -> None:
     torch.set_num_threads(1)
+    before = memory_bytes("VmRSS")
+    print(json.dumps({"before": before, "fits": [fit(photos) for photos in counts]}))
+
+
+def fit(photos: int) -> dict[str, int]:
     config = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
     extractor = Extractor(config, torch.device("cpu"), backbone=ManyPatches())
+    fitted = fit_vocabulary(extractor, batches(photos), photos, clusters=CLUSTERS, seed=0)
+    return {
+        "peak": memory_bytes("VmHWM"),  # of all fits so far
+        "photos": fitted.provenance["photos"],
+        "patches": fitted.provenance["patches"],
+        "clusters": fitted.centres.clusters,
+    }
+
+
+def batches(photos: int) -> Iterator[list[NDArray[np.uint8]]]:
     blank = np.zeros((8, 8, 3), np.uint8)
-
-    def batches() -> Iterator[list[NDArray[np.uint8]]]:
-        for begin in range(0, photos, BATCH_PHOTOS):
-            yield [blank] * min(BATCH_PHOTOS, photos - begin)
-
-    before = memory_bytes("VmRSS")
-    fitted = fit_vocabulary(extractor, batches(), photos, clusters=CLUSTERS, seed=0)
-    print(
-        json.dumps(
-            {
-                "before": before,
-                "peak": memory_bytes("VmHWM"),
-                "photos": fitted.provenance["photos"],
-                "patches": fitted.provenance["patches"],
-                "clusters": fitted.centres.clusters,
-            }
-        )
-    )
+    for begin in range(0, photos, BATCH_PHOTOS):
+        yield [blank] * min(BATCH_PHOTOS, photos - begin)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(list(map(int, sys.argv[1:])))
