@@ -168,20 +168,29 @@ def _format_explanation(explanation: Explanation | None) -> str:
 
 def _summarize_levels(estimate: Estimate) -> str:
     """Why the estimate answers at its level, or does not answer, in one sentence."""
-    required = f"{100 * (estimate.certainty or 0):g} %"
+    certainty = estimate.certainty or 0
+    required = f"{100 * certainty:g} %"
+    # An answer that is finer than the coarsest level also requires odds against "not in this map".
+    is_unsure = any(
+        level.probability >= certainty for level in estimate.levels[: estimate.answer_level]
+    )
     if estimate.answer_level is not None:
         level = estimate.levels[estimate.answer_level]
+        stricter = " Finer levels require stronger evidence that the place is in the map."
         return (
             f"At a certainty of {required}, the finest answer is {_format_level(level)}, "
             f"with a probability of {_format_percent(level.probability)}."
+            f"{stricter if is_unsure else ''}"
         )
     outside = estimate.not_in_map_probability or 0
     if outside > 0.5:
         return f"The map probably has no photo of this place ({_format_percent(outside)})."
     level = estimate.levels[-1]
+    stricter = ", but it requires stronger evidence that the place is in the map"
     return (
         f"No level is certain enough at a certainty of {required}; the most probable is "
-        f"{_format_level(level)}, with {_format_percent(level.probability)}."
+        f"{_format_level(level)}, with {_format_percent(level.probability)}"
+        f"{stricter if is_unsure else ''}."
     )
 
 

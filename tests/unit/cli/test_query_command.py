@@ -90,6 +90,16 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
     assert max(map(len, tables)) <= 80
 
 
+def test_a_finer_level_that_is_as_certain_is_explained(tmp_path: Path) -> None:
+    levels = [{**PLACES[0], "probability": 0.96}, *PLACES[1:]]
+    answered, _ = query(tmp_path, estimate(levels, answer_level=1))
+    assert "Finer levels require stronger evidence" in " ".join(answered.split())
+    unanswered, _ = query(tmp_path, estimate(levels))
+    assert "but it requires stronger evidence" in " ".join(unanswered.split())
+    plain, _ = query(tmp_path, estimate(PLACES, answer_level=1))
+    assert "stronger evidence" not in plain
+
+
 def test_a_long_label_leaves_room_for_the_probability_and_the_bar(tmp_path: Path) -> None:
     level = {"place": "building/" + 12 * "corridor ", "probability": 0.5}
     shown, _ = query(tmp_path, estimate([level]))
