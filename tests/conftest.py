@@ -22,7 +22,6 @@ from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
-from tests.support.compiled_statements import share_compiled_statements
 from tests.support.servers import (
     PostgresServer,
     RedisServer,
@@ -193,9 +192,7 @@ def catalog(catalog_kind: str, request: pytest.FixtureRequest, tmp_path: Path) -
         else:
             spare: SpareDatabases = request.getfixturevalue("spare_databases")
             url = stack.enter_context(spare.one())
-        opened = stack.enter_context(contextlib.closing(Catalog(url)))
-        share_compiled_statements(opened.engine)
-        yield opened
+        yield stack.enter_context(contextlib.closing(Catalog(url)))
 
 
 @pytest.fixture

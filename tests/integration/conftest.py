@@ -24,7 +24,6 @@ from tests.integration.api_with_keys import Door
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_map
-from tests.support.compiled_statements import share_compiled_statements
 
 BATCH_PHOTOS = 4
 
@@ -94,7 +93,6 @@ def service(
 def sqlite_catalog(migrated_sqlite: Path, tmp_path: Path) -> Iterator[Catalog]:
     """An empty catalog for tests of what is the same whatever the database."""
     opened = Catalog(f"sqlite:///{shutil.copy(migrated_sqlite, tmp_path)}")
-    share_compiled_statements(opened.engine)
     yield opened
     opened.close()
 
