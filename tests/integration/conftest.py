@@ -61,14 +61,15 @@ def make_worker(
     settings: Settings,
     decoders: DecoderPool,
     monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Callable[[], ExtractorWorker]]:
-    """Makes extractors, which are closed in the end."""
+) -> Iterator[Callable[..., ExtractorWorker]]:
+    """Makes extractors, which are closed in the end; keywords change their settings."""
     monkeypatch.setattr(worker_module, "DecoderPool", lambda settings: LentDecoders(decoders))
     small = settings.model_copy(update={"batch_photos": BATCH_PHOTOS, "device": "cpu"})
     made: list[ExtractorWorker] = []
 
-    def make() -> ExtractorWorker:
-        made.append(ExtractorWorker(catalog, store, small, f"worker-{len(made)}"))
+    def make(**changes: object) -> ExtractorWorker:
+        own = small.model_copy(update=changes)
+        made.append(ExtractorWorker(catalog, store, own, f"worker-{len(made)}"))
         return made[-1]
 
     yield make

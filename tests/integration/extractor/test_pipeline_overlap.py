@@ -92,13 +92,11 @@ def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
 
 
 def test_leases_of_batches_that_wait_to_be_published_are_extended(
-    averages: Workplace, gate: Gate, make_worker: Callable[[], ExtractorWorker]
+    averages: Workplace, gate: Gate, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(*range(2 * BATCH))
-    worker = make_worker()
     lease = timedelta(seconds=1.5)
-    changes = {"lease_seconds": lease.total_seconds()}
-    worker._settings = worker._settings.model_copy(update=changes)
+    worker = make_worker(lease_seconds=lease.total_seconds())
 
     def leases() -> list[datetime]:
         found = [averages.job_of(photo_id).lease_until for photo_id in photo_ids]
