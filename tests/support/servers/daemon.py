@@ -146,11 +146,13 @@ class Daemon:
 
     def pause(self) -> None:
         for process in self._family():
-            process.suspend()
+            with contextlib.suppress(psutil.NoSuchProcess):  # a child that has ended since
+                process.suspend()
 
     def resume(self) -> None:
         for process in self._family():
-            process.resume()
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.resume()
 
     def cpu_seconds(self) -> float:
         return cpu_seconds_of(self._running().pid)
