@@ -39,7 +39,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.vocabulary import ARRAY_READ_ERRORS
+from shared.descriptors.vocabulary import ARRAY_READ_ERRORS, decode_array
+from shared.errors import Unprocessable
 
 FLOAT16 = np.dtype("<f2")
 
@@ -83,8 +84,8 @@ class LocalFeatures:
     def decode(cls, data: bytes, width: int) -> LocalFeatures:
         """Decode the result of `encode`; ValueError if it is malformed or D is not `width`."""
         try:
-            array = np.load(io.BytesIO(data), allow_pickle=False)
-        except ARRAY_READ_ERRORS as error:
+            array = decode_array(data)
+        except (*ARRAY_READ_ERRORS, Unprocessable) as error:
             raise ValueError(f"not a NumPy array: {error}") from error
         if array.dtype != FLOAT16 or array.ndim != 3 or array.shape[2] != width or not array.size:
             raise ValueError(

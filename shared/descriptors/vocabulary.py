@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
+from shared.storage.chunks import read_npy_header
 
 # Raised by NumPy for bytes that are not an array, or whose header declares an impossible one.
 ARRAY_READ_ERRORS = (
@@ -122,20 +123,11 @@ def decode_array(data: bytes) -> NDArray[Any]:
     Raises one of ARRAY_READ_ERRORS for other bytes, and Unprocessable (`vocabulary_unfit`) for
     pickled objects.
     """
-    _check_array_size(data)
-    array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    return array
-
-
-def _check_array_size(data: bytes) -> None:
-    """Raise ValueError if a `.npy` header declares another size than the data has."""
-    buffer = io.BytesIO(data)
-    major, _ = np.lib.format.read_magic(buffer)
-    read_header = (
-        np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = read_header(buffer)
+    file = io.BytesIO(data)
+    shape, fortran_order, dtype = read_npy_header(file)
     if dtype.hasobject:
         raise Unprocessable("vocabulary_unfit", "This file holds pickled objects, not numbers.")
-    if math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
+    if math.prod(shape) * dtype.itemsize != len(data) - file.tell():
         raise ValueError("the header does not match the size of the data")
+    values = np.frombuffer(data, dtype, offset=file.tell())
+    return values.reshape(shape, order="F" if fortran_order else "C").copy()

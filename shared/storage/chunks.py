@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 import mmap
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -42,6 +43,10 @@ NORM_TOLERANCE = 1e-3
 CORRUPT = "chunk_corrupt"
 
 HEADER_READ_BYTES = 1024  # enough for the header: NumPy writes 128 bytes
+
+# NumPy parses the header as a Python literal. Python before 3.11.8 may raise SystemError if two
+# threads do so at once: https://github.com/python/cpython/issues/106905
+_HEADER_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +91,24 @@ def decode_rows(data: bytes | mmap.mmap) -> StoredRows:
 def _read_header(data: bytes) -> tuple[tuple[int, int], np.dtype[Any], int]:
     """Return (rows, dimension), dtype and offset of the rows; ValueError for another file."""
     buffer = io.BytesIO(data)
-    major, _ = np.lib.format.read_magic(buffer)
-    read_header = {
-        1: np.lib.format.read_array_header_1_0,
-        2: np.lib.format.read_array_header_2_0,
-    }[major]
-    shape, fortran_order, dtype = read_header(buffer)
+    shape, fortran_order, dtype = read_npy_header(buffer)
     if dtype not in ROW_DTYPES or fortran_order or len(shape) != 2:
         raise ValueError(f"not a chunk: {dtype}, shape {shape}, fortran_order={fortran_order}")
     return shape, dtype, buffer.tell()
+
+
+def read_npy_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read (shape, fortran_order, dtype) of a `.npy` file, up to its data; any thread may.
+
+    Raises ValueError for another file.
+    """
+    version = np.lib.format.read_magic(file)
+    with _HEADER_LOCK:
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(file)
+        if version == (2, 0):
+            return np.lib.format.read_array_header_2_0(file)
+    raise ValueError(f"the version {version} of its format is unknown")
 
 
 def write_chunk(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 from uuid import UUID
@@ -246,6 +248,25 @@ def test_a_row_of_a_damaged_object_is_not_made_up(store: FolderStore, damage: st
         read_row(store, chunk.object_key, 4)
     with pytest.raises(NotFound):
         read_row(store, "chunks/no/such.npy", 0)
+
+
+def test_headers_are_parsed_by_one_thread_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    parse, parsing, most = np.lib.format.read_array_header_1_0, set[int](), 0
+
+    def parse_slowly(file: BinaryIO) -> Any:
+        nonlocal most
+        parsing.add(id(file))
+        most = max(most, len(parsing))
+        time.sleep(0.01)
+        parsing.remove(id(file))
+        return parse(file)
+
+    monkeypatch.setattr(np.lib.format, "read_array_header_1_0", parse_slowly)
+    rows = some_rows()
+    with ThreadPoolExecutor(4) as threads:
+        for decoded in threads.map(decode_rows, [encode_rows(rows)] * 8):
+            np.testing.assert_array_equal(decoded, rows)
+    assert most == 1
 
 
 def test_row_is_whole_with_the_length_of_a_descriptor_and_damaged_with_any_other() -> None:

@@ -31,5 +31,6 @@ def test_a_fit_on_two_thousand_photos_takes_no_more_memory_than_one_on_five_hund
     assert few["patches"] == 500 * PATCHES, "all of them"
     assert many["patches"] > 150_000, "a share of each photo's"
     assert many["peak"] < 2_000_000_000
-    assert many["peak"] - few["peak"] < 50_000_000
+    # The features of 1,500 more photos are 590 MB. Two equal fits may differ by 40 MB.
+    assert many["peak"] - few["peak"] < 100_000_000
     assert many["peak"] - body["before"] < 200_000_000 < ALL_FEATURES_BYTES / 3
