@@ -400,6 +400,8 @@ class Search(Answer):
     results: int
     best_score: float | None
     in_map: bool | None
+    answer_level: int | None = None
+    not_in_map_probability: float | None = None
     processing_time_ms: float
     searched_at: datetime
 

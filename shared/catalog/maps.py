@@ -194,6 +194,9 @@ class Search(Base):
     processing_ms: Mapped[float] = mapped_column(sa.Float)
     best_score: Mapped[float | None] = mapped_column(sa.Float)
     in_map: Mapped[bool | None] = mapped_column(sa.Boolean)
+    answer_level: Mapped[int | None] = mapped_column(sa.Integer)
+    not_in_map_probability: Mapped[float | None] = mapped_column(sa.Float)
+    """null if the estimate had no levels"""
     searched_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     __table_args__ = (

@@ -172,6 +172,7 @@ def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
 ) -> None:
     found = town.ask(town.queries[0]) | {"similar_images": [], "vocabulary": "foreign"}
     found["estimate"] |= {"levels": [], "in_map": None, "latitude": None, "place": None}
+    found["estimate"] |= {"answer_level": None, "not_in_map_probability": None}
     visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
     page = ask(visitor, town.queries[0])
     expect(page.get_by_role("heading", name="No photo found")).to_be_visible()
@@ -183,6 +184,8 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     nowhere: dict[str, Any] = {
         "in_map": None,
         "levels": [],
+        "answer_level": None,
+        "not_in_map_probability": None,
         "latitude": None,
         "longitude": None,
         "place": None,

@@ -81,6 +81,29 @@ def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, to
     expect(page.locator("time").first).to_contain_text(re.compile("just now|ago"))
 
 
+def test_a_question_in_the_history_has_the_title_of_its_answer(
+    visitor: Visitor, town: Town
+) -> None:
+    town.ask(town.queries[0])
+    entry = town.get("/searches?limit=1")["searches"][0]
+    titles = {
+        (True, None, None): "In this map",
+        (False, None, None): "Not in this map",
+        (None, None, None): "No estimate",
+        (False, 1, 0.02): "In this map",
+        (True, None, 0.7): "Not in this map",
+        (True, None, 0.3): "Best guess",
+    }
+    fields = ("in_map", "answer_level", "not_in_map_probability")
+    searches = [entry | dict(zip(fields, values, strict=True)) for values in titles]
+    visitor.page.route(
+        "**/api/v1/searches?*",
+        lambda route: route.fulfill(json={"searches": searches, "next_cursor": None}),
+    )
+    history = visitor.visit("status").get_by_role("group", name="Newest questions")
+    expect(history.locator("tbody .chip")).to_have_text(list(titles.values()))
+
+
 def test_a_phone_gets_the_address_as_a_code_where_it_can_reach_the_server(
     visitor: Visitor,
 ) -> None:

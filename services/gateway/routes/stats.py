@@ -32,6 +32,10 @@ class SearchHistoryEntry(ResponseModel):
     results: int
     best_score: float | None
     in_map: bool | None = Field(description="`estimate.in_map` of the response")
+    answer_level: int | None = Field(description="`estimate.answer_level` of the response")
+    not_in_map_probability: float | None = Field(
+        description="`estimate.not_in_map_probability` of the response; null if it had no levels"
+    )
     processing_time_ms: float = Field(validation_alias="processing_ms")
     searched_at: datetime
 

@@ -295,6 +295,8 @@ def run_similarity_search(
         processing_ms=elapsed_ms,
         best_score=hits[0].score if hits else None,
         in_map=estimate.in_map,
+        answer_level=estimate.answer_level,
+        not_in_map_probability=estimate.not_in_map_probability,
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
     return SimilarityResult(

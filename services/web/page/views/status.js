@@ -5,6 +5,7 @@ import { button, fill, h, time } from "../dom.js";
 import { bytes, count, duration, score } from "../format.js";
 import { stateInWords } from "../jobs.js";
 import { serverSettings } from "../settings.js";
+import { judge } from "./verdict.js";
 
 const LOOK_SECONDS = 5;
 
@@ -82,19 +83,20 @@ function drawJobs(card, jobs, look) {
         ["queued", "running"].includes(job.state) && button("Cancel", () => post(`/jobs/${job.job_id}/cancel`).then(look)))))))));
 }
 
+const TONES = { known: "own", unknown: "foreign", open: "" };
+
 function drawSearches(card, searches) {
   if (!searches.length) {
     fill(card, h("h2", {}, "Questions"), h("p", { class: "soft" }, "None yet. ", h("a", { href: "#/ask" }, "Ask with a photo"), "."));
     return;
   }
-  const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number wide-only" }, "Similarity"), h("th", { scope: "col", class: "number wide-only" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
-      const [words, tone] = verdict[one.in_map] ?? ["No estimate", ""];
+      const [kind, title] = judge(one);
       return h("tr", {},
         h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
-        h("td", {}, h("span", { class: `chip ${tone}` }, words)),
+        h("td", {}, h("span", { class: `chip ${TONES[kind]}` }, title)),
         h("td", { class: "number wide-only" }, one.best_score === null ? "–" : score(one.best_score)),
         h("td", { class: "number wide-only" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, time(one.searched_at)));
     })))));

@@ -43,10 +43,11 @@ export function drawRings(map, estimate) {
   }
 }
 
-/** The style and the title of the card. */
-function judge({ levels, answer_level: answer, not_in_map_probability: outside, in_map: accepted, latitude, place }) {
-  if (levels.length ? answer !== null : accepted) return ["known", "In this map"];
-  return (levels.length ? outside > 0.5 : accepted === false) ? ["unknown", "Not in this map"] : ["open", levels.length || latitude !== null || place ? "Best guess" : "No estimate"];
+/** The style and the title of an estimate, or of an entry of the search history. Without levels there is no probability of “not in this map”. */
+export function judge({ answer_level: answer, not_in_map_probability: outside, in_map: accepted, latitude = null, place = null }) {
+  const hasLevels = outside !== null;
+  if (hasLevels ? answer !== null : accepted) return ["known", "In this map"];
+  return (hasLevels ? outside > 0.5 : accepted === false) ? ["unknown", "Not in this map"] : ["open", hasLevels || latitude !== null || place ? "Best guess" : "No estimate"];
 }
 
 /** The estimated place. Its error is the widest ring of the map that is known, so that both agree. */
