@@ -82,6 +82,11 @@ def printable_path(path: Path) -> str:
     return os.fsencode(path).decode("utf-8", "replace")
 
 
+def format_percent(share: float | None) -> str:
+    """Return a share with one decimal, such as `55.3 %`; a dash for None."""
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; answers of the server as the server sent them."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json")))

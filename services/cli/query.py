@@ -18,6 +18,7 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    format_percent,
     print_json,
     print_message,
     print_table,
@@ -130,7 +131,7 @@ def query(
         table.add_row(
             str(rank),
             f"{match.similarity_score:.4f}",
-            *([_format_percent(match.match_probability)] if levels else []),
+            *([format_percent(match.match_probability)] if levels else []),
             *([_format_score(match.weighted_score)] if weighted else []),
             *([_format_score(match.rerank_score)] if rerank else []),
             escape(match.relative_path or match.original_filename),
@@ -179,17 +180,17 @@ def _summarize_levels(estimate: Estimate) -> str:
         stricter = " Finer levels require stronger evidence that the place is in the map."
         return (
             f"At a certainty of {required}, the finest answer is {_format_level(level)}, "
-            f"with a probability of {_format_percent(level.probability)}."
+            f"with a probability of {format_percent(level.probability)}."
             f"{stricter if is_unsure else ''}"
         )
     outside = estimate.not_in_map_probability or 0
     if outside > 0.5:
-        return f"The map probably has no photo of this place ({_format_percent(outside)})."
+        return f"The map probably has no photo of this place ({format_percent(outside)})."
     level = estimate.levels[-1]
     stricter = ", but it requires stronger evidence that the place is in the map"
     return (
         f"No level is certain enough at a certainty of {required}; the most probable is "
-        f"{_format_level(level)}, with {_format_percent(level.probability)}"
+        f"{_format_level(level)}, with {format_percent(level.probability)}"
         f"{stricter if is_unsure else ''}."
     )
 
@@ -209,11 +210,11 @@ def _levels_table(estimate: Estimate) -> Table:
     for level in estimate.levels:
         name = level.place or f"within {_format_m(level.radius_m or 0)}"
         table.add_row(
-            escape(name), _format_percent(level.probability), _probability_bar(level.probability)
+            escape(name), format_percent(level.probability), _probability_bar(level.probability)
         )
     outside = estimate.not_in_map_probability
     table.add_section()
-    table.add_row("not in this map", _format_percent(outside), _probability_bar(outside or 0))
+    table.add_row("not in this map", format_percent(outside), _probability_bar(outside or 0))
     return table
 
 
@@ -236,10 +237,6 @@ def _format_level(level: EstimateLevel) -> str:
 
 def _format_m(length_m: float) -> str:
     return f"{length_m:.0f} m" if length_m < 999.5 else f"{round(length_m / 1000, 1):g} km"
-
-
-def _format_percent(probability: float | None) -> str:
-    return "" if probability is None else f"{100 * probability:.1f} %"
 
 
 def _format_estimate(estimate: Estimate) -> str:

@@ -15,6 +15,7 @@ from services.cli.output import (
     Json,
     JsonOption,
     Table,
+    format_percent,
     print_json,
     print_message,
     print_table,
@@ -129,9 +130,9 @@ def _print_figures(figures: Json) -> None:
     for baseline in figures["ladder"]:
         table.add_row(
             baseline["rung"],
-            *(_format_percent(baseline["recall"][str(k)]) for k in BASELINE_KS),
+            *(format_percent(baseline["recall"][str(k)]) for k in BASELINE_KS),
             *(
-                _format_percent(baseline[f"recall_{kind}"]["1"])
+                format_percent(baseline[f"recall_{kind}"]["1"])
                 if baseline[f"recall_{kind}"]
                 else "-"
                 for kind in ("in_map", "other_way")
@@ -143,10 +144,6 @@ def _print_figures(figures: Json) -> None:
         f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m."
     )
     print_message(NOT_COMPARABLE)
-
-
-def _format_percent(share: float) -> str:
-    return f"{share:.1%}"
 
 
 def _city_summary(plan: CityPlan, out: Path, seconds: float) -> Json:

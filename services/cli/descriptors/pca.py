@@ -15,6 +15,7 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
+    format_percent,
     print_failures,
     print_result,
     progress_bar,
@@ -130,6 +131,6 @@ def _print_generation(job: Job, as_json: bool) -> None:
 
 def _format_pca(pca: Json) -> str:
     return (
-        f"{pca['dimension']} of {pca['from_dimension']} dimensions with {pca['explained']:.1%} of "
-        f"the variance of {pca['rows']} rows"
+        f"{pca['dimension']} of {pca['from_dimension']} dimensions with "
+        f"{format_percent(pca['explained'])} of the variance of {pca['rows']} rows"
     )

@@ -11,7 +11,15 @@ from rich.table import Column
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import Json, Table, print_json, print_message, print_table, progress_bar
+from services.cli.output import (
+    Json,
+    Table,
+    format_percent,
+    print_json,
+    print_message,
+    print_table,
+    progress_bar,
+)
 from shared.errors import Conflict
 from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
@@ -85,7 +93,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
                 vocabularies.get(evaluation.generation_id, ""),
                 str(evaluation.searchable),
                 f"{recall['queries']} {kind}",
-                *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
+                *(format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     print_table(table)
     figures = evaluations[0].figures
@@ -130,14 +138,14 @@ def answers_table(places: Json) -> Table:
                 for key in ("answered", "answered_at_finest_level", "precision")
             ),
             "-" if mean_level is None else f"{mean_level:.2f}",
-            _format_percent(answers[others[1]]),
+            format_percent(answers[others[1]]),
         )
     return table
 
 
 def _format_share(figure: Json) -> str:
     """Format a share with its 95 % interval, if it has one."""
-    text = _format_percent(figure["mean"])
+    text = format_percent(figure["mean"])
     if figure["interval"] is None:
         return text
     low, high = figure["interval"]
@@ -169,19 +177,15 @@ def _estimate_lines(figures: Json) -> list[str]:
             "first match."
         )
     lines.append(
-        f"{_format_percent(labelled['accepted_in_map'])} of the {labelled['queries']} queries in "
-        f"the map and {_format_percent(labelled['false_accepts'])} of the "
+        f"{format_percent(labelled['accepted_in_map'])} of the {labelled['queries']} queries in "
+        f"the map and {format_percent(labelled['false_accepts'])} of the "
         f"{labelled['out_of_map']} queries outside it are accepted. "
-        f"{_format_percent(labelled['right_of_accepted'])} of the accepted queries are correct."
+        f"{format_percent(labelled['right_of_accepted'])} of the accepted queries are correct."
     )
     if labelled["auroc"] is not None:
         lines.append(
             f"Confidence ({estimate['calibration']}, cross-validated): expected calibration error "
             f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
-            f"precision {_format_percent(labelled['recall_at_99_precision'])}."
+            f"precision {format_percent(labelled['recall_at_99_precision'])}."
         )
     return lines
-
-
-def _format_percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"

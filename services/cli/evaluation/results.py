@@ -18,6 +18,7 @@ from services.cli.evaluation.live_map import answers_table
 from services.cli.output import (
     Json,
     Table,
+    format_percent,
     print_json,
     print_message,
     print_table,
@@ -203,8 +204,8 @@ def _format_share(
     if math.isnan(share):  # no query to average over
         return "-"
     if intervals is None:
-        return f"{100 * share:.1f} %"
-    return f"{100 * share:.1f} % ({intervals[position].as_percent()})"
+        return format_percent(share)
+    return f"{format_percent(share)} ({intervals[position].as_percent()})"
 
 
 PREDICTIONS_PROTOCOL = "predictions file"

@@ -15,6 +15,7 @@ from services.cli.evaluation.data_sets import EvaluationTarget, make_describer
 from services.cli.output import (
     Json,
     Table,
+    format_percent,
     print_json,
     print_message,
     print_table,
@@ -143,26 +144,22 @@ def _print_figures(name: str, figures: Json) -> None:
     )
     for key, title in METHODS.items():
         precise = figures["recall_at_99_precision"].get(key)
-        table.add_row(title, _percent(figures["recall"][key]), _percent(precise))
+        table.add_row(title, format_percent(figures["recall"][key]), format_percent(precise))
     print_table(table)
     print_message(
-        f"Tracking {_percent(figures['tracking'])} of the frames in the map, of which "
-        f"{_percent(figures['tracking_precision'])} are right; calibration error (ECE) "
+        f"Tracking {format_percent(figures['tracking'])} of the frames in the map, of which "
+        f"{format_percent(figures['tracking_precision'])} are right; calibration error (ECE) "
         f"{figures['calibration_error']:.3f}. Frames to localise: "
         f"{_frame_counts(figures['frames_to_localise'])}; to notice that the map was left: "
         f"{_frame_counts(figures['frames_to_notice_lost'])}; claimed to be tracked outside: "
-        f"{_percent(figures['claimed_outside'])}."
+        f"{format_percent(figures['claimed_outside'])}."
     )
     if "kidnapped" in figures:
         print_message(
             f"Carried away {figures['kidnapped']} times: "
-            f"{_percent(figures['found_within_40_frames'])} are found again within 40 frames; "
-            f"frames: {_frame_counts(figures['frames_until_found'])}."
+            f"{format_percent(figures['found_within_40_frames'])} are found again within "
+            f"40 frames; frames: {_frame_counts(figures['frames_until_found'])}."
         )
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{share:.1%}"
 
 
 def _frame_counts(counts: list[int | None]) -> str:

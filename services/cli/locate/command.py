@@ -28,6 +28,7 @@ from services.cli.output import (
     ServerOption,
     Table,
     err_console,
+    format_percent,
     print_json,
     print_message,
     print_note,
@@ -329,7 +330,7 @@ def _print_proposals(
             f"{found.longitude:.6f}" if found else "",
             *([escape(each.place or "")] if any(each.place for each in located) else []),
             f"{found.radius_m:.0f} m" if found else "",
-            f"{100 * each.probability:.1f} %" if found or each.place else "",
+            format_percent(each.probability) if found or each.place else "",
             escape(each.error or (found.reason if found else "nothing is known about its place")),
             style=None if each in accepted else "dim",
         )

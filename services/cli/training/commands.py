@@ -31,6 +31,7 @@ from services.cli.output import (
     Table,
     console,
     err_console,
+    format_percent,
     print_json,
     print_message,
     print_note,
@@ -111,7 +112,7 @@ def _print_summary(report: Json) -> None:
             table.add_row(
                 escape(name),
                 stage,
-                *(f"{recall[k]:.1%}" if recall.get(k) is not None else "-" for k in SHOWN_KS),
+                *(format_percent(recall.get(k)) for k in SHOWN_KS),
                 str(set_info["queries"]),
                 f"{set_info['fingerprint'][:12]} {set_info['protocol']}, {set_info['rule']}",
             )
@@ -123,7 +124,7 @@ def _print_summary(report: Json) -> None:
     if "images" in report and report["images_per_second"]:
         print_message(
             f"Trained on {report['images']} photos ({report['images_per_second']:.1f}/s; "
-            f"{report['share_waiting_for_data']:.1%} of the time waiting for data). "
+            f"{format_percent(report['share_waiting_for_data'])} of the time waiting for data). "
             f"{len(report['bad_photos'])} photos could not be decoded."
         )
     console.print("Next:", *(f"  {line}" for line in report["next"]), sep="\n", markup=False,

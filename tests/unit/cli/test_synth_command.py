@@ -44,5 +44,5 @@ def test_ladder_is_shown_with_the_line_that_it_is_not_comparable(
     arguments = ["synth", str(tmp_path / "out"), "--places", "1", "--queries", "2"]
     result = CliRunner().invoke(app, [*arguments, "--size", "64x64"])
     assert result.exit_code == 0, result.output
-    for part in ("average colour", "25.0%", "75.0%", "25 m", NOT_COMPARABLE):
+    for part in ("average colour", "25.0 %", "75.0 %", "25 m", NOT_COMPARABLE):
         assert part in result.output
