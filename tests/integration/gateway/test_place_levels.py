@@ -82,6 +82,9 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     assert (estimate["radius_68_m"], estimate["radius_95_m"]) == (None, None)
     assert estimate["place"] == "tower/7/lift"
     assert answer["similar_images"][0]["match_probability"] == probabilities[0]
+    (entry,) = tower.json("GET", "/searches", params={"map": "tower"})["searches"]
+    for field in ("in_map", "answer_level", "not_in_map_probability"):
+        assert entry[field] == estimate[field]
     assert ask(tower, 0, "tower")["estimate"]["certainty"] == 0.95
     assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
 
