@@ -12,6 +12,7 @@ import pytest
 from services.extractor import worker as worker_module
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.worker import ExtractorWorker
+from services.steward.tasks import reindex_jobs
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
@@ -110,8 +111,11 @@ def workplace_of(
     store: FolderStore,
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], Workplace]:
     """Makes a map with the extractor of that name; each call another map."""
+    # One call of `advance` queues all photos, however slow the machine is.
+    monkeypatch.setattr(reindex_jobs, "SLICE_SECONDS", 60.0)
 
     def make(extractor: str) -> Workplace:
         name = f"map-{UUID(int=len(made))}"

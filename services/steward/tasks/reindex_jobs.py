@@ -43,9 +43,10 @@ QueuedChunks = dict[UUID, set[UUID]]
 def queue_missing_photos(
     catalog: Catalog, job: Job, generation: Generation, queued_chunks: set[UUID]
 ) -> tuple[int, bool]:
-    """Queue a reindex job for each photo without one, for up to SLICE_SECONDS.
+    """Queue a reindex job for each photo without one, for about SLICE_SECONDS.
 
-    Adds the chunks of the active generation whose photos are all queued to `queued_chunks`.
+    Every call reaches one more chunk, however slow the catalog is. Adds the chunks of the active
+    generation whose photos are all queued to `queued_chunks`.
 
     Returns:
         The number of queued jobs, and whether every chunk was reached.
@@ -56,11 +57,11 @@ def queue_missing_photos(
         chunk_ids = _active_chunk_ids(session, generation.map_id)
     queued_chunks &= chunk_ids
     for chunk_id in sorted(chunk_ids - queued_chunks):
-        if time.monotonic() > deadline:
-            return queued, False
         queued += _queue_photos(catalog, job, generation, _photos_of_chunk(chunk_id))
         queued_chunks.add(chunk_id)
-    return queued, True
+        if time.monotonic() > deadline:
+            break
+    return queued, chunk_ids == queued_chunks
 
 
 def _queue_photos(

@@ -262,6 +262,25 @@ def test_a_photo_that_is_being_described_at_the_switch_ends_up_in_the_new_genera
     assert fitted.job_of(late).attempts == 0
 
 
+def test_each_run_queues_another_chunk_however_little_time_it_has(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reindex_jobs, "SLICE_SECONDS", -1.0)
+    fitted.upload(101)
+    fitted.drain()
+    with fitted.catalog.read() as session:
+        chunks = len(list_live_chunks(session, fitted.active().id))
+    assert chunks > 1
+    job_id, new = fitted.build(seed=1)
+    queued = []
+    for _ in range(chunks):
+        fitted.advance()
+        queued.append(len(fitted.reindex_jobs(new)))
+    assert sorted(set(queued)) == queued, "each run queues more"
+    assert queued[-1] == PHOTOS + 1
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+
+
 def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
     job_id, new = fitted.build(seed=1)
     before, after, *rest = photo_ids(fitted)
