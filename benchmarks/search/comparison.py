@@ -92,7 +92,6 @@ class MethodComparison:
     photos: int
     dimension: int
     rows: list[MethodTiming]
-    read_bytes_per_second: float
     grown_bytes: int
     """Private memory that loading the map took."""
     certificates: list[str]
@@ -217,7 +216,6 @@ def compare_methods(
             photos=photos,
             dimension=world.dimension,
             rows=rows,
-            read_bytes_per_second=speed.bytes_per_second,
             grown_bytes=grown,
             certificates=sorted(ours.certificates),
             took=took,
