@@ -78,7 +78,7 @@ class Sizing:
         for width in WIDTHS:
             plans = [self.evaluate(photos, width)[0] for photos in PHOTOS]
             found[f"plan-{width}"] = [
-                ["", *(f"{photos:,} photos" for photos in PHOTOS)],
+                ["number", *(f"{photos:,} photos" for photos in PHOTOS)],
                 *(
                     [f"`{name}`", *(format_amount(plan[name], unit) for plan in plans)]
                     for name, unit, _ in self._formulas
@@ -104,11 +104,12 @@ class Sizing:
         return page
 
     def terminal_tables(self) -> list[Table]:
+        """Return the computed tables without the page's backticks."""
         found = []
         for name, (head, *rows) in self.tables().items():
             found.append(Table(*head, title=name))
             for row in rows:
-                found[-1].add_row(*row)
+                found[-1].add_row(*(cell.replace("`", "") for cell in row))
         return found
 
     def as_json(self) -> dict[str, Any]:

@@ -116,6 +116,13 @@ def test_page_is_computed_from_its_own_inputs_only(tmp_path: Path) -> None:
     assert page.read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")
 
 
+def test_each_number_has_its_name() -> None:
+    ended = runner.invoke(app, ["bench", "scale", "--set", "photo_bytes=1000"])
+    assert ended.exit_code == 0
+    assert "originals\t10 MB\t1 GB\t100 GB\n" in ended.output
+    assert "the codes exceed one machine's memory\t" in ended.output
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
 def test_an_input_is_a_positive_number(value: str) -> None:
     with pytest.raises(Misconfigured, match="above 0"):
