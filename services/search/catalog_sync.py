@@ -25,6 +25,7 @@ from services.search.chunk_loader import (
     hold_in_memory,
     memory_parts,
 )
+from services.search.dense_scan import compile_kernel
 from services.search.photo_columns import PhotoColumns
 from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
@@ -124,6 +125,8 @@ def sync_snapshot(
     large = sum(chunk.rows.nbytes for chunk in loaded) >= MIN_CODED_BYTES
     if large or (old is not None and (old.has_sign_codes or old.has_int8_codes)):
         loaded = _with_codes(loader, loaded)
+    else:
+        compile_kernel(loaded)
     loader.evict_except(loaded)
     return _apply_memory_budget(
         memory_budget,

@@ -14,6 +14,10 @@ from services.search.chunk_loader import LoadedChunk
 # 4e-7): candidates this close to the k-th score are scored again in float64 before ranking.
 FLOAT32_MARGIN = 1e-5
 
+# NumPy converts as many float16 numbers in 2 ms, but ten times as slowly as it multiplies. More are
+# multiplied by a compiled kernel, whose import takes a second.
+NUMPY_FLOAT16_NUMBERS = 1_000_000
+
 # Selecting rows copies them, which pays up to this share of a chunk; beyond, all are multiplied.
 GATHER_SHARE = 0.25
 
@@ -66,28 +70,43 @@ def _float32_scores(
 ) -> tuple[RowNumbers, NDArray[Any]]:
     """Return the selected row numbers, and their cosines, whose error is that of float32."""
     unit = _normalize(query).astype(np.float32)
+    use_kernel = int(np.count_nonzero(row_mask)) * len(unit) > NUMPY_FLOAT16_NUMBERS
     scores: list[NDArray[Any]] = []
     numbers: list[RowNumbers] = []
     first = 0
     for chunk in chunks:
         rows = np.flatnonzero(row_mask[first : first + len(chunk.rows)])
         if len(rows):
-            scores.append(_multiply(chunk, rows, unit))
+            scores.append(_multiply(chunk, rows, unit, use_kernel))
             numbers.append(rows + first)
         first += len(chunk.rows)
     return np.concatenate(numbers), np.concatenate(scores)
 
 
-def _multiply(chunk: LoadedChunk, rows: RowNumbers, unit: QueryRow) -> NDArray[Any]:
+def _multiply(
+    chunk: LoadedChunk, rows: RowNumbers, unit: QueryRow, use_kernel: bool
+) -> NDArray[Any]:
     """Return the products of the given rows of a chunk with the query, float32 or float64."""
-    if chunk.rows.dtype == np.float16:  # NumPy takes ten times as long to convert as to multiply
-        from services.search.exact_rerank import RowBlocks  # importing numba is slow
-
-        products = np.empty(len(rows))
-        RowBlocks.of([chunk]).multiply(rows, unit, products)
-        return products
+    if chunk.rows.dtype == np.float16:
+        return _kernel_products(chunk, rows, unit) if use_kernel else chunk.rows[rows] @ unit
     gather = len(rows) <= GATHER_SHARE * len(chunk.rows)
     return chunk.rows[rows] @ unit if gather else (chunk.rows @ unit)[rows]
+
+
+def _kernel_products(chunk: LoadedChunk, rows: RowNumbers, unit: QueryRow) -> Scores:
+    from services.search.exact_rerank import RowBlocks  # importing numba is slow
+
+    products = np.empty(len(rows))
+    RowBlocks.of([chunk]).multiply(rows, unit, products)
+    return products
+
+
+def compile_kernel(chunks: Sequence[LoadedChunk]) -> None:
+    """Compile what scans of these chunks use, so that no query waits for it."""
+    float16 = [chunk for chunk in chunks if chunk.rows.dtype == np.float16]
+    if sum(chunk.rows.size for chunk in float16) > NUMPY_FLOAT16_NUMBERS:
+        unit = np.ones(float16[0].rows.shape[1], np.float32)
+        _kernel_products(float16[0], np.zeros(1, np.int64), unit)
 
 
 def _normalize(query: QueryRow) -> Scores:

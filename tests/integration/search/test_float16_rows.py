@@ -102,7 +102,8 @@ def test_exported_descriptors_are_the_stored_rows_in_float32(service: Service) -
 def test_an_old_map_keeps_its_rows_until_its_next_generation(
     service: Service, catalog: Catalog
 ) -> None:
-    service.json("POST", "/maps", 201, json={"name": "half", "extractor": "test-tiny-avg"})
+    body = {"name": "half", "extractor": "test-tiny-avg", "rows": "float32"}
+    service.json("POST", "/maps", 201, json=body)
     photos = service.indexed(1, 2, 3, map_name="half")
     changed = service.json("PATCH", "/maps/half", json={"rows": "float16"})
     assert changed["rows"] == "float16"
@@ -121,7 +122,8 @@ def test_an_old_map_keeps_its_rows_until_its_next_generation(
 def test_rows_are_rounded_without_their_photos_and_described_again_for_more_precision(
     service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service.json("POST", "/maps", 201, json={"name": "half", "extractor": "test-tiny-avg"})
+    body = {"name": "half", "extractor": "test-tiny-avg", "rows": "float32"}
+    service.json("POST", "/maps", 201, json=body)
     photos = service.indexed(1, 2, 3, map_name="half")
     full = rows_of(service)
     service.json("PATCH", "/maps/half", json={"rows": "float16"})

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from services.search import dense_scan
 from services.search.chunk_loader import LoadedChunk
 from services.search.dense_scan import FLOAT32_MARGIN
 from services.search.exact_rerank import RowBlocks
@@ -114,6 +115,7 @@ def ask(
     duplicates=st.integers(0, 20),
     nearly=st.booleans(),
     row_type=st.sampled_from([np.float32, np.float16]),
+    numpy_numbers=st.sampled_from([0, dense_scan.NUMPY_FLOAT16_NUMBERS]),
     data=st.data(),
 )
 def test_answers_equal_brute_force_with_order_and_ties(
@@ -125,6 +127,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
     duplicates: int,
     nearly: bool,
     row_type: Any,
+    numpy_numbers: int,
     data: st.DataObject,
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -142,12 +145,41 @@ def test_answers_equal_brute_force_with_order_and_ties(
     stored: StoredRows = rows.astype(row_type)
     chunks = split(stored, pieces, numbers, dead)
     exact = dict(brute_force(stored, numbers, query, count, dead))
-    found = ask(chunks, query, SearchOptions(k))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dense_scan, "NUMPY_FLOAT16_NUMBERS", numpy_numbers)
+        found = ask(chunks, query, SearchOptions(k))
     assert_best([(hit.photo_id, hit.score) for hit in found.hits], exact, k)
     assert found.certificate == "exhaustive"
     assert found.certified_k == len(found.hits)
     assert found.rows_scanned == count - len(dead)
     assert len(found.hits) <= found.rows_reranked <= found.rows_scanned
+
+
+def test_the_kernel_is_compiled_in_advance_exactly_for_maps_that_use_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    products = dense_scan._kernel_products
+    used: list[int] = []
+
+    def record(chunk: LoadedChunk, rows: NDArray[np.int64], unit: Rows) -> Any:
+        used.append(len(rows))
+        return products(chunk, rows, unit)
+
+    monkeypatch.setattr(dense_scan, "_kernel_products", record)
+    rows = unit_rows(6, 80, 14_336)
+    cases: list[tuple[StoredRows, bool]] = [
+        (rows.astype(np.float16), True),
+        (rows[:60].astype(np.float16), False),
+        (rows, False),
+    ]
+    for stored, uses in cases:
+        used.clear()
+        count = len(stored)
+        chunks = [chunk_of(stored, list(range(count)))]
+        dense_scan.compile_kernel(chunks)
+        assert used == [1] * uses
+        ask(chunks, rows[0], SearchOptions(5))
+        assert used == [1, count] * uses
 
 
 def test_chunks_of_both_types_are_searched_as_one_map() -> None:
