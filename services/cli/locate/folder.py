@@ -41,7 +41,7 @@ def read_folder(
         InvalidRequest: `no_photos`, `bad_time_zone`.
     """
     zone = _parse_time_zone(time_zone) if time_zone else None
-    photos = [_read_photo(folder, path, zone) for path in list_photos(folder)]
+    photos = [read_photo(folder, path, zone) for path in list_photos(folder)]
     ahead = timedelta(seconds=clock_offset_seconds)
     unlocated = {photo.camera for photo in photos if photo.latitude is None}
     return [
@@ -119,7 +119,8 @@ def read_gpx(path: Path) -> list[KnownPosition]:
     return sorted(points, key=lambda point: point.time)
 
 
-def _read_photo(folder: Path, path: Path, zone: tzinfo | None) -> FolderPhoto:
+def read_photo(folder: Path, path: Path, zone: tzinfo | None = None) -> FolderPhoto:
+    """Read the header of a photo and its sidecar; `zone` is that of times without one."""
     header, xmp = PhotoHeader(0, 0), None
     # The search names what is wrong with a photo that can't be read.
     with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
