@@ -346,6 +346,23 @@ def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.M
     assert "4.jpg,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
 
 
+def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels = [{"place": "tower/floor 7", "probability": 0.3}]
+    connect(monkeypatch, answer(estimate={"reason": "", "levels": levels}))
+    found = proposals(folder, picture=True)["day 1/2.jpg"]
+    assert (found["accepted"], found["place"], found["place_probability"]) == (
+        True,
+        "tower/floor 7",
+        0.3,
+    )
+    assert run(folder, "--write", "csv", picture=True).exit_code == 0
+    table = (folder / "placewise-locations.csv").read_bytes()
+    (entry,) = read_csv_manifest(table, "table")
+    assert entry.fields.keys() == {"latitude", "longitude"}
+
+
 @pytest.mark.parametrize("target", ["sidecar", "exif"])
 def test_a_photo_that_got_coordinates_or_was_moved_during_the_searches_is_left_alone(
     folder: Path, monkeypatch: pytest.MonkeyPatch, target: str
