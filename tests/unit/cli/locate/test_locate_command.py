@@ -140,9 +140,22 @@ def test_a_clock_that_was_ahead_is_put_right(folder: Path, tmp_path: Path) -> No
     assert found["position"]["latitude"] == expected
 
 
+def test_a_date_that_no_camera_meant_is_no_time_and_stops_nothing(folder: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "0001:01:01 00:00:00"
+    (folder / "5.jpg").write_bytes(encoded(photo_image(1), "JPEG", exif=exif))
+    found = proposals(folder, "--time-zone", "+02:00", "--clock-offset", "5")
+    assert (found["5.jpg"]["captured_at"], found["5.jpg"]["position"]) == (None, None)
+    assert found["day 1/2.jpg"]["accepted"]
+    found = proposals(folder, "--clock-offset", "5")
+    assert found["5.jpg"]["captured_at"] is None
+
+
 def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "track.gpx"
-    for text in ("no XML", "<gpx/>", '<gpx><trkpt lat="1"><time>2026-05-01</time></trkpt></gpx>'):
+    early = '<gpx><trkpt lat="1" lon="1"><time>0001-01-01T00:00:00+02:00</time></trkpt></gpx>'
+    no_longitude = '<gpx><trkpt lat="1"><time>2026-05-01</time></trkpt></gpx>'
+    for text in ("no XML", "<gpx/>", no_longitude, early):
         path.write_text(text)
         with pytest.raises(InvalidRequest) as refusal:
             read_gpx(path)
@@ -370,6 +383,7 @@ def test_a_photo_that_got_coordinates_or_was_moved_during_the_searches_is_left_a
     (folder / "5.jpg").write_bytes(photo(25))
     located, moved, changed = (folder / name for name in ("day 1/2.jpg", "5.jpg", "6.jpg"))
     changed.write_bytes(photo(30))
+
     def write_later(*arguments: Any) -> Any:
         located.write_bytes(photo(20, 5.0))
         moved.unlink()
