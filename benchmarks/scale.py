@@ -16,9 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from threadpoolctl import threadpool_limits
-
+from benchmarks.search.growth import make_scan
 from services.cli.output import Table
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -26,9 +24,10 @@ from shared.search_api.client import MAX_CONCURRENT_CALLS
 
 PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
 PHOTOS = (10_000, 1_000_000, 100_000_000)
-WIDTHS = (7168, 98_304)
-MEASURED_ROWS = {7168: 20_000, 98_304: 2000}  # 573 and 786 MB: larger than any CPU cache
-SETTINGS = ("slot_rows", "search_follow_seconds", "database_work_seconds")
+WIDTHS = (14_336, 98_304)
+WIDTH_INPUTS = ("gpu_photos_per_second", "pipeline_cpu_seconds")
+MEASURED_CODES = 1_000_000  # 512 MB: larger than any CPU cache
+SETTINGS = ("slot_rows", "search_follow_seconds")
 FUNCTIONS = {"__builtins__": {}, "min": min, "max": max, "ceil": math.ceil}
 
 Rows = list[list[str]]
@@ -65,7 +64,7 @@ class Sizing:
         values: dict[str, Any] = {**self.inputs, "photos": photos, "dimensions": dimensions}
         values |= {name: Settings.model_fields[name].default for name in SETTINGS}
         values["max_concurrent_calls"] = MAX_CONCURRENT_CALLS
-        for name in ("gpu_photos_per_second", "scan_us"):
+        for name in WIDTH_INPUTS:
             values[name] = self.inputs[f"{name}_{dimensions}"]
         plan = {}
         for name, _, formula in self._formulas:
@@ -79,7 +78,7 @@ class Sizing:
         for width in WIDTHS:
             plans = [self.evaluate(photos, width)[0] for photos in PHOTOS]
             found[f"plan-{width}"] = [
-                ["", *(f"{photos:,} photos" for photos in PHOTOS)],
+                ["number", *(f"{photos:,} photos" for photos in PHOTOS)],
                 *(
                     [f"`{name}`", *(format_amount(plan[name], unit) for plan in plans)]
                     for name, unit, _ in self._formulas
@@ -105,11 +104,12 @@ class Sizing:
         return page
 
     def terminal_tables(self) -> list[Table]:
+        """Return the computed tables without the page's backticks."""
         found = []
         for name, (head, *rows) in self.tables().items():
             found.append(Table(*head, title=name))
             for row in rows:
-                found[-1].add_row(*row)
+                found[-1].add_row(*(cell.replace("`", "") for cell in row))
         return found
 
     def as_json(self) -> dict[str, Any]:
@@ -156,19 +156,14 @@ def parse_assignments(texts: Sequence[str]) -> dict[str, float]:
 
 
 def measure_inputs() -> dict[str, float]:
-    """Measure the scan of rows and SHA-256 on one thread; needs 800 MB of memory, takes seconds."""
-    values = {}
-    random = np.random.default_rng(0)
-    with threadpool_limits(1):
-        for width, count in MEASURED_ROWS.items():
-            rows = random.random((count, width), dtype=np.float32)
-            seconds = min(
-                timeit.repeat("rows @ rows[0]", globals={"rows": rows}, number=1, repeat=7)
-            )
-            values[f"scan_us_{width}"] = 1e6 * seconds / count
-    names = {"sha256": hashlib.sha256, "rows": rows}
-    seconds = min(timeit.repeat("sha256(rows)", globals=names, number=1, repeat=3))
-    return values | {"hash_bytes_per_second": rows.nbytes / seconds}
+    """Measure the scan of sign codes, and SHA-256; needs 1 GB of memory, takes seconds."""
+    codes, scan = make_scan(MEASURED_CODES)
+    scan_seconds = min(timeit.repeat(scan, number=1, repeat=7))
+    hash_seconds = min(timeit.repeat(lambda: hashlib.sha256(codes.data), number=1, repeat=3))
+    return {
+        "scan_us": 1e6 * scan_seconds / MEASURED_CODES,
+        "hash_bytes_per_second": codes.nbytes / hash_seconds,
+    }
 
 
 def format_amount(value: float, unit: str = "") -> str:

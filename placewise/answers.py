@@ -160,6 +160,7 @@ class Similar(Answer):
     vocabulary: str
     word_weights: str
     generation_id: UUID
+    rows: str = "float32"
     certificate: str
     certified_k: int = 0
     max_z: float | None = None

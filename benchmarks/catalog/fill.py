@@ -18,7 +18,7 @@ from shared.catalog.models import get_or_create_model
 from shared.ids import new_id
 
 MAPS = 10
-LARGEST_MAP, SECOND_MAP = "map-0", "map-1"
+LARGEST_MAP = "map-0"
 SLOT_ROWS = 1000
 WAITING_JOB_SHARE = 0.01  # share of photos just uploaded and not described yet
 

@@ -49,7 +49,7 @@ def measure(
 
     Each kind of query is run `queries` times. The largest map of the longest descriptors is also
     searched with a cold cache, and by many clients for `load_seconds`. Files are written to a
-    temporary folder below `folder`, which must be on a real disk: 400 kB per photo of 98,304
+    temporary folder below `folder`, which must be on a real disk: 600 kB per photo of 98,304
     dimensions.
     """
     report = Report("Search", details={"comparisons": []})

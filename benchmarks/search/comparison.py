@@ -5,12 +5,13 @@ Every query is run with all methods in turn, so that other load affects all of t
 
 from __future__ import annotations
 
-import contextlib
 import random
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from statistics import median
 
 import faiss
@@ -92,7 +93,6 @@ class MethodComparison:
     photos: int
     dimension: int
     rows: list[MethodTiming]
-    read_bytes_per_second: float
     grown_bytes: int
     """Private memory that loading the map took."""
     certificates: list[str]
@@ -190,7 +190,11 @@ def compare_methods(
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
     draw = random.Random(city.seed)
-    with MemoryBandwidth() as speed, _make_methods(world, worker, query_rows) as (methods, ours):
+    with (
+        MemoryBandwidth() as speed,
+        tempfile.TemporaryDirectory(dir=world.settings.placewise_home) as folder,
+    ):
+        methods, ours = _make_methods(world, worker, query_rows, Path(folder))
         for case in QUERY_CASES:
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             took[case.name] = {method.name: [] for method in methods}
@@ -217,7 +221,6 @@ def compare_methods(
             photos=photos,
             dimension=world.dimension,
             rows=rows,
-            read_bytes_per_second=speed.bytes_per_second,
             grown_bytes=grown,
             certificates=sorted(ours.certificates),
             took=took,
@@ -253,30 +256,32 @@ def _summarise_timing(
     )
 
 
-@contextlib.contextmanager
 def _make_methods(
-    world: SyntheticMap, worker: SearchWorker, queries: Rows
-) -> Iterator[tuple[list[SearchMethod], PlacewiseSearch]]:
+    world: SyntheticMap, worker: SearchWorker, queries: Rows, folder: Path
+) -> tuple[list[SearchMethod], PlacewiseSearch]:
+    """Return all methods, and Placewise's; the others search float32 copies of its stored rows."""
     index = faiss.IndexFlatIP(world.dimension)
-    for rows in _stored_rows(world):
-        index.add(rows)
+    paths = []
+    for number, stored in enumerate(_stored_rows(world)):
+        float32_rows = stored.astype(np.float32)
+        index.add(float32_rows)
+        paths.append(folder / f"{number}.npy")
+        np.save(paths[-1], float32_rows)
     photos = len(world.photo_ids)
     rows = faiss.rev_swig_ptr(index.get_xb(), photos * world.dimension)
     rows = rows.reshape(photos, world.dimension)
     ids = world.photo_ids
     ours = PlacewiseSearch(world, worker, queries)
     snapshot = worker.snapshot(world.generation_id, world.version)
-    yield (
-        [
-            ours,
-            PlacewiseWorker(world, worker, ours),
-            NumpySearch(ids, queries, rows),
-            FaissFlat(ids, queries, index),
-            FaissBinary(ids, queries, rows, _sign_codes_of(snapshot, rows)),
-            AnyLocSearch(ids, queries, world.chunk_paths()),
-        ],
+    methods: list[SearchMethod] = [
         ours,
-    )
+        PlacewiseWorker(world, worker, ours),
+        NumpySearch(ids, queries, rows),
+        FaissFlat(ids, queries, index),
+        FaissBinary(ids, queries, rows, _sign_codes_of(snapshot, rows)),
+        AnyLocSearch(ids, queries, paths),
+    ]
+    return methods, ours
 
 
 def _sign_codes_of(snapshot: Snapshot, rows: Rows) -> SignCodes:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import median
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.progress import Progress
 
 from benchmarks.report import Report
@@ -27,21 +28,14 @@ def measure_growth(
     report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
 ) -> None:
     """Report the latency of scans, and its ratio to reading the same codes from memory."""
-    rotation = get_rotation(DIMENSION)
-    words = int(level_ends(rotation.padded)[0])
-    rng = np.random.default_rng(SEED)
-    query = SignCodedQuery.of(rng.standard_normal(DIMENSION).astype(np.float32), rotation)
     task = progress.add_task("growth", total=len(sizes) * ROUNDS)
     for rows in sizes:
-        codes = np.frombuffer(rng.bytes(8 * rows * words), np.uint64).reshape(rows, words)
-        blocks = _blocks(codes)
-        mask = np.ones(rows, bool)
+        codes, scan = make_scan(rows)
         durations = []
-        scan_first_level(blocks, [query], [mask])
         with MemoryBandwidth(codes) as bandwidth:
             for _ in range(ROUNDS):
                 started_at = time.perf_counter()
-                scan_first_level(blocks, [query], [mask])
+                scan()
                 durations.append(time.perf_counter() - started_at)
                 bandwidth.sample()
                 progress.advance(task)
@@ -50,7 +44,23 @@ def measure_growth(
         report.add(f"growth: {rows:,} codes, time / reading", ratio, "x", at_most=TARGET_RATIO)
 
 
-def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:
+def make_scan(rows: int) -> tuple[NDArray[np.uint64], Callable[[], object]]:
+    """Return (rows, words) random first-level codes and a compiled scan of them for one query."""
+    rotation = get_rotation(DIMENSION)
+    words = int(level_ends(rotation.padded)[0])
+    rng = np.random.default_rng(SEED)
+    query = SignCodedQuery.of(rng.standard_normal(DIMENSION).astype(np.float32), rotation)
+    codes = np.frombuffer(rng.bytes(8 * rows * words), np.uint64).reshape(rows, words)
+    blocks, mask = _blocks(codes), np.ones(rows, bool)
+
+    def scan() -> object:
+        return scan_first_level(blocks, [query], [mask])
+
+    scan()  # compiles
+    return codes, scan
+
+
+def _blocks(codes: NDArray[np.uint64]) -> SignCodeBlocks:
     """Return (rows, words) first-level codes as `scan_first_level` takes them, by chunk."""
     begins = np.arange(0, len(codes), BLOCK_ROWS)
     nothing = np.empty(0, np.uint64)

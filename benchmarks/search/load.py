@@ -92,7 +92,8 @@ def measure_load(
         outcome = _Load(world, caller, queries, pool).run(seconds, progress)
     pieces: Iterator[Rows] = (np.load(path, mmap_mode="r") for path in paths)
     added = len(world.photo_ids) - photos
-    oracle = BruteForce.of((*pieces, pool[:added]), world.photo_ids, queries)
+    stored = pool[:added].astype(world.row_type)
+    oracle = BruteForce.of((*pieces, stored), world.photo_ids, queries)
     wrong = count_wrong_answers(outcome, oracle)
     report.add("load: results", len(outcome.answered), at_least=1)
     report.add("load: versions of the map", len(outcome.versions) + outcome.merges, at_least=2)

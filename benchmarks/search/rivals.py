@@ -127,7 +127,7 @@ class Placewise(Rival):
 
     name = "Placewise"
     uses_pca = False
-    row_type: ClassVar[RowType] = RowType.FLOAT32
+    row_type: ClassVar[RowType] = RowType.FLOAT16
 
     def build(self, pieces: Sequence[Rows]) -> None:
         dimension = pieces[0].shape[1]
@@ -150,11 +150,11 @@ class Placewise(Rival):
         return [self._numbers[photo_id] for photo_id, _ in found]
 
 
-class PlacewiseFloat16(Placewise):
-    """The same with rows=float16."""
+class PlacewiseFloat32(Placewise):
+    """The same with rows=float32."""
 
-    name = "Placewise, rows=float16"
-    row_type = RowType.FLOAT16
+    name = "Placewise, rows=float32"
+    row_type = RowType.FLOAT32
 
 
 class FaissIndex(Rival):
@@ -302,7 +302,7 @@ class _Pgvector(Rival):
 
 
 RIVALS: tuple[type[Rival], ...] = (
-    *(Placewise, PlacewiseFloat16, FaissFlat, _FaissIvf, FaissFlatPca, _FaissHnswPca),
+    *(Placewise, PlacewiseFloat32, FaissFlat, _FaissIvf, FaissFlatPca, _FaissHnswPca),
     *(Qdrant, _LanceDb, _Pgvector),
 )
 

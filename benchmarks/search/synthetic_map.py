@@ -56,7 +56,7 @@ class SyntheticMap:
     map_id: UUID
     generation_id: UUID
     dimension: int
-    row_type: RowType = RowType.FLOAT32
+    row_type: RowType = RowType.FLOAT16
     photo_ids: list[UUID] = field(default_factory=list)
     """In the order in which they were added; those that were deleted, too."""
 
@@ -167,7 +167,7 @@ def create_synthetic_map(
     dimension: int,
     *,
     search_memory_budget: int,
-    row_type: RowType = RowType.FLOAT32,
+    row_type: RowType = RowType.FLOAT16,
 ) -> Iterator[SyntheticMap]:
     """Create an empty map in the folder `home`, in a SQLite catalog."""
     chosen = Settings(

@@ -80,7 +80,7 @@ def create(
     rows: Annotated[
         str | None,
         typer.Option(
-            help="Type of the stored descriptors: float32, or float16 in half the space. "
+            help="Type of the stored descriptors: float16, or float32 in twice the space. "
             "Default: the setting DESCRIPTOR_ROWS."
         ),
     ] = None,

@@ -51,7 +51,6 @@ class RateLimiter:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._shared = settings.redis_url is not None
         self._counter = SlidingWindowCounterRateLimiter(_open_limit_storage(settings))
         self._redis_retry_at = 0.0
 

@@ -212,6 +212,10 @@ class SimilarityResponse(ResponseModel):
         "or the query has no words with weights; `off`: disabled by the request or by WORD_WEIGHTS"
     )
     generation_id: UUID
+    rows: RowType = Field(
+        description="type of the stored descriptors, for which scores are exact: `float32` or "
+        "`float16`"
+    )
     certificate: str = Field(
         description="`exhaustive`: every row was compared exactly; `bound`: no skipped row can "
         "be in the result; `statistical`: the same with an error probability of 1e-8; `none`: the "

@@ -24,9 +24,9 @@ class ExtractorSettings(BaseSettings):
         "anyloc-vitb14:layer=9,preprocessing=demo1024",
     )
     descriptor_rows: Literal["float32", "float16"] = Field(
-        "float32",
-        description="type of the stored descriptors of new maps: float16 takes half the space, and "
-        "changes a score by about 0.00001",
+        "float16",
+        description="type of the stored descriptors of new maps: float16 takes half the space of "
+        "float32, and changes a score by about 0.00001",
     )
     dino_model: str | None = Field(
         None,

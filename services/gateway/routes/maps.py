@@ -63,7 +63,7 @@ class CreateMapRequest(RequestModel):
     )
     rows: RowType | None = Field(
         None,
-        description="type of the stored descriptors: float32, or float16 in half the space; "
+        description="type of the stored descriptors: float16, or float32 in twice the space; "
         "omitted: the default of the server",
     )
 

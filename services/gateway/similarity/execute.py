@@ -33,7 +33,7 @@ from services.gateway.similarity.neighbours import Neighbours
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
-from shared.catalog.generations import Generation, active_generation
+from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.maps import Map, Search, get_map, map_not_found_error
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
@@ -276,6 +276,7 @@ def run_similarity_search(
         vocabulary=query.vocabulary,
         word_weights=weights.state(hits),
         generation_id=query.generation.id,
+        rows=RowType(query.generation.row_type),
         certificate=response.certificate,
         certified_k=_count_certified(similar[: search_params.top_k], response),
         max_z=response.max_z,

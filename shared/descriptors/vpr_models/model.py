@@ -69,9 +69,8 @@ def build_vpr_model(config: VprModelConfig, *, weights: Path | None = None) -> V
     backbone = build_backbone(config, weights)
     _check_patches(backbone, *config.image_size, config)
     with torch.inference_mode():
-        maps, token = backbone(torch.zeros(1, 3, *config.image_size))
-    _, channels, height, width = maps.shape
-    shape = FeatureMapShape(channels, height, width, has_token=token is not None)
+        maps, _ = backbone(torch.zeros(1, 3, *config.image_size))
+    shape = FeatureMapShape(*maps.shape[1:])
     aggregator, arguments = _build_aggregator(config, shape)
     _check_map(aggregator, config, maps, config.image_size)
     complete = config.model_copy(update={"agg_config": arguments})

@@ -13,7 +13,7 @@ from benchmarks.search.rivals import (
     FaissFlat,
     FaissFlatPca,
     Placewise,
-    PlacewiseFloat16,
+    PlacewiseFloat32,
     measure,
     recall,
 )
@@ -21,7 +21,7 @@ from shared.errors import Misconfigured
 
 
 def test_exact_engines_find_all_of_the_best_photos_and_a_projection_fewer(tmp_path: Path) -> None:
-    rivals = (Placewise, PlacewiseFloat16, FaissFlat, FaissFlatPca)
+    rivals = (Placewise, PlacewiseFloat32, FaissFlat, FaissFlatPca)
     report = measure(
         Progress(disable=True),
         photos=300,
@@ -31,11 +31,11 @@ def test_exact_engines_find_all_of_the_best_photos_and_a_projection_fewer(tmp_pa
         folder=tmp_path,
         rivals=rivals,
     )
-    exact, half, flat, projected = report.details["engines"]
-    assert exact["recall"] == half["recall"] == flat["recall"] == 1.0
+    exact, float32, flat, projected = report.details["engines"]
+    assert exact["recall"] == float32["recall"] == flat["recall"] == 1.0
     assert 0.0 < projected["recall"] < 1.0
     assert [each["dimension"] for each in (exact, flat, projected)] == [512, 512, 8]
-    assert half["disk_mb"] < exact["disk_mb"]
+    assert exact["disk_mb"] < float32["disk_mb"]
     assert [figure.what for figure in report.figures] == [
         f"{rival.name}: query, p50" for rival in rivals
     ]

@@ -44,22 +44,24 @@ def test_a_plan_by_hand() -> None:
     plan = plan_of(
         1_000_000,
         98_304,
-        scan_us_98304=10,
+        scan_us=10,
         search_seconds=1,
-        photo_columns_bytes=784,
-        machine_ram_bytes=100e9,
+        photo_columns_bytes=712,
+        machine_ram_bytes=2e9,
+        machine_disk_bytes=100e9,
         ram_used=0.5,
         replicas=3,
         queries_per_second=1,
         gpu_photos_per_second_98304=50,
     )
-    assert plan["row_in_memory"] == 394_000
-    assert plan["rows_in_memory"] == 788e9  # two generations
-    assert plan["shards_for_memory"] == 16  # 788 GB in parts of 50 GB
+    assert plan["row_in_memory"] == 13_000
+    assert plan["codes_in_memory"] == 26e9  # two generations
+    assert plan["shards_for_memory"] == 26  # 26 GB in parts of 1 GB
+    assert plan["shards_for_disk"] == 4  # 393 GB in parts of 100 GB
     assert plan["shards_for_time"] == 10  # 10 s in parts of one
-    assert plan["shards"] == 16
-    assert plan["search_workers"] == 48
-    assert plan["worker_memory"] == pytest.approx(98.5e9)
+    assert plan["shards"] == 26
+    assert plan["search_workers"] == 78
+    assert plan["worker_memory"] == pytest.approx(2e9)
     assert plan["gpu_time"] == 20_000
     assert plan["searches"] == 7_776_000
     costs = ("extractor_cost", "search_cost", "object_cost", "catalog_cost", "other_cost")
@@ -67,7 +69,7 @@ def test_a_plan_by_hand() -> None:
 
 
 def test_an_extractor_is_as_fast_as_the_slower_of_gpu_and_decoding() -> None:
-    slow_cpu = {"extractor_vcpus": 2, "pipeline_cpu_seconds": 0.1}
+    slow_cpu = {"extractor_vcpus": 2, "pipeline_cpu_seconds_98304": 0.1}
     assert plan_of(1000, 98_304, **slow_cpu)["extractor_rate"] == 20
     assert plan_of(1000, 98_304, gpu_photos_per_second_98304=3, **slow_cpu)["extractor_rate"] == 3
 
@@ -78,14 +80,14 @@ def test_chunk_bytes_are_those_that_are_written(tmp_path: Path) -> None:
         store,
         generation_id=new_id(),
         chunk_id=new_id(),
-        rows=np.zeros((1000, 64), np.float32),
+        rows=np.zeros((1000, 64), np.float16),
         photo_ids=[new_id() for _ in range(1000)],
         spec={},
     )
     assert written.rows == 1000
     on_disk = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     assert on_disk / 1000 == pytest.approx(
-        4 * 64 + plan_of(1000, 7168)["chunks"] / 1000 - 4 * 7168, rel=0.01
+        2 * 64 + plan_of(1000, 14_336)["chunks"] / 1000 - 2 * 14_336, rel=0.01
     )
 
 
@@ -94,7 +96,7 @@ def test_limits_come_with_the_lowest_first_and_follow_the_inputs() -> None:
     order = [row[0] for row in Sizing({}).tables()["limits"][1:]]
     assert [found[what] for what in order] == sorted(found.values())
     half = Sizing({"ram_used": 0.4}).evaluate(1000, 98_304)[1]
-    what = "the rows exceed one machine's memory"
+    what = "the codes exceed one machine's memory"
     assert half[what] == found[what] / 2
 
 
@@ -114,6 +116,13 @@ def test_page_is_computed_from_its_own_inputs_only(tmp_path: Path) -> None:
     assert page.read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")
 
 
+def test_each_number_has_its_name() -> None:
+    ended = runner.invoke(app, ["bench", "scale", "--set", "photo_bytes=1000"])
+    assert ended.exit_code == 0
+    assert "originals\t10 MB\t1 GB\t100 GB\n" in ended.output
+    assert "the codes exceed one machine's memory\t" in ended.output
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
 def test_an_input_is_a_positive_number(value: str) -> None:
     with pytest.raises(Misconfigured, match="above 0"):
@@ -128,7 +137,7 @@ def test_json_has_inputs_plans_and_limits() -> None:
     assert {(plan["photos"], plan["dimensions"]) for plan in found["plans"]} == {
         (photos, dimensions)
         for photos in (10_000, 1_000_000, 100_000_000)
-        for dimensions in (7168, 98_304)
+        for dimensions in (14_336, 98_304)
     }
     assert all(plan["limits"] for plan in found["plans"])
 

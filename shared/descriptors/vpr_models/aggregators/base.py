@@ -21,7 +21,6 @@ class FeatureMapShape(NamedTuple):
     channels: int
     height: int
     width: int
-    has_token: bool = False
 
 
 class Aggregator(nn.Module):
