@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import os
@@ -44,6 +45,8 @@ COMPUTING = ("integration", "contract", "unit")
 # A test makes many objects and little garbage: collecting at Python's 700 objects takes a tenth of
 # the CPU time of tests of the gateway.
 gc.set_threshold(50_000)
+# Imports freeze their objects, of which triton would report hundreds as leaked at the end.
+atexit.register(gc.unfreeze)
 collect_ignore = [] if os.environ.get(BROWSER) else ["browser"]
 
 
