@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -121,6 +122,7 @@ class AdmissionControl:
         self.disk = DiskSpace(settings)
         self._queue_depth = PolledValue(self._measure_queue_depth, ADMISSION_POLL_SECONDS)
         self._admitted: Counter[str | None] = Counter()  # since the last poll; None: queries
+        self._admitted_lock = threading.Lock()
         self._active_uploads = {
             kind: _ConcurrencyLimit(
                 f"{kind} (MAX_CONCURRENT_UPLOADS, MAX_CONCURRENT_UPLOADS_PER_CALLER)",
@@ -148,17 +150,20 @@ class AdmissionControl:
         """
         self.disk.check()
         depth, settings = self.queue_depth(), self._settings
-        for suffix, queued, limit in (
-            ("", depth.jobs + self._admitted_jobs(), settings.max_queued_jobs),
-            (
-                f" of the map {map_name!r}",
-                depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
-                settings.max_queued_jobs_per_map,
-            ),
-        ):
-            if queued >= limit:
-                raise _queue_full_error(f"jobs{suffix}", queued, limit, depth.finished_per_second)
-        self._admitted[map_name] += 1
+        with self._admitted_lock:
+            for suffix, queued, limit in (
+                ("", depth.jobs + self._admitted_jobs(), settings.max_queued_jobs),
+                (
+                    f" of the map {map_name!r}",
+                    depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
+                    settings.max_queued_jobs_per_map,
+                ),
+            ):
+                if queued >= limit:
+                    raise _queue_full_error(
+                        f"jobs{suffix}", queued, limit, depth.finished_per_second
+                    )
+            self._admitted[map_name] += 1
 
     def may_block(self) -> bool:
         """Return whether admitting queries the catalog or a local disk now."""
@@ -171,11 +176,13 @@ class AdmissionControl:
             TooManyRequests: `queue_full`.
         """
         depth, limit = self.queue_depth(), self._settings.max_queued_jobs
-        queued = depth.jobs + self._admitted_jobs()
+        with self._admitted_lock:
+            queued = depth.jobs + self._admitted_jobs()
         if queued >= limit:
             raise _queue_full_error("jobs", queued, limit, depth.finished_per_second)
 
     def _admitted_jobs(self) -> int:
+        """Number of jobs admitted since the last poll; the caller holds the lock."""
         return sum(count for name, count in self._admitted.items() if name is not None)
 
     def admit_query(self) -> None:
@@ -190,10 +197,11 @@ class AdmissionControl:
         """
         self.disk.check(QUERY_SHARE)
         depth, limit = self.queue_depth(), self._settings.max_queued_queries
-        queued = depth.queries + self._admitted[None]
-        if queued >= limit:
-            raise _queue_full_error("query photos", queued, limit, depth.finished_per_second)
-        self._admitted[None] += 1
+        with self._admitted_lock:
+            queued = depth.queries + self._admitted[None]
+            if queued >= limit:
+                raise _queue_full_error("query photos", queued, limit, depth.finished_per_second)
+            self._admitted[None] += 1
 
     def admit_upload(self, kind: UploadKind, request: Request) -> AbstractContextManager[None]:
         """Context manager that counts an upload while its file is received.
@@ -216,7 +224,8 @@ class AdmissionControl:
 
     def _measure_queue_depth(self) -> QueueDepth:
         limit = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
-        self._admitted.clear()  # before the poll: a job may be counted twice, but is never missed
+        with self._admitted_lock:
+            self._admitted.clear()  # before the poll: a job may be counted twice, never missed
         with self._catalog.read() as session:
             return measure_queue_depth(session, limit)
 

@@ -36,6 +36,7 @@ from shared.storage import ObjectStore
 NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
 CHANGE_POLL_SECONDS = 0.25  # poll interval while a request waits for a change of a job
 POLL_COST_DIVISOR = 10  # polling takes at most one tenth of the time: slow polls become rare
+MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
 
@@ -142,7 +143,7 @@ class JobNotifier:
                 elapsed = time.monotonic() - started
                 awaits_end = any(waiter.last_seen is None for waiter in self._waiters)
                 interval = NOTIFIER_POLL_SECONDS if awaits_end else CHANGE_POLL_SECONDS
-                pause = max(interval, POLL_COST_DIVISOR * elapsed)
+                pause = max(interval, min(POLL_COST_DIVISOR * elapsed, MAX_POLL_PAUSE_SECONDS))
         finally:
             self._poll_task = None
 

@@ -15,7 +15,7 @@ import mmap
 import os
 import shutil
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -290,10 +290,15 @@ def generation_loader(store: ObjectStore, folder: Path, generation_id: UUID) -> 
     return ChunkLoader(store, folder / str(generation_id))
 
 
-def remove_stale_folders(folder: Path, generation_ids: Collection[UUID]) -> None:
-    """Delete the cache folders of generations that no longer exist."""
+def list_generation_folders(folder: Path) -> list[Path]:
+    """Return the cache folders of the generations."""
+    return list(folder.iterdir()) if folder.is_dir() else []
+
+
+def remove_stale_folders(folders: Iterable[Path], generation_ids: Collection[UUID]) -> None:
+    """Delete the cache folders of all but these generations."""
     known = {str(generation_id) for generation_id in generation_ids}
-    for path in folder.iterdir() if folder.is_dir() else ():
+    for path in folders:
         if path.name not in known:
             log.info("deleting the cached files of generation %s", path.name)
             shutil.rmtree(path, ignore_errors=True)

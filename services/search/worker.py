@@ -25,7 +25,7 @@ from services.search.catalog_sync import (
     read_generation_versions,
     sync_snapshot,
 )
-from services.search.chunk_loader import remove_stale_folders
+from services.search.chunk_loader import list_generation_folders, remove_stale_folders
 from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.query_batcher import QueryBatcher
@@ -211,6 +211,8 @@ class SearchWorker:
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Sync every generation of these states to its map's version; drop deleted generations."""
         read_at = time.monotonic()
+        # Before the catalog is read: what another thread loads meanwhile has not ended.
+        held, folders = self._snapshots.keys(), list_generation_folders(self._folder)
         current = read_generation_versions(self._catalog)
         self.replication_lag.record_catalog_read(current, read_at)
         for generation_id, target in current.items():
@@ -223,15 +225,18 @@ class SearchWorker:
                 self._sync_generation(generation_id, target.version, damaged=snapshot)
             self._update_gpu(generation_id)
             self.replication_lag.record_synced(generation_id, read_at)
-        for generation_id in self._snapshots.keys() - current.keys():
+        ended = held - current.keys()
+        for generation_id in ended:
             self._memory_budget.release_generation(generation_id)
-        remove_stale_folders(self._folder, current.keys())
         with self._snapshots_lock:
-            self._snapshots = {k: v for k, v in self._snapshots.items() if k in current}
+            self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
+            known = {*current, *self._snapshots}
             self._load_locks = {
-                k: v for k, v in self._load_locks.items() if k in current or v.locked()
+                k: v for k, v in self._load_locks.items() if k in known or v.locked()
             }
-            self._files_due = {k: v for k, v in self._files_due.items() if k in current}
+            self._files_due = {k: v for k, v in self._files_due.items() if k in known}
+            loading = self._load_locks.keys()
+        remove_stale_folders(folders, known | loading)
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )

@@ -166,14 +166,18 @@ class BackupFolder:
             lines.write("\n" + json.dumps(asdict(entry)))
 
     def finish(self, about: BackupManifest, keep: set[str]) -> None:
-        """Write the manifest, then delete objects not in `keep` and the previous backup's rows."""
+        """Write the manifest and the index of the objects in `keep`.
+
+        Then delete the other objects, also those that an interrupted call left, and the previous
+        backup's rows: the backup can be restored at any moment.
+        """
         write_private(self.path / "backup.json", json.dumps(asdict(about), indent=2) + "\n")
-        objects = self.objects
-        for key in self.index.keys() - keep:
-            objects.delete(key)
-            del self.index[key]
+        self.index = {key: entry for key, entry in self.index.items() if key in keep}
         lines = (json.dumps(asdict(entry)) + "\n" for entry in self.index.values())
         write_private(self._index_file, "".join(lines))
+        objects = self.objects
+        for key in [info.key for info in objects.list("") if info.key not in self.index]:
+            objects.delete(key)
         for old in self.path.glob("catalog-*"):
             if old.name != about.catalog:
                 shutil.rmtree(old)

@@ -11,6 +11,7 @@ the response has the time of the count.
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any
@@ -328,3 +329,13 @@ def cache_map_statistics(session: Session, map_id: UUID) -> None:
     session.merge(
         CachedMapStatistics(map_id=map_id, figures=figures, counted_at=now, took_seconds=took)
     )
+
+
+def list_maps_with_cached_statistics(session: Session) -> set[UUID]:
+    """Return the ids of the maps whose statistics are cached."""
+    return set(session.scalars(sa.select(CachedMapStatistics.map_id)))
+
+
+def delete_cached_statistics(session: Session, map_ids: Collection[UUID]) -> None:
+    """Delete the cached statistics of these maps."""
+    session.execute(sa.delete(CachedMapStatistics).where(CachedMapStatistics.map_id.in_(map_ids)))

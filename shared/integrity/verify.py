@@ -243,7 +243,11 @@ def _verify_vocabulary(
         stored = session.get(Vocabulary, one.row_id)
     if stored is None:
         return
-    data = store.get(one.key)
+    try:
+        data = store.get(one.key)
+    except NotFound:  # deleted with its map since `head`
+        yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
+        return
     report.read_bytes += len(data)
     try:
         intact = hashlib.sha256(decode_rows(data).tobytes()).hexdigest() == stored.sha256

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import logging
+import math
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -86,15 +87,16 @@ def _top_hits(k: int, responses: Sequence[SearchResponse]) -> list[SearchHit]:
 def _certified_count(hits: Sequence[SearchHit], responses: Sequence[SearchResponse]) -> int:
     """Number of leading hits that are certain.
 
-    A shard that stopped early guarantees only hits that score at least as high as the last hit that
+    A shard that stopped early guarantees only hits that rank at least as high as the last hit that
     it certifies.
     """
-    certain_from = -1.0
+    certain_from = -math.inf
     for response in responses:
         if _certificate_rank(response.certificate) >= CERTIFICATES.index(NONE):
             last = response.certified_k - 1
-            certain_from = max(certain_from, response.hits[last].score if last >= 0 else 2.0)
-    return sum(hit.score >= certain_from for hit in hits)
+            bound = response.hits[last].ranked_by if last >= 0 else math.inf
+            certain_from = max(certain_from, bound)
+    return sum(hit.ranked_by >= certain_from for hit in hits)
 
 
 def _certificate_rank(certificate: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 from shared.errors import InvalidRequest
@@ -49,7 +50,9 @@ def motion_model(motion: str | float) -> MotionModel:
             f"The motion must be {', '.join(MOTION_MODELS)} or a maximum speed in m/s above 0, "
             f"not {motion!r}."
         )
-    return MotionModel(f"{speed:g}", speed * TYPICAL_SHARE, speed)
+    # A positive number times a share may be rounded to 0, by which no distance can be divided.
+    typical = max(speed * TYPICAL_SHARE, sys.float_info.min)
+    return MotionModel(f"{speed:g}", typical, speed)
 
 
 def parse_motion(text: str) -> MotionModel:

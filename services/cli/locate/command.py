@@ -174,10 +174,13 @@ def locate(
         _locate_photo(photo, search, photo_count, neighbours, track, moves, radius)
         for photo, search in zip(unlocated, searches, strict=True)
     ]
-    accepted = [each for each in located if each.probability >= max(accept, 1e-9)]
+    accept_from = max(accept, 1e-9)
+    accepted = [each for each in located if each.probability >= accept_from]
     written = None
     if write is not None:
-        written = write_locations(folder, write, [_location(each) for each in accepted])
+        written = write_locations(
+            folder, write, [_location(each, accept_from) for each in accepted]
+        )
     if as_json:
         print_json(_to_json(photos, located, accept, written))
     else:
@@ -267,14 +270,15 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
     )
 
 
-def _location(located: _LocatedPhoto) -> Location:
+def _location(located: _LocatedPhoto, accept: float) -> Location:
+    """Return what is written of an accepted proposal: its place only if that is accepted, too."""
     photo = located.photo
     return Location(
         photo.path,
         photo.name,
         photo.time if photo.time_zone_is_known else None,
         located.proposal,
-        located.place,
+        located.place if (located.place_probability or 0.0) >= accept else None,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
@@ -41,15 +41,23 @@ def read_folder(
         InvalidRequest: `no_photos`, `bad_time_zone`.
     """
     zone = _parse_time_zone(time_zone) if time_zone else None
-    photos = [_read_photo(folder, path, zone) for path in list_photos(folder)]
+    photos = [read_photo(folder, path, zone) for path in list_photos(folder)]
     ahead = timedelta(seconds=clock_offset_seconds)
     unlocated = {photo.camera for photo in photos if photo.latitude is None}
     return [
-        replace(photo, time=photo.time - ahead)
-        if photo.time is not None and photo.camera in unlocated
+        replace(photo, time=_in_range(photo.time, lambda time: time - ahead))
+        if photo.camera in unlocated
         else photo
         for photo in photos
     ]
+
+
+def _in_range(time: datetime | None, change: Callable[[datetime], datetime]) -> datetime | None:
+    """Change a time; None if it was no date, such as 0001-01-01, which can't be moved."""
+    try:
+        return None if time is None else change(time)
+    except OverflowError:
+        return None
 
 
 def _parse_time_zone(text: str) -> tzinfo:
@@ -108,7 +116,7 @@ def read_gpx(path: Path) -> list[KnownPosition]:
             if not (abs(latitude) <= 90 and abs(longitude) <= 180):
                 raise ValueError(f"the position {latitude}, {longitude} does not exist")
             points.append(KnownPosition(time, latitude, longitude))
-    except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+    except (OSError, ElementTree.ParseError, KeyError, ValueError, OverflowError) as error:
         raise InvalidRequest(
             "bad_gpx", f"Can't read the GPX track {printable_path(path)}: {error}"
         ) from error
@@ -119,7 +127,8 @@ def read_gpx(path: Path) -> list[KnownPosition]:
     return sorted(points, key=lambda point: point.time)
 
 
-def _read_photo(folder: Path, path: Path, zone: tzinfo | None) -> FolderPhoto:
+def read_photo(folder: Path, path: Path, zone: tzinfo | None = None) -> FolderPhoto:
+    """Read the header of a photo and its sidecar; `zone` is that of times without one."""
     header, xmp = PhotoHeader(0, 0), None
     # The search names what is wrong with a photo that can't be read.
     with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
@@ -127,8 +136,8 @@ def _read_photo(folder: Path, path: Path, zone: tzinfo | None) -> FolderPhoto:
         file.seek(0)
         xmp = embedded_xmp(file)
     time = header.captured_at
-    if time is not None and zone is not None and not header.time_zone_is_known:
-        time = time.replace(tzinfo=zone).astimezone(UTC)
+    if zone is not None and not header.time_zone_is_known:
+        time = _in_range(time, lambda clock: clock.replace(tzinfo=zone).astimezone(UTC))
     latitude, longitude = header.latitude, header.longitude
     sidecar = find_sidecar(path)
     for data in (xmp, sidecar.read_bytes() if sidecar else None):

@@ -51,6 +51,7 @@ class UndoJournal:
         lines = _read_lines(self._journal)
         # Without an incomplete last line, which a killed process has left.
         _write_synced(self._journal, b"".join(_to_line(line) for line in lines))
+        self._read: dict[Path, str | None] = {}  # staged file -> SHA-256 of the file it is made of
         self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
         for line in lines:
             self._remember(line)
@@ -61,7 +62,9 @@ class UndoJournal:
         staged.unlink(missing_ok=True)
         if content is None:
             shutil.copy2(path, staged)
+            self._read[staged] = _sha256(staged)
         else:
+            self._read[staged] = _sha256(path)
             staged.write_bytes(content)
             if path.exists():
                 shutil.copymode(path, staged)
@@ -72,12 +75,17 @@ class UndoJournal:
 
         Raises:
             Unprocessable: `outside_folder`, for a link to a file that is not below the folder.
+            Conflict: `changed_meanwhile`, if another program changed the file since it was staged.
         """
         path = path.resolve()  # a link stays a link
         name = os.path.relpath(path, self._root)
         _check_is_below(self._root, name)
         _sync(staged)
         line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
+        if line["before"] != self._read.pop(staged):
+            raise Conflict(
+                "changed_meanwhile", "Another program has changed the file meanwhile. Try again."
+            )
         is_known = line["before"] in self._known.get(name, ())
         if not is_known and line["before"] is not None:  # new, or changed by something else since
             line["backup"] = str(new_id())  # a name that no earlier backup has

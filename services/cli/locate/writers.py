@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
+from services.cli.locate.folder import read_photo
 from services.cli.locate.sidecars import METHOD, add_position, find_sidecar, sidecar_path
 from services.cli.locate.undo_journal import UndoJournal, open_journal
 from services.cli.output import printable_path
@@ -88,6 +89,9 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
             report.written.append(name)
         else:
             for location, proposal in positions:
+                if reason := _change_meanwhile(folder, location.path):
+                    report.skipped[location.name] = reason
+                    continue
                 try:
                     path = write_one(journal, location.path, proposal)
                 except PlacewiseError as error:
@@ -97,6 +101,15 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
                 else:
                     report.written.append(printable_path(path.relative_to(folder)))
     return report
+
+
+def _change_meanwhile(folder: Path, photo: Path) -> str | None:
+    """Return why a photo needs no position any more; the searches may have taken minutes."""
+    if not photo.exists():
+        return "was moved or deleted meanwhile"
+    if read_photo(folder, photo).latitude is not None:
+        return "got coordinates meanwhile"
+    return None
 
 
 def _photo_writer(target: Target) -> Callable[[UndoJournal, Path, Proposal], Path] | None:

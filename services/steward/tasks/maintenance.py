@@ -20,8 +20,10 @@ from shared.catalog.maps import (
     Search,
     are_statistics_stale,
     cache_map_statistics,
+    delete_cached_statistics,
     is_large_map,
     list_maps,
+    list_maps_with_cached_statistics,
 )
 from shared.catalog.photos import Photo
 from shared.catalog.tracks import Track, delete_tracks
@@ -119,14 +121,18 @@ def _delete_rows(
 
 
 def update_statistics_of_large_maps(catalog: Catalog) -> None:
-    """Refresh the cached statistics of each map that is too large to be counted per request."""
+    """Refresh the cached statistics of each map that is too large to be counted per request.
+
+    Those of maps that are no longer so large, or were deleted, are deleted.
+    """
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
-        due = [
-            map_id
-            for map_id in maps
-            if is_large_map(session, map_id) and are_statistics_stale(session, map_id)
-        ]
+        large = {map_id for map_id in maps if is_large_map(session, map_id)}
+        due = [map_id for map_id in large if are_statistics_stale(session, map_id)]
+        outdated = list_maps_with_cached_statistics(session) - large
     for map_id in due:
         with catalog.write() as session:
             cache_map_statistics(session, map_id)
+    if outdated:
+        with catalog.write() as session:
+            delete_cached_statistics(session, outdated)

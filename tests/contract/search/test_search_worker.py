@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import torch
 
 from services.search import executor, gpu
 from services.search import worker as worker_module
+from services.search.catalog_sync import read_generation_versions
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
@@ -143,6 +144,43 @@ class TestSearchWorker(SearchPortContract):
         worker.sync()
         assert worker.status().missing == (), "a loaded chunk was read again"
         assert worker.status().rows == 10
+
+
+@whatever_the_catalog
+def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    always_by_int8(monkeypatch)  # with cached files
+    places = SmallMap(catalog, store)
+    places.add(unit_rows(1, 30))
+    worker = SearchWorker(catalog, store, settings)
+    others: list[SmallMap] = []
+
+    def read_before_another_map_is_searched(catalog: Catalog) -> Any:
+        current = read_generation_versions(catalog)
+        others.append(other := SmallMap(catalog, store))
+        other.add(unit_rows(2, 30))
+        worker.snapshot(other.generation_id, other.version)
+        return current
+
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            worker_module, "read_generation_versions", read_before_another_map_is_searched
+        )
+        worker.sync()
+    (other,) = others
+    both = {each.generation_id: each.version for each in (places, other)}
+    assert worker.status().versions == both
+    cached = settings.search_cache_folder(SINGLE_SHARD)
+    assert {folder.name for folder in cached.iterdir()} == set(map(str, both))
+    with catalog.write() as session:
+        session.get_one(Generation, other.generation_id).state = GenerationState.RETIRED
+    worker.sync()
+    assert worker.status().versions.keys() == {places.generation_id}
+    assert [folder.name for folder in cached.iterdir()] == [str(places.generation_id)]
 
 
 @whatever_the_catalog

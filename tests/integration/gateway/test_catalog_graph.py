@@ -7,13 +7,16 @@ from uuid import UUID
 
 import numpy as np
 import pytest
+from sqlalchemy import delete
 
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
+from services.steward.tasks.maintenance import update_statistics_of_large_maps
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import PhotoRole
+from shared.jobs import Job, JobKind
 from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
-from tests.support.catalog_rows import add_map, add_photo
+from tests.support.catalog_rows import add_job, add_map, add_photo
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 CENTERS = [(45.0, 7.0), (10.0, 180.0), (89.9999, 30.0)]
@@ -77,3 +80,28 @@ def test_the_catalog_answers_as_arrays_do(catalog: Catalog, map_id: UUID) -> Non
         known = sorted(ids_of(all_times))
         assert ids_of(graph.photos([*known, str(UUID(int=1))])) == set(known)
         assert len(graph.photos([])) == 0
+
+
+def test_the_photos_of_a_map_that_is_no_longer_large_are_counted_again(
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The statistics of a map with many jobs are cached, until these were deleted by their age."""
+    monkeypatch.setattr("shared.catalog.maps.MAX_EXACT_COUNT", 20)
+
+    def count_after_the_steward(map_id: UUID) -> int:
+        update_statistics_of_large_maps(catalog)
+        with catalog.read() as session:
+            return CatalogPhotoGraph(session, map_id).photo_count
+
+    with catalog.write() as session:
+        map_id = add_map(session).id
+        for _ in range(2):
+            add_photo(session, map_id)
+        for _ in range(21):
+            add_job(session, map_id, JobKind.DESCRIBE)
+    assert count_after_the_steward(map_id) == 2
+    with catalog.write() as session:
+        session.execute(delete(Job))
+        for _ in range(10):
+            add_photo(session, map_id)
+    assert count_after_the_steward(map_id) == 12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
 from uuid import UUID
 
@@ -49,6 +50,30 @@ def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUI
             assert not wait.done()
             set_columns(catalog, job, state=JobState.FAILED)
             await asyncio.wait_for(wait, LONG)
+
+    asyncio.run(scenario())
+
+
+def test_one_slow_look_does_not_hold_up_the_next_ones(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tenth of the time would be a pause of 20 seconds."""
+    look, looks = job_watch._load_watched_states, 0
+
+    def slow_at_first(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
+        nonlocal looks
+        looks += 1
+        states = look(catalog, job_ids)
+        time.sleep(2.0 if looks == 1 else 0.0)
+        return states
+
+    monkeypatch.setattr(job_watch, "_load_watched_states", slow_at_first)
+
+    async def scenario() -> None:
+        wait = asyncio.create_task(JobNotifier(catalog).wait_until_finished(jobs[0], LONG))
+        await asyncio.sleep(1.0)
+        set_columns(catalog, jobs[0], state=JobState.FAILED)
+        await asyncio.wait_for(wait, LONG / 2)
 
     asyncio.run(scenario())
 

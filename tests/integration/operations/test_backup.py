@@ -28,6 +28,7 @@ from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured
 from shared.integrity.verify import verify_store
 from shared.storage import FolderStore
+from shared.storage.keys import thumbnail_key
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import read_job, take
 from tests.support.photos import photo_bytes
@@ -261,6 +262,38 @@ def test_an_interrupted_backup_leaves_the_one_before_and_goes_on(
     restored(tmp_path / "backup", other_catalog, other_store)
     with other_catalog.read() as session:
         assert len(session.scalars(select(Photo)).all()) == 2
+
+
+def test_a_backup_killed_while_it_deletes_old_objects_can_be_restored_and_deletes_them_later(
+    service: Service,
+    backed_up: Callable[[], Any],
+    other_catalog: Catalog,
+    other_store: FolderStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gone, _ = service.indexed(1, 2)
+    backed_up()
+    service.json("DELETE", f"/uploads/{gone}")
+    with service.catalog.read() as session:
+        original = session.get_one(Photo, UUID(gone)).object_key
+    service.store.delete(original)
+    service.store.delete(thumbnail_key(UUID(gone)))
+    delete = FolderStore.delete
+
+    def killed_after_the_first(store: FolderStore, key: str) -> None:
+        delete(store, key)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FolderStore, "delete", killed_after_the_first)
+        with pytest.raises(KeyboardInterrupt):
+            backed_up()
+    restored(tmp_path / "backup", other_catalog, other_store)
+    assert service.store.head(original) is other_store.head(original) is None
+    backed_up()
+    folder, _ = open_backup(tmp_path / "backup")
+    assert {info.key for info in folder.objects.list("")} == folder.index.keys()
 
 
 def test_an_interrupted_restore_goes_on_with_what_it_lacks(

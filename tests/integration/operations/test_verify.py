@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 from uuid import UUID
 
 import pytest
@@ -10,6 +11,7 @@ from sqlalchemy import delete, func, select
 
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import Base
+from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
@@ -159,6 +161,26 @@ def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
     )
     assert faults(found) == {("damaged", "vocabulary")}
     assert "vocabularies" in stages
+
+
+def test_a_vocabulary_that_is_deleted_while_it_is_verified_is_no_fault(
+    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vlads.upload(*range(10))
+    vlads.fit()
+    (key,) = vlads.keys("vocabularies/")
+    head = vlads.store.head
+
+    def delete_the_map_after(looked_up: str) -> Any:
+        found = head(looked_up)
+        if looked_up == key:
+            with vlads.catalog.write() as session:
+                mark_map_deleted(session, session.get_one(Map, vlads.map_id))
+            vlads.store.delete(key)
+        return found
+
+    monkeypatch.setattr(vlads.store, "head", delete_the_map_after)
+    assert verify_store(vlads.catalog, vlads.store, originals=False).faults == []
 
 
 def test_every_table_that_names_objects_is_looked_at() -> None:

@@ -21,6 +21,7 @@ from services.search.chunk_loader import (
     LoadedChunk,
     StoredChunk,
     hold_in_memory,
+    list_generation_folders,
     memory_parts,
     remove_stale_folders,
 )
@@ -168,7 +169,7 @@ def test_only_the_files_of_chunks_that_are_searched_are_kept(tmp_path: Path, fol
     other.mkdir()
     mine = new_id()
     folder.rename(folder.with_name(str(mine)))
-    remove_stale_folders(folder.parent, [mine])
+    remove_stale_folders(list_generation_folders(folder.parent), [mine])
     assert [path.name for path in folder.parent.iterdir()] == [str(mine)]
 
 

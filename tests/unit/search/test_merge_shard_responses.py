@@ -39,6 +39,15 @@ def answer(*hits: tuple[int, float], **changes: Any) -> SearchResponse:
     )
 
 
+def weighted(*hits: tuple[int, float, float], **changes: Any) -> SearchResponse:
+    """`hits` are (photo, score, weighted score), in the order of the last."""
+    found = tuple(
+        SearchHit(photo_id=UUID(int=number), score=score, weighted_score=by)
+        for number, score, by in hits
+    )
+    return answer(**changes).model_copy(update={"hits": found})
+
+
 def ranked(response: SearchResponse) -> list[tuple[int, float]]:
     return [(hit.photo_id.int, hit.score) for hit in response.hits]
 
@@ -60,16 +69,6 @@ def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
 
 
 def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() -> None:
-    def weighted(*hits: tuple[int, float, float]) -> SearchResponse:
-        return answer().model_copy(
-            update={
-                "hits": tuple(
-                    SearchHit(photo_id=UUID(int=number), score=score, weighted_score=by)
-                    for number, score, by in hits
-                )
-            }
-        )
-
     shards = [weighted((4, 0.1, 0.9), (1, 0.8, 0.3)), weighted((3, 0.2, 0.9), (2, 0.9, 0.5))]
     assert ranked(merge_responses(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
 
@@ -142,6 +141,13 @@ def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
     assert ranked(merged)[: merged.certified_k] == truth[: merged.certified_k]
     if all(one.certificate != NONE for one in answers):
         assert merged.certified_k == len(truth)
+
+
+def test_what_is_certain_of_a_ranking_by_weighted_scores_is_decided_by_them() -> None:
+    early = weighted((1, 0.3, 0.9), (2, 0.2, 0.5), certified_k=1, certificate=NONE)
+    # A photo that the first shard has not seen may have a weighted score of up to 0.9.
+    merged = merge_responses([early, weighted((3, 0.8, 0.7))], k=3)
+    assert (ranked(merged), merged.certified_k) == ([(1, 0.3), (3, 0.8), (2, 0.2)], 1)
 
 
 def test_largest_error_of_an_estimate_is_merged_and_none_without_estimates() -> None:

@@ -100,3 +100,4 @@ def test_an_unknown_motion_is_an_error_that_lists_the_known_ones(motion: str) ->
 def test_a_motion_is_a_name_or_a_maximum_speed() -> None:
     assert motion_model("car") is MOTION_MODELS["car"]
     assert motion_model("7.5").max_speed_mps == 7.5
+    assert motion_model(5e-324).typical_speed_mps > 0, "distances are divided by it"

@@ -140,9 +140,22 @@ def test_a_clock_that_was_ahead_is_put_right(folder: Path, tmp_path: Path) -> No
     assert found["position"]["latitude"] == expected
 
 
+def test_a_date_that_no_camera_meant_is_no_time_and_stops_nothing(folder: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "0001:01:01 00:00:00"
+    (folder / "5.jpg").write_bytes(encoded(photo_image(1), "JPEG", exif=exif))
+    found = proposals(folder, "--time-zone", "+02:00", "--clock-offset", "5")
+    assert (found["5.jpg"]["captured_at"], found["5.jpg"]["position"]) == (None, None)
+    assert found["day 1/2.jpg"]["accepted"]
+    found = proposals(folder, "--clock-offset", "5")
+    assert found["5.jpg"]["captured_at"] is None
+
+
 def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "track.gpx"
-    for text in ("no XML", "<gpx/>", '<gpx><trkpt lat="1"><time>2026-05-01</time></trkpt></gpx>'):
+    early = '<gpx><trkpt lat="1" lon="1"><time>0001-01-01T00:00:00+02:00</time></trkpt></gpx>'
+    no_longitude = '<gpx><trkpt lat="1"><time>2026-05-01</time></trkpt></gpx>'
+    for text in ("no XML", "<gpx/>", no_longitude, early):
         path.write_text(text)
         with pytest.raises(InvalidRequest) as refusal:
             read_gpx(path)
@@ -313,10 +326,8 @@ def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others() -> No
     assert search(answer())[1] == [None]
 
 
-def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
-    unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
-    by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
+def connect(monkeypatch: pytest.MonkeyPatch, response: Similar) -> None:
+    """Let a server answer every search so."""
 
     class Connection:
         def __enter__(self) -> Any:
@@ -329,15 +340,79 @@ def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.M
             return type("Stats", (), {"searchable_images": 10})
 
         def similar(self, path: Path, **options: object) -> Similar:
-            return by_label
+            return response
 
     monkeypatch.setattr(command, "connect", lambda *options: Connection())
+
+
+def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
+    unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
+    by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
+
+    connect(monkeypatch, by_label)
     found = proposals(folder, picture=True)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
     result = run(folder, "--write", "gpx", picture=True)
     assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
     assert run(folder, "--write", "csv", picture=True).exit_code == 0
     assert "4.jpg,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
+
+
+def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels = [{"place": "tower/floor 7", "probability": 0.3}]
+    connect(monkeypatch, answer(estimate={"reason": "", "levels": levels}))
+    found = proposals(folder, picture=True)["day 1/2.jpg"]
+    assert (found["accepted"], found["place"], found["place_probability"]) == (
+        True,
+        "tower/floor 7",
+        0.3,
+    )
+    assert run(folder, "--write", "csv", picture=True).exit_code == 0
+    table = (folder / "placewise-locations.csv").read_bytes()
+    (entry,) = read_csv_manifest(table, "table")
+    assert entry.fields.keys() == {"latitude", "longitude"}
+
+
+@pytest.mark.parametrize("target", ["sidecar", "exif"])
+def test_a_photo_that_got_coordinates_or_was_moved_during_the_searches_is_left_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    (folder / "5.jpg").write_bytes(photo(25))
+    located, moved, changed = (folder / name for name in ("day 1/2.jpg", "5.jpg", "6.jpg"))
+    changed.write_bytes(photo(30))
+
+    def write_later(*arguments: Any) -> Any:
+        located.write_bytes(photo(20, 5.0))
+        moved.unlink()
+        return writers.write_locations(*arguments)
+
+    monkeypatch.setattr(command, "write_locations", write_later)
+    result = run(folder, "--write", target)
+    assert result.exit_code == 1
+    assert "day 1/2.jpg: got coordinates meanwhile" in result.stderr
+    assert "5.jpg: was moved or deleted meanwhile" in result.stderr
+    assert "1 files written: 6.jpg" in result.stderr
+    assert located.read_bytes() == photo(20, 5.0)
+    assert not (folder / "5.jpg.xmp").exists()
+
+
+def test_a_photo_that_is_changed_while_its_exif_is_written_keeps_the_change(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo_file = folder / "day 1" / "2.jpg"
+    found = writers.find_exif_writer()
+
+    def write_slowly(*arguments: Any) -> None:
+        found(*arguments)
+        photo_file.write_bytes(photo(20, camera="edited"))
+
+    monkeypatch.setattr(writers, "find_exif_writer", lambda: write_slowly)
+    result = run(folder, "--write", "exif")
+    assert (result.exit_code, "changed the file meanwhile" in result.stderr) == (1, True)
+    assert photo_file.read_bytes() == photo(20, camera="edited")
 
 
 def test_the_table_is_tab_separated_without_a_terminal(folder: Path) -> None:
