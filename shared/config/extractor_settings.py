@@ -26,7 +26,7 @@ class ExtractorSettings(BaseSettings):
     descriptor_rows: Literal["float32", "float16"] = Field(
         "float16",
         description="type of the stored descriptors of new maps: float16 takes half the space of "
-        "float32, and changes a score by about 0.00001",
+        "float32, and changes a score by 0.00001 at 7,168 dimensions",
     )
     dino_model: str | None = Field(
         None,

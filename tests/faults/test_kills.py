@@ -132,5 +132,5 @@ def assert_each_finds_itself(server: ServerProcess, acknowledged: dict[int, str]
     for number in range(0, PHOTOS, 10):
         found = server.ask(photo_bytes(number), top_k=2).json()["similar_images"]
         assert found[0]["image_id"] == acknowledged[number]
-        assert found[0]["similarity_score"] > 0.9999
+        assert found[0]["similarity_score"] > 0.9995  # the rows are float16
         assert found[1]["image_id"] != acknowledged[number]
