@@ -88,7 +88,8 @@ def _measure_cpu(
     batch: int,
     on_left: Callable[[int], object],
 ) -> None:
-    _upload_and_wait(fleet, jpegs, 2 * batch, lambda left: None)  # models, decoders, connections
+    # What a process does once: models, decoders, connections, and the kernels of a larger map.
+    _upload_and_wait(fleet, jpegs, photos + 2 * batch, lambda left: None)
     before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
     _upload_and_wait(fleet, jpegs, photos, on_left)
     after, servers_after = fleet.cpu_seconds(), fleet.server_cpu_seconds()
