@@ -1,7 +1,8 @@
 # Placewise: `make` alone lists the targets.
 PYTHON ?= python3
-# Another build of PyTorch, for example: make setup TORCH_INDEX=https://download.pytorch.org/whl/cpu
-TORCH_INDEX ?=
+# Another build of PyTorch, for example: make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# The first one is kept in .venv, so that later targets install no other.
+TORCH_INDEX ?= $(shell cat .venv/torch-index 2>/dev/null)
 HOST ?= 127.0.0.1
 PORT ?= 8000
 PLACEWISE_HOME ?= ./var
@@ -12,34 +13,35 @@ unexport PYTHONDONTWRITEBYTECODE
 VENV := .venv
 BIN := $(VENV)/bin
 UV_VERSION := 0.13.8
+RUNNABLE := $(VENV)/.runnable
 INSTALLED := $(VENV)/.installed
+INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-fast test-deploy test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
+.PHONY: help setup run test test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 setup: $(INSTALLED) ## create .venv and install everything (TORCH_INDEX= selects another torch build)
 
-$(INSTALLED): pyproject.toml requirements.lock
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Placewise needs Python 3.11 or newer; this is %d.%d. Try: make setup PYTHON=python3.12" % sys.version_info[:2])'
+$(RUNNABLE): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Placewise needs Python 3.11 or newer; this is %d.%d. Try: make $(or $(MAKECMDGOALS),run) PYTHON=python3.12" % sys.version_info[:2])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-ifeq ($(TORCH_INDEX),)
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --requirement requirements.lock
-else
-	# The lock pins the CUDA build and its libraries: skip those and install torch from the other index.
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --index-url $(TORCH_INDEX) \
-		$$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock)
-	grep -vE '^(torch|torchvision|triton|nvidia-[a-z0-9-]+|cuda-[a-z0-9-]+)(\[|==)' requirements.lock > $(VENV)/other.lock
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-deps --requirement $(VENV)/other.lock
+ifneq ($(TORCH_INDEX),)
+	@echo $(TORCH_INDEX) > $(VENV)/torch-index
+	$(INSTALL) --index-url $(TORCH_INDEX) $$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock)
 endif
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-deps --editable .
+	$(INSTALL) --constraint requirements.lock --editable '.[embedded,exif,heic,tracks]'
+	@touch $(RUNNABLE)
+
+$(INSTALLED): $(RUNNABLE)
+	$(INSTALL) --constraint requirements.lock --requirement pyproject.toml --all-extras
 	@touch $(INSTALLED)
 
-run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
-	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) $(BIN)/placewise serve
+run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
+	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) exec $(BIN)/placewise serve
 
 test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
@@ -47,8 +49,18 @@ test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real p
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
 	$(BIN)/python -m pytest tests/unit tests/contract -m "not servers" --numprocesses logical --dist loadfile
 
+# ARM ignores the names of x86's instructions and cores.
+test-numerics: $(INSTALLED) ## tests whose outcome depends on rounding, with the sums of another processor
+	ATEN_CPU_CAPABILITY=default ONEDNN_MAX_CPU_ISA=SSE41 MKL_CBWR=COMPATIBLE OPENBLAS_CORETYPE=Nehalem \
+		FAISS_SIMD_LEVEL=NONE NUMBA_CPU_NAME=generic NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c \
+		'import numpy; print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", []))')" \
+		$(BIN)/python -m pytest tests -m numerics --numprocesses logical --dist loadfile
+
 test-deploy: $(INSTALLED) ## tests of the files for containers and Kubernetes (part of `make test`)
 	$(BIN)/python -m pytest tests/deploy
+
+test-images: $(INSTALLED) ## build each image's environment by the Dockerfile, and run the services in them
+	PLACEWISE_TEST_IMAGES=1 $(BIN)/python -m pytest tests/deploy/images
 
 test-browser: $(INSTALLED) ## tests of the page in Chromium (apt-get install chromium)
 	PLACEWISE_TEST_BROWSER=1 $(BIN)/python -m pytest tests/browser

@@ -103,10 +103,11 @@ def _record_peer(app: ASGIApp) -> ASGIApp:
 
 @contextlib.contextmanager
 def stop_on_signals(server: uvicorn.Server) -> Iterator[None]:
-    """Context manager in which SIGTERM and SIGINT stop the server gracefully.
+    """Context manager in which SIGTERM, SIGINT and SIGHUP stop the server gracefully.
 
-    uvicorn raises the signal again after its shutdown. Python's default handlers would then end the
-    process before the other services have released their resources.
+    A closed terminal sends SIGHUP; under `nohup` it is ignored. uvicorn raises the signal again
+    after its shutdown. Python's default handlers would then end the process before the other
+    services have released their resources.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may set signal handlers
@@ -115,7 +116,10 @@ def stop_on_signals(server: uvicorn.Server) -> Iterator[None]:
     def stop(_number: int, _frame: object) -> None:
         server.should_exit = True
 
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield
     finally:

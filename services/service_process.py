@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from uuid import UUID
 
 from shared.catalog.database.schema import migrate, wait_for_schema
@@ -13,6 +15,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import get_or_create_installation
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.tracing import configure_tracing
 
@@ -29,11 +32,15 @@ Announce = Callable[[str], None]
 def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
     """Set up logging and tracing, and open the catalog once its schema is current.
 
+    A thread that crashes stops the process as SIGTERM does.
+
     Raises:
-        Misconfigured, Unavailable: As `wait_for_schema` raises them.
+        Misconfigured: As `wait_for_schema` and `stop_when_a_thread_crashes` raise it.
+        Unavailable: As `wait_for_schema` raises it.
     """
     configure_logging(settings, name)
     with (
+        stop_when_a_thread_crashes(lambda: os.kill(os.getpid(), signal.SIGTERM)),
         configure_tracing(settings, name),
         contextlib.closing(open_catalog(settings, name)) as catalog,
     ):
@@ -50,18 +57,42 @@ def migrate_catalog(settings: Settings) -> UUID:
             return get_or_create_installation(session).id
 
 
-def start_service_thread(
-    name: str, run: RunUntilStopped, stop: threading.Event, on_crash: Callable[[], None]
-) -> threading.Thread:
-    """Starts `run(stop)` in a thread; logs its exception and calls `on_crash` if it raises."""
+@contextlib.contextmanager
+def stop_when_a_thread_crashes(stop: Callable[[], object]) -> Iterator[None]:
+    """Call `stop` when any thread ends with an exception while the block runs.
 
-    def guarded() -> None:
-        try:
-            run(stop)
-        except BaseException:
-            log.exception("the service thread %s crashed", name)
-            on_crash()
+    It holds for every thread of the process, also for those that a library has started: a service
+    of which a part is dead must not look healthy.
 
-    thread = threading.Thread(target=guarded, name=name)
-    thread.start()
-    return thread
+    Raises:
+        Misconfigured: `thread_crashed`, when the block ends after such an exception.
+    """
+    crashed = threading.Event()
+
+    def on_crash(crash: threading.ExceptHookArgs) -> None:
+        if crash.exc_type is SystemExit:  # ends a thread quietly, as in Python's own hook
+            return
+        name = crash.thread.name if crash.thread else "unknown"
+        log.critical("the thread %s crashed", name, exc_info=crash.exc_value)
+        crashed.set()
+        stop()
+
+    previous, threading.excepthook = threading.excepthook, on_crash
+    try:
+        yield
+    finally:
+        threading.excepthook = previous
+        if crashed.is_set():
+            raise Misconfigured(
+                "thread_crashed", "A thread crashed. Its exception is in the log above."
+            )
+
+
+def start_service_threads(
+    runs: Mapping[str, RunUntilStopped], stop: threading.Event
+) -> list[threading.Thread]:
+    """Start a thread of each name, which runs until `stop` is set."""
+    threads = [threading.Thread(target=run, args=[stop], name=name) for name, run in runs.items()]
+    for thread in threads:
+        thread.start()
+    return threads

@@ -30,7 +30,7 @@ from services.http_server import http_server, lan_url, listen, reachable_url, st
 from services.search.metrics import MeteredSearch
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.service_process import start_service_thread
+from services.service_process import start_service_threads, stop_when_a_thread_crashes
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -75,21 +75,18 @@ class Standalone:
     local_key: str | None
     """Key for the CLI of this user; None on loopback without ADMIN_KEY, where no key is needed."""
     error: PlacewiseError | None = None
-    """Why a service thread could not continue: the process must end with this error."""
+    """Why the extractor could not start: the process must end with this error."""
 
     def stop(self, error: PlacewiseError | None = None) -> None:
-        """Stop the server because a service thread has failed; by default `thread_crashed`."""
-        self.error = error or Misconfigured(
-            "thread_crashed", "A service thread crashed. Its exception is in the log above."
-        )
+        """Stop the server; `serve` then raises the error, if there is one."""
+        self.error = error
         self.server.should_exit = True
 
     def serve(self) -> None:
         """Serve HTTP until the process is stopped by a signal.
 
         Raises:
-            Misconfigured: `thread_crashed`, if a service thread has crashed; also as the
-                extractor's start raises it.
+            PlacewiseError: As the extractor's start raises it.
         """
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
@@ -103,7 +100,7 @@ def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None])
     Raises:
         PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
     """
-    configure_logging(settings, "embedded")
+    configure_logging(settings, "embedded", for_operators=False)
     with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
         on_ready(running)
         running.serve()
@@ -123,7 +120,8 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
 
     Raises:
         Misconfigured: `home_in_use` if another server uses the folder, `address_in_use`,
-            `separate_services` if SEARCH_URLS is set, and those of `open_installation_store`.
+            `separate_services` if SEARCH_URLS is set, `thread_crashed` at the end if a thread has
+            crashed, and those of `open_installation_store`.
         Unavailable: The bucket can't be used.
     """
     if settings.search_worker_urls:
@@ -209,19 +207,20 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 extractor.run(stop, wakeups)
 
         stop = threading.Event()
-        threads = [
-            start_service_thread(thread_name, run, stop, running.stop)
-            for thread_name, run in (
-                ("search", search.run),
-                ("search of building generations", search.run_building),
-                ("search heartbeat", heartbeat.run),
-                ("extractor", run_extractor),
-                ("steward", steward.run),
-                ("evaluator", evaluator.run),
-                ("batches", batches.run),
-                ("webhooks", webhooks.run),
-            )
-        ]
+        stack.enter_context(stop_when_a_thread_crashes(running.stop))
+        threads = start_service_threads(
+            {
+                "search": search.run,
+                "search of building generations": search.run_building,
+                "search heartbeat": heartbeat.run,
+                "extractor": run_extractor,
+                "steward": steward.run,
+                "evaluator": evaluator.run,
+                "batches": batches.run,
+                "webhooks": webhooks.run,
+            },
+            stop,
+        )
         try:
             yield running
         finally:

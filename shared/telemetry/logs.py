@@ -25,7 +25,16 @@ from shared.telemetry.tracing import current_request_id, current_trace_id
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("services", "shared")
 # Third-party loggers, limited to warnings.
-QUIET_LOGGERS = ("alembic", "celery", "httpx2", "kombu", "opentelemetry", "sqlalchemy", "urllib3")
+QUIET_LOGGERS = (
+    "alembic",
+    "celery",
+    "httpx2",
+    "kombu",
+    "opentelemetry",
+    "sqlalchemy",
+    "urllib3",
+    "uvicorn",
+)
 
 # C0 and C1 controls, DEL, Unicode's line breaks and bidirectional controls, surrogates.
 UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -122,7 +131,9 @@ class _PrivateRotatingFileHandler(RotatingFileHandler):
         return append_to_private_file(Path(self.baseFilename))
 
 
-def configure_logging(settings: Settings, service: str, *, to_file: bool = True) -> None:
+def configure_logging(
+    settings: Settings, service: str, *, to_file: bool = True, for_operators: bool = True
+) -> None:
     """Log to stderr and LOG_FILE in the format of LOG_FORMAT, with debug lines if DEBUG is set.
 
     Replaces the existing handlers of the root logger.
@@ -130,11 +141,15 @@ def configure_logging(settings: Settings, service: str, *, to_file: bool = True)
     Args:
         to_file: Write to LOG_FILE. Commands that may run beside a server do not, because only one
             process can rotate a file.
+        for_operators: If False, a terminal shows no lines below WARNING, unless DEBUG is set.
 
     Raises:
         Misconfigured: `bad_setting`, if LOG_FILE can't be written.
     """
-    handlers: list[logging.Handler] = [logging.StreamHandler()]
+    stderr = logging.StreamHandler()
+    if not for_operators and not settings.debug and stderr.stream.isatty():
+        stderr.setLevel(logging.WARNING)
+    handlers: list[logging.Handler] = [stderr]
     if to_file and settings.log_file is not None:
         handlers.append(_open_log_file(settings, settings.log_file))
     for handler in handlers:

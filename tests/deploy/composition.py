@@ -50,9 +50,12 @@ def read_by_docker(
     values: Mapping[str, str],
     profiles: Sequence[str] = (),
     *options: str,
+    override: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """`docker compose config` of a project folder, with no variables but `values`."""
     command = [docker_compose(), "-f", str(file), "--project-directory", str(project)]
+    if override is not None:
+        command += ["-f", str(override)]
     for profile in profiles:
         command += ["--profile", profile]
     return subprocess.run(
@@ -66,10 +69,14 @@ def read_by_docker(
 
 
 def services(
-    file: Path, project: Path, values: Mapping[str, str], profiles: Sequence[str] = PROFILES
+    file: Path,
+    project: Path,
+    values: Mapping[str, str],
+    profiles: Sequence[str] = PROFILES,
+    override: Path | None = None,
 ) -> dict[str, Json]:
     """Each service in full, by its name."""
-    result = read_by_docker(file, project, values, profiles, "--format", "json")
+    result = read_by_docker(file, project, values, profiles, "--format", "json", override=override)
     assert result.returncode == 0, result.stderr
     # What is meant as a dollar comes out doubled, so that it could be read again.
     read: dict[str, Json] = json.loads(result.stdout.replace("$$", "$"))["services"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -104,6 +105,32 @@ def test_the_embedded_placewise_runs_on_a_gpu_where_its_service_is_named(project
     # The data stay where they are.
     for shared in ("volumes", "ports", "command"):
         assert gpu[shared] == found["placewise"][shared]
+
+
+def test_the_documented_service_for_a_second_gpu_reserves_that_gpu_alone(
+    tmp_path: Path, values: dict[str, str]
+) -> None:
+    page = (ROOT / "docs/how-to/docker-compose.md").read_text()
+    (example,) = re.findall(r"```yaml\n(services:\n  extractor-gpu-1:.*?)```", page, re.DOTALL)
+    shutil.copy(SERVICES, tmp_path)
+    override = tmp_path / "docker-compose.override.yml"
+    override.write_text(example)
+    found = services(tmp_path / SERVICES.name, tmp_path, values, ("gpu",), override)
+    reserved = {
+        name: found[name]["deploy"]["resources"]["reservations"]["devices"]
+        for name in ("extractor-gpu", "extractor-gpu-1")
+    }
+    device = {"driver": "nvidia", "capabilities": ["gpu"]}
+    assert reserved == {
+        "extractor-gpu": [{**device, "device_ids": ["0"]}],
+        "extractor-gpu-1": [{**device, "device_ids": ["1"]}],
+    }
+    second = found["extractor-gpu-1"]
+    # Prometheus looks extractors up by this name.
+    assert set(second["networks"]) == set(found["extractor-gpu"]["networks"])
+    assert second["networks"]["inside"]["aliases"] == ["extractor-gpu"]
+    for name in ("image", "command", "environment", "volumes", "depends_on", "profiles"):
+        assert second[name] == found["extractor-gpu"][name]
 
 
 @pytest.mark.parametrize("missing", sorted(REQUIRED))

@@ -15,6 +15,7 @@ from sqlalchemy import func, select
 
 from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog.database.session import Catalog
+from shared.catalog.installation import open_installation_store
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import Job, JobState, celery_wakeups
@@ -160,7 +161,11 @@ def map_id(catalog_on_postgres: Catalog) -> UUID:
 def extractor(
     tmp_path: Path, catalog_on_postgres: Catalog, own_redis: RedisServer, map_id: UUID
 ) -> Iterator[Extractor]:
-    started = Extractor(tmp_path / "home", catalog_on_postgres, own_redis)
+    # The folder belongs to the catalog before photos are stored: until their rows are committed, it
+    # would look like another catalog's.
+    home = tmp_path / "home"
+    open_installation_store(catalog_on_postgres, Settings(placewise_home=home), exclusive=False)
+    started = Extractor(home, catalog_on_postgres, own_redis)
     yield started
     started.process.kill()
     started.process.wait()

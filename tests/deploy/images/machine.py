@@ -1,7 +1,8 @@
 """The services of docker-compose.yml as processes of this machine, on the ports that are free.
 
-A service's command, environment and health check are taken from the file as they stand. Only where
-things are is exchanged: a service's host and port, and the folders that are its own in a container.
+A service's command, environment and health check are taken from the file as they stand, and it runs
+in the environment of its image. Only where things are is exchanged: a service's host and port, and
+the folders that are its own in a container.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from tests.deploy.composition import Json, seconds
-from tests.support.server import environment
+from tests.deploy.images.image import Image
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.programs import find_redis, find_weed
 
@@ -36,10 +37,17 @@ target == "-" and sys.stdout.buffer.write(data)
 class Machine:
     """`start` a service, ask for its health, `stop` it as an orchestrator would."""
 
-    def __init__(self, root: Path, services: Mapping[str, Json], places: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        root: Path,
+        services: Mapping[str, Json],
+        image: Callable[[str], Image],
+        places: Mapping[str, str],
+    ) -> None:
         """`places` says where servers of others are: {"postgres:5432": "127.0.0.1:18123"}."""
         self.root = root
         self._services = services
+        self._image = image
         self._ports = dict(zip(services, free_ports(len(services)), strict=True))
         self._places = dict(places)
         for name in services:
@@ -77,26 +85,28 @@ class Machine:
             )
 
     def is_healthy(self, service: str) -> bool:
-        """What the service's own check says, within the time that it has."""
+        """What the service's own check says; one that takes too long has failed."""
         check = self._services[service]["healthcheck"]
         kind, *test = check["test"]
         command = test if kind == "CMD" else ["sh", "-c", *test]
-        done = subprocess.run(
-            [self._here(service, part) for part in command],
-            env=self._environment(service),
-            cwd=self.folder(service),
-            capture_output=True,
-            # Twice: this machine is shared by tests.
-            timeout=2 * seconds(check["timeout"]),
-            check=False,
-        )
+        try:
+            done = subprocess.run(
+                [self._here(service, part) for part in command],
+                env=self._environment(service),
+                cwd=self.folder(service),
+                capture_output=True,
+                timeout=seconds(check["timeout"]),
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return False
         return done.returncode == 0
 
     def wait_until_healthy(self, *services: str) -> None:
         deadline = time.monotonic() + START_SECONDS
         for service in services:
             while not self.is_healthy(service):
-                assert self._running[service].poll() is None, f"{service}: {self.log(service)}"
+                self.check_running()
                 assert time.monotonic() < deadline, f"{service}: {self.log(service)}"
                 time.sleep(LOOK_SECONDS)
 
@@ -112,6 +122,20 @@ class Machine:
         process = self._running.pop(service)
         process.send_signal(signal.Signals[of.get("stop_signal", "SIGTERM")])
         return process.wait(timeout=seconds(of["stop_grace_period"]))
+
+    def send_signal(self, service: str, sig: signal.Signals) -> None:
+        self._running[service].send_signal(sig)
+
+    def kill(self, service: str) -> None:
+        """SIGKILL, to its children as well: so does the end of a container."""
+        process = self._running.pop(service)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+    def check_running(self) -> None:
+        """Fail if a service that was started has ended."""
+        for service, process in self._running.items():
+            assert process.poll() is None, f"{service} ended: {self.log(service)}"
 
     def log(self, service: str) -> str:
         return self._log(service).read_text(errors="replace")[-4000:]
@@ -133,19 +157,20 @@ class Machine:
         return re.sub(r"(?<![\w.])/(tmp|data)\b", str(self.folder(service)), text)
 
     def _environment(self, service: str) -> dict[str, str]:
-        base = environment(self.folder(service))
-        for name in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS", "DECODE_PROCESSES", "PLACEWISE_HOME"):
-            del base[name]  # placewise.env and the image say
-        reported = self._services[service].get("environment") or {}
+        folder, of = self.folder(service), self._services[service]
+        if "build" in of:
+            image = self._image(of["build"]["args"]["SERVICE"])
+            base = image.environment(folder, self._programs)
+        else:
+            base = {"PATH": f"{self._programs}:{os.environ['PATH']}", "HOME": str(folder)}
+        reported = of.get("environment") or {}
         read = {name: self._here(service, value) for name, value in reported.items()}
         for port in ("PORT", "FLOWER_PORT"):
             if port in read:
                 read[port] = str(self._ports[service])
         if "METRICS_PORT" in read:
             read["METRICS_PORT"] = "0"  # of all of them on one machine
-        path = f"{self._programs}:{Path(sys.executable).parent}:{os.environ['PATH']}"
-        home = {"PLACEWISE_HOME": str(self.folder(service))}
-        return {**base, **home, **read, "PATH": path, "REDISCLI_PORT": str(self._ports["redis"])}
+        return {**base, **read}
 
     def _log(self, service: str) -> Path:
         return self.root / f"{service}.log"
@@ -166,7 +191,6 @@ class Machine:
         self._program("redis-cli", f'exec {redis.with_name("redis-cli")} -p {port} "$@"')
         self._program("weed", f'exec {weed} "$@" {ports} {mine} {small}')
         self._program("wget", WGET.format(python=sys.executable), interpreter="")
-        self._program("python", f'exec {sys.executable} "$@"')
 
     def _program(self, name: str, text: str, interpreter: str = "#!/bin/sh\n") -> None:
         file = self._programs / name

@@ -1,0 +1,74 @@
+"""What is installed in each image: all that its service imports, and no more than that."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.composition import ROOT
+from tests.deploy.images.conftest import BuildImage
+
+# kombu imports it when it first connects.
+BROKER = "kombu.transport.redis"
+MODULES = {
+    "embedded": ["services.standalone", "services.extractor.worker"],
+    "extractor": ["services.extractor.service", BROKER],
+    "flower": ["flower.command", BROKER],
+    "gateway": ["services.gateway.service", BROKER],
+    "search": ["services.search.service"],
+    "steward": ["services.steward.service", BROKER],
+}
+# What the command imports, whatever service it runs; some of it at its first use.
+COMMAND = [
+    "services.cli.main",
+    "services.cli.operations.installation_checks",
+    "services.cli.operations.maintenance",
+    "shared.catalog.installation",
+    "shared.telemetry.heartbeat",
+    "alembic.command",
+    "opentelemetry.exporter.otlp.proto.http.trace_exporter",
+    "shared.catalog.database.postgres",
+    "shared.storage.s3",
+]
+IMPORT = """
+import importlib, sys
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+if "services.cli.main" in sys.argv:
+    sys.modules["services.cli.main"].build_app()
+"""
+pytestmark = pytest.mark.timeout(1200)  # with the builds, on a busy machine
+
+
+@pytest.mark.parametrize("service", MODULES)
+def test_an_image_holds_what_its_service_and_the_command_import(
+    service: str, image: BuildImage, tmp_path: Path
+) -> None:
+    command = [] if service == "flower" else COMMAND  # it runs Celery's
+    done = subprocess.run(
+        [image(service).python, "-c", IMPORT, *MODULES[service], *command],
+        cwd=tmp_path,
+        env=image(service).environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-1500:]
+
+
+def test_only_the_images_that_describe_photos_hold_torch(image: BuildImage) -> None:
+    holding = {service for service in MODULES if "torch" in image(service).packages()}
+    assert holding == {"embedded", "extractor"}
+
+
+def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = [re.split(r"[^\w.-]", line)[0] for line in project["optional-dependencies"]["dev"]]
+    tools = set(names) - {"placewise", "pyyaml"}  # which huggingface-hub needs, too
+    assert {"pytest", "moto"} <= tools
+    for service in MODULES:
+        assert not image(service).packages() & tools, service
