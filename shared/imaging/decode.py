@@ -34,8 +34,8 @@ from shared.imaging.file_formats import (
     check_pixel_count,
     detect_media_type,
     needs_preview,
-    open_photo,
 )
+from shared.imaging.file_structure import open_photo
 from shared.imaging.photo_header import ROTATED_ORIENTATIONS
 from shared.imaging.preprocessing import Pixels, Preprocessing
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from enum import StrEnum
 from pathlib import PurePosixPath
-from typing import BinaryIO
 
 from PIL import Image
 
@@ -115,11 +114,6 @@ def needs_preview(
     if media_type not in BROWSER_MEDIA_TYPES:
         return previews != Previews.NONE
     return previews == Previews.ALL and max(width, height) > PREVIEW_PIXELS
-
-
-def open_photo(file: BinaryIO) -> Image.Image:
-    """Open a photo with Pillow; reads the header and decodes no pixels."""
-    return Image.open(file, formats=PILLOW_FORMATS)
 
 
 def check_pixel_count(width: int, height: int, max_pixels: int) -> None:

@@ -184,10 +184,16 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
     assert reason(whole[: len(whole) * 2 // 3]).code == "undecodable_photo"
 
 
-@pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"\xff\xd8\xff\xe0", b"GIF89a"])
+@pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"GIF89a"])
 def test_what_is_no_photo_is_an_error_that_names_what_is_accepted(data: bytes) -> None:
     assert reason(data).code == "undecodable_photo"
     assert "not JPEG, PNG, WebP, BMP, TIFF or HEIC" in reason(data).detail
+
+
+def test_header_that_is_cut_off_is_an_error_that_says_so() -> None:
+    error = reason(b"\xff\xd8\xff\xe0")
+    assert error.code == "undecodable_photo"
+    assert error.detail == "The photo can't be decoded: its header is cut off."
 
 
 def test_formats_that_are_not_accepted_are_not_decoded() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import io
 import random
+import struct
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
 from shared.imaging.file_formats import detect_media_type
 from shared.imaging.photo_header import read_photo_header
 from shared.imaging.preprocessing import get_preprocessing
+from tests.support import hostile_headers
 from tests.support.photos import photo_image
 
 PIXELS = 50_000_000
@@ -108,6 +110,39 @@ def test_an_extractor_without_the_decoder_says_what_to_install(no_decoder: None)
 def test_an_avif_that_calls_itself_mif1_is_refused() -> None:
     data = PHOTO.replace(b"ftypheic", b"ftypmif1").replace(b"hvc1", b"av01")
     assert detect_media_type(data[:16]) == "image/heic"
+    with pytest.raises(Unprocessable) as caught:
+        read_photo_header(io.BytesIO(data), PIXELS)
+    assert caught.value.code == "undecodable_photo"
+
+
+def test_exif_is_found_behind_an_item_of_several_extents() -> None:
+    exif = b"\0\0\0\6" + taken_in_turin()
+    at = 1000
+    iloc = struct.pack(">HHH", 1, 0, 3) + bytes(24) + struct.pack(">HHHII", 2, 0, 1, at, len(exif))
+    data = hostile_headers.heic(iloc, entries=2).ljust(at, b"\0") + exif
+    header = read_photo_header(io.BytesIO(data), PIXELS)
+    assert (header.width, header.height) == (320, 200)
+    assert header.latitude == pytest.approx(45.07)
+
+
+@pytest.mark.parametrize("sizes", [b"\x40\0", b"\x04\0", b"\0\0"])
+def test_fields_of_size_zero_are_refused(sizes: bytes) -> None:
+    with pytest.raises(Unprocessable) as caught:
+        read_photo_header(io.BytesIO(hostile_headers.heic(bytes(100), sizes=sizes)), PIXELS)
+    assert caught.value.code == "undecodable_photo"
+    assert "its box iloc has fields of size zero" in caught.value.detail
+
+
+def test_exif_of_several_extents_is_left_out() -> None:
+    header = read_photo_header(
+        io.BytesIO(hostile_headers.heic(struct.pack(">HHH", 2, 0, 65_535))), PIXELS
+    )
+    assert (header.width, header.latitude) == (320, None)
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1])
+def test_box_that_is_larger_than_any_file_is_refused(size: int) -> None:
+    data = hostile_headers.box(b"ftyp", b"heic\0\0\0\0") + struct.pack(">I4sQ", 1, b"free", size)
     with pytest.raises(Unprocessable) as caught:
         read_photo_header(io.BytesIO(data), PIXELS)
     assert caught.value.code == "undecodable_photo"

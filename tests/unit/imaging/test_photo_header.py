@@ -5,20 +5,36 @@ from __future__ import annotations
 import io
 import random
 import struct
+import sys
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image, ImageFile
+from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
-from PIL.TiffImagePlugin import IFDRational, TiffImageFile
-from PIL.WebPImagePlugin import WebPImageFile
+from PIL.PngImagePlugin import PngInfo
+from PIL.TiffImagePlugin import IFDRational
 
 from shared.errors import Unprocessable
+from shared.imaging.decode import decode_photo
+from shared.imaging.file_structure import MAX_SEGMENTS, open_photo, read_structure
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
+from shared.imaging.preprocessing import get_preprocessing
+from tests.support.hostile_headers import (
+    MANY_PARTS,
+    chunk,
+    gps_of_many_values,
+    heic,
+    jpeg,
+    png,
+    segment,
+    webp,
+)
 from tests.support.photos import photo_bytes, photo_image
 
 PIXELS = 50_000_000
@@ -30,14 +46,14 @@ def encoded(media: str = "JPEG", **options: Any) -> bytes:
 
 
 def header(data: bytes, max_pixels: int = PIXELS) -> PhotoHeader:
-    """The header, read while no plugin can decode anything."""
+    """The header, read while Pillow can open nothing."""
 
-    def refuse(*_: Any) -> Any:
-        raise AssertionError("the gateway decoded a picture")
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise AssertionError("the gateway gave a photo to Pillow")
 
     with pytest.MonkeyPatch.context() as patch:
-        for kind in (Image.Image, ImageFile.ImageFile, TiffImageFile, WebPImageFile):
-            patch.setattr(kind, "load", refuse)
+        patch.setattr(Image, "open", refuse)
+        patch.setattr(Image.Exif, "load", refuse)
         return read_photo_header(io.BytesIO(data), max_pixels)
 
 
@@ -229,19 +245,15 @@ def test_no_damage_to_the_exif_refuses_a_photo(seed: int, media: str) -> None:
     assert found.captured_at is None or found.captured_at.utcoffset() == UTC.utcoffset(None)
 
 
-def png_chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def png(width: int, height: int, *between: bytes) -> bytes:
+def png_without_pixels(width: int, height: int, *between: bytes) -> bytes:
     """A PNG whose pixels are missing: only a reader of headers can make sense of it."""
     size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", size) + b"".join(between)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + b"".join(between)
 
 
 def test_exif_of_a_png_is_read_where_it_precedes_the_pixels() -> None:
     exif = whole_exif().removeprefix(b"Exif\0\0")
-    data = png(30, 20, png_chunk(b"eXIf", exif), png_chunk(b"IDAT", b"no pixels at all"))
+    data = png_without_pixels(30, 20, chunk(b"eXIf", exif), chunk(b"IDAT", b"no pixels at all"))
     found = header(data)
     assert (found.width, found.height) == (20, 30)
     assert found.latitude == pytest.approx(45.07)
@@ -250,12 +262,12 @@ def test_exif_of_a_png_is_read_where_it_precedes_the_pixels() -> None:
 
 def test_exif_behind_the_pixels_is_not_waited_for() -> None:
     exif = whole_exif().removeprefix(b"Exif\0\0")
-    data = png(30, 20, png_chunk(b"IDAT", b"no pixels"), png_chunk(b"eXIf", exif))
+    data = png_without_pixels(30, 20, chunk(b"IDAT", b"no pixels"), chunk(b"eXIf", exif))
     assert header(data) == PhotoHeader(width=30, height=20)
 
 
 def test_too_many_pixels_are_refused_from_the_header_alone() -> None:
-    bomb = png(60_000, 60_000, png_chunk(b"IDAT", b""))
+    bomb = png_without_pixels(60_000, 60_000, chunk(b"IDAT", b""))
     error = reason(bomb)
     assert error.code == "too_many_pixels"
     assert "60000 x 60000" in error.detail
@@ -275,4 +287,154 @@ def test_truncated_header_is_undecodable(media: str) -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"not a photo", b"GIF89a" + bytes(30)])
 def test_what_is_no_photo_is_undecodable(data: bytes) -> None:
+    assert reason(data).code == "undecodable_photo"
+
+
+MAX_CALLS = 500_000  # of functions; 20,000 parts take some 150,000
+
+
+@contextmanager
+def bounded_work() -> Iterator[None]:
+    """Fail as soon as more than MAX_CALLS functions were called, instead of waiting for hours."""
+    calls = 0
+
+    def count(_: Any, event: str, __: Any) -> None:
+        nonlocal calls
+        calls += event in ("call", "c_call")
+        if calls > MAX_CALLS:
+            sys.setprofile(None)
+            raise AssertionError(f"more than {MAX_CALLS} calls")
+
+    sys.setprofile(count)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_bytes"),
+    [("HEIC: extents without bytes", 780), *((kind, 6_200_000) for kind in MANY_PARTS)],
+)
+def test_header_of_too_many_parts_is_refused_after_bounded_work(kind: str, size_bytes: int) -> None:
+    data = MANY_PARTS[kind](size_bytes)
+    with bounded_work():
+        assert reason(data).code == "undecodable_photo"
+    with bounded_work(), pytest.raises((ValueError, OSError)):
+        open_photo(io.BytesIO(data))
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "HEIC"])
+def test_exif_of_many_values_costs_bounded_work(media: str) -> None:
+    block = gps_of_many_values(5000, 500)
+    larger = gps_of_many_values(60_000, 20_000)
+    data = {
+        "JPEG": jpeg(segment(0xE1, b"Exif\0\0" + gps_of_many_values(4000, 500))),
+        "PNG": png(chunk(b"eXIf", larger)),
+        "WEBP": webp((b"EXIF", block)),
+        "HEIC": heic(struct.pack(">HHHII", 2, 0, 1, 10_000, 4 + len(larger))).ljust(10_000, b"\0")
+        + bytes(4)
+        + larger,
+    }[media]
+    with bounded_work():
+        found = header(data)
+    assert found.latitude is None
+
+
+def test_tiff_of_many_values_costs_bounded_work() -> None:
+    tiff = photo_bytes(1, "TIFF")
+    (at,) = struct.unpack_from("<I", tiff, 4)
+    (count,) = struct.unpack_from("<H", tiff, at)
+    own = tiff[at + 2 : at + 2 + 12 * count]
+    # Orientation, too, has more values than anything that is read.
+    more = b"".join(
+        struct.pack("<HHII", tag, 5, 100_000, 8) for tag in (0x0112, *range(20_000, 60_000))
+    )
+    directory = struct.pack("<H", count + 40_001) + own + more + bytes(4)
+    data = tiff[:4] + struct.pack("<I", 1_000_000) + tiff[8:].ljust(999_992, b"\0") + directory
+    with bounded_work():
+        assert header(data) == PhotoHeader(width=64, height=48)
+
+
+def test_jpeg_with_the_segments_of_a_panorama_with_depth_and_sound_is_read() -> None:
+    """XMP of 10 MB in 150 segments, a colour profile, an index of pictures, EXIF in two parts."""
+    exif = whole_exif().removeprefix(b"Exif\0\0")
+    more = [
+        segment(0xE1, b"Exif\0\0" + exif[:100]),
+        segment(0xE1, b"Exif\0\0" + exif[100:]),
+        segment(0xE1, b"http://ns.adobe.com/xap/1.0/\0<x:xmpmeta/>"),
+        *[segment(0xE1, b"http://ns.adobe.com/xmp/extension/\0" + bytes(65_000))] * 150,
+        *[segment(0xE2, b"ICC_PROFILE\0\x01\x09" + bytes(60_000))] * 9,
+        segment(0xE2, b"MPF\0II*\0\x08\0\0\0\0\0"),
+        b"\xff" * 500 + bytes(500),
+    ]
+    data = jpeg(*more)
+    found = header(data)
+    assert (found.width, found.height) == (48, 64)
+    assert found.latitude == pytest.approx(45.07)
+    assert read_structure(io.BytesIO(data)).xmp == b"<x:xmpmeta/>"
+    decode_photo(data, get_preprocessing("square32"), PIXELS)
+
+
+def test_jpeg_that_ends_between_its_size_and_its_pixels_has_a_header_unless_a_segment_is_cut() -> (
+    None
+):
+    whole = encoded()
+    pixels = whole.index(b"\xff\xda")
+    assert header(whole[:pixels]) == PhotoHeader(width=64, height=48)
+    assert reason(whole[: pixels - 1]).detail == (
+        "The photo can't be decoded: its header is cut off."
+    )
+
+
+def test_limit_of_segments_is_stated() -> None:
+    error = reason(jpeg(segment(0xFE, b"") * MAX_SEGMENTS))
+    assert error.detail == (
+        "The photo can't be decoded: it has more than 1000 segments before its pixels."
+    )
+
+
+XMP = b"<x:xmpmeta>somewhere</x:xmpmeta>"
+TEXTS = PngInfo()
+TEXTS.add_itxt("XML:com.adobe.xmp", XMP.decode())
+
+
+@pytest.mark.parametrize(
+    ("media", "options"),
+    [
+        ("JPEG", {"xmp": XMP, "progressive": True}),
+        ("PNG", {"pnginfo": TEXTS}),
+        ("WEBP", {"xmp": XMP}),
+        ("WEBP", {"xmp": XMP, "lossless": True}),
+        ("WEBP", {"xmp": XMP, "save_all": True, "append_images": [photo_image(2)]}),
+        ("TIFF", {}),
+        ("TIFF", {"big_tiff": True}),
+    ],
+)
+def test_xmp_exif_and_size_are_those_that_pillow_reads(media: str, options: Any) -> None:
+    main: Tags = {Base.Make: "m", Base.Model: "n"}
+    if media == "TIFF":
+        main[700] = XMP  # Pillow's other way of writing it is ignored beside EXIF
+    data = encoded(media, exif=exif_with(position("S", "W"), CAMERA_TIME, main), **options)
+    found = header(data)
+    with Image.open(io.BytesIO(data)) as image:
+        assert (found.width, found.height) == image.size
+        assert read_structure(io.BytesIO(data)).xmp == image.info["xmp"] == XMP
+    assert found.latitude == pytest.approx(-45.07)
+    assert found.longitude == pytest.approx(-7.51)
+    assert found.captured_at == datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)
+    assert found.camera == "m n"
+
+
+def test_compressed_xmp_of_a_png_is_unpacked_up_to_a_limit() -> None:
+    def packed(text: bytes) -> bytes:
+        return png(chunk(b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(text)))
+
+    assert read_structure(io.BytesIO(packed(b"<x:xmpmeta/>"))).xmp == b"<x:xmpmeta/>"
+    assert read_structure(io.BytesIO(packed(bytes(80_000_000)))).xmp is None
+
+
+def test_tiff_whose_width_is_infinite_is_undecodable() -> None:
+    entry = struct.pack("<HHIf", 256, 11, 1, float("inf"))
+    data = b"II*\0\x08\0\0\0" + struct.pack("<H", 1) + entry + bytes(4)
     assert reason(data).code == "undecodable_photo"

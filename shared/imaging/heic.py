@@ -1,0 +1,167 @@
+"""Size and EXIF of a HEIC photo, without its decoder, which is optional.
+
+A HEIC file is a tree of boxes (ISO/IEC 14496-12): each has a length, a name of four letters and
+content. `meta` lists the items (ISO/IEC 23008-12): the image, its tiles, its EXIF; properties in
+`iprp` give the size and the rotation. Each box and each entry of a list is a step of the reader;
+inconsistent files raise ValueError.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from shared.imaging.bounded_reader import MAX_METADATA_BYTES, BoundedReader
+
+HEVC = (b"hvc1", b"grid")  # a single image, or a grid of tiles as phones write it
+QUARTER_TURNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    name: bytes
+    content: bytes
+
+
+def read_heic(reader: BoundedReader) -> tuple[int, int, bytes | None]:
+    """Return upright width and height of the primary image, and its EXIF as a TIFF block.
+
+    Raises ValueError if there is none, or if it is not HEVC (AVIF, for example).
+    """
+    boxes = {box.name: box.content for box in _boxes(reader, _meta(reader))}
+    primary = _primary(boxes[b"pitm"])
+    kinds = dict(_kinds(reader, boxes[b"iinf"]))
+    if kinds.get(primary) not in HEVC:
+        raise ValueError("its primary picture is not HEVC")
+    width, height = _upright_size(reader, boxes[b"iprp"], primary)
+    exif_item = next((item for item, kind in kinds.items() if kind == b"Exif"), None)
+    exif = None if exif_item is None else _exif(reader, boxes.get(b"iloc", b""), exif_item)
+    return width, height, exif
+
+
+def _meta(reader: BoundedReader) -> bytes:
+    """Return the content of the top-level box `meta`."""
+    offset = 0
+    while len(head := reader.read_available(offset, 16)) >= 8:
+        size, name = struct.unpack(">I4s", head[:8])
+        begin = 8
+        if size == 1 and len(head) == 16:
+            size, begin = struct.unpack(">Q", head[8:])[0], 16
+        if name == b"meta":
+            if size < begin + 4:
+                raise ValueError("its box meta has a wrong length")
+            return reader.read(offset + begin + 4, size - begin - 4)  # after version and flags
+        if size < begin:
+            break  # 0: last box; otherwise broken
+        offset += size
+    raise ValueError("it has no box meta")
+
+
+def _boxes(reader: BoundedReader, data: bytes) -> Iterator[_Box]:
+    offset = 0
+    while offset + 8 <= len(data):
+        reader.step()
+        size, name = struct.unpack_from(">I4s", data, offset)
+        if size < 8 or offset + size > len(data):
+            raise ValueError(f"its box {name!r} has a wrong length")
+        yield _Box(name, data[offset + 8 : offset + size])
+        offset += size
+
+
+def _primary(data: bytes) -> int:
+    item: int = struct.unpack_from(">H" if data[0] == 0 else ">I", data, 4)[0]
+    return item
+
+
+def _kinds(reader: BoundedReader, data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield (item, item type) of each entry of `iinf`."""
+    for box in _boxes(reader, data[6 if data[0] == 0 else 8 :]):
+        version = box.content[0]
+        if box.name == b"infe" and version >= 2:
+            item, _, kind = struct.unpack_from(">HH4s" if version == 2 else ">IH4s", box.content, 4)
+            yield item, kind
+
+
+def _upright_size(reader: BoundedReader, data: bytes, item: int) -> tuple[int, int]:
+    """Return width and height of an item after rotation, from `ispe` and `irot`."""
+    parts = {box.name: box.content for box in _boxes(reader, data)}
+    properties = list(_boxes(reader, parts[b"ipco"]))
+    size: tuple[int, int] | None = None
+    quarter_turns = 0
+    for index in _properties_of(reader, parts[b"ipma"], item):
+        if not 1 <= index <= len(properties):
+            raise ValueError("a property of its picture is missing")
+        box = properties[index - 1]
+        if box.name == b"ispe":
+            width, height = struct.unpack_from(">II", box.content, 4)
+            size = (width, height)
+        elif box.name == b"irot":
+            quarter_turns += box.content[0] % QUARTER_TURNS
+    if size is None:
+        raise ValueError("its header has no size")
+    return size if quarter_turns % 2 == 0 else (size[1], size[0])
+
+
+def _properties_of(reader: BoundedReader, data: bytes, item: int) -> list[int]:
+    """Return an item's property numbers, from 1, by `ipma`; 0 stands for none."""
+    version, wide = data[0], data[3] & 1
+    (entries,) = struct.unpack_from(">I", data, 4)
+    offset = 8
+    for _ in range(entries):
+        reader.step()
+        entry, count = struct.unpack_from(">HB" if version == 0 else ">IB", data, offset)
+        offset += 3 if version == 0 else 5
+        if entry == item:
+            numbers = struct.unpack_from(f">{count}{'H' if wide else 'B'}", data, offset)
+            return [index for n in numbers if (index := n & (0x7FFF if wide else 0x7F))]
+        offset += count * (2 if wide else 1)
+    return []
+
+
+def _exif(reader: BoundedReader, data: bytes, item: int) -> bytes | None:
+    """Return the TIFF block of the EXIF item; None unless it is one extent of this file."""
+    extent = _extent(reader, data, item)
+    if extent is None or not 4 < extent[1] <= MAX_METADATA_BYTES:
+        return None
+    block = reader.read_available(*extent)
+    if len(block) < 4:
+        return None
+    begin = 4 + struct.unpack_from(">I", block)[0]
+    return block[begin:] or None
+
+
+def _extent(reader: BoundedReader, data: bytes, item: int) -> tuple[int, int] | None:
+    """Return (offset, length) of an item in the file, by `iloc`; None if it has several extents."""
+    if len(data) < 8:
+        return None
+    version = data[0]
+    offset_size, length_size = data[4] >> 4, data[4] & 15
+    base_size, index_size = data[5] >> 4, data[5] & 15 if version else 0
+    if not offset_size or not length_size:
+        raise ValueError("its box iloc has fields of size zero")
+    wide = version == 2
+    (entries,) = struct.unpack_from(">I" if wide else ">H", data, 6)
+    position = 10 if wide else 8
+
+    def number(size: int) -> int:
+        nonlocal position
+        if position + size > len(data):
+            raise ValueError("its box iloc is cut off")
+        value = int.from_bytes(data[position : position + size], "big")
+        position += size
+        return value
+
+    for _ in range(entries):
+        reader.step()
+        entry = number(4 if wide else 2)
+        method = number(2) & 15 if version else 0
+        source, base, extents = number(2), number(base_size), number(2)
+        if entry != item:
+            position += extents * (index_size + offset_size + length_size)
+            continue
+        if method or source or extents != 1:
+            return None
+        number(index_size)
+        return base + number(offset_size), number(length_size)
+    return None
