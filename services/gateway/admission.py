@@ -42,6 +42,9 @@ RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share
 MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
+MAX_SMOOTHED_TRACKS = 2  # at the same time: each competes with all other requests for the CPU
+MAX_SMOOTHED_TRACKS_PER_CALLER = 1
+SMOOTHING_RETRY_SECONDS = 2
 
 
 class _ConcurrencyLimit:
@@ -139,6 +142,13 @@ class AdmissionControl:
             total=settings.max_event_streams,
             per_caller=settings.max_event_streams_per_caller,
             retry_after_seconds=STREAM_RETRY_SECONDS,
+        )
+        self.smoothed_tracks = _ConcurrencyLimit(
+            "requests for smoothed tracks",
+            "too_many_smoothed_tracks",
+            total=MAX_SMOOTHED_TRACKS,
+            per_caller=MAX_SMOOTHED_TRACKS_PER_CALLER,
+            retry_after_seconds=SMOOTHING_RETRY_SECONDS,
         )
 
     def admit_job(self, map_name: str) -> None:
@@ -253,6 +263,11 @@ async def _admit_query(request: Request) -> None:
     await _run(admission, admission.admit_query)
 
 
+async def _check_disk(request: Request) -> None:
+    admission: AdmissionControl = request.app.state.admission
+    await _run(admission, admission.disk.check)
+
+
 async def _run(admission: AdmissionControl, admit: Callable[[], None]) -> None:
     if admission.may_block():
         await run_in_threadpool(admit)
@@ -288,6 +303,8 @@ def get_photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | No
 CHECK_PHOTO_QUOTA = Depends(_check_photo_quota)
 ADMIT_JOB = Depends(_admit_job)
 ADMIT_QUERY = Depends(_admit_query)
+CHECK_DISK = Depends(_check_disk)
+"""For requests that store rows, but queue no job: StorageFull (`disk_full`)."""
 
 
 def _queue_full_error(what: str, queued: int, limit: int, per_second: float) -> TooManyRequests:

@@ -54,10 +54,13 @@ class Track(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     updated_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     """When the last frame was accepted."""
+    key_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
+    """The API key that began it, if any."""
 
     __table_args__ = (
         sa.Index("ix_tracks_map_id", "map_id", "id"),
         sa.Index("ix_tracks_updated_at", "updated_at"),
+        partial_index("ix_tracks_key", "key_id", only=key_id.is_not(None)),
     )
 
 
@@ -80,6 +83,8 @@ class TrackFrame(Base):
     state: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     belief: Mapped[bytes | None] = mapped_column(sa.LargeBinary)
+    key_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
+    """The API key that sent it, if any."""
 
     __table_args__ = (
         sa.UniqueConstraint("track_id", "captured_at"),
@@ -92,6 +97,7 @@ class TrackFrame(Base):
         partial_index(
             "ix_track_frames_belief", "track_id", "captured_at", only=belief.is_not(None)
         ),
+        partial_index("ix_track_frames_key", "key_id", only=key_id.is_not(None)),
     )
 
     @property

@@ -28,13 +28,21 @@ share of the evidence that is new: the squared Hellinger distance 1 - sum_j sqrt
 of what exceeds the prior, d(j) ~ max(q(j) - 1 / n, 0), from the frame before. A camera that stands
 still adds nothing. SeqSLAM (Milford and Wyeth 2012) sums scores along lines of constant speed
 instead; it is the baseline of the evaluation.
+
+The cost of a step does not depend on how many photos are near. Where these are too many, the hits
+and the nearest ones have a row of their own, and the others count in the sums that K and the
+likelihood of a position fix are divided by (`nearest`). They are no hits, so the frame's evidence
+is the same for all of them, and they share `elsewhere` with the rest of the map.
 """
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 
 import numpy as np
 
@@ -44,7 +52,9 @@ from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel
+from shared.tracks.nearest import MAX_NEAR, find_nearest, weigh_rings
 from shared.tracks.photo_graph import (
+    MAX_SAME_LABEL,
     FloatArray,
     Indices,
     PhotoGraph,
@@ -86,6 +96,8 @@ FIX_OUTLIERS = 0.02
 """Share of the position fixes that are wrong by more than their accuracy explains"""
 HEADING_FLOOR = 0.05
 """Weight of photos that look in a direction which the odometry excludes"""
+KERNEL_ROWS = 50
+"""Rows of K that are computed together, which bounds the memory of a step"""
 SMOOTHED_AT_ONCE = 200
 LATER_FRAMES = 100
 """Frames after those that are smoothed at once"""
@@ -98,7 +110,7 @@ class _Step:
     sources: Indices
     """(n,) rows of the belief before that are still in the map"""
     kernel: FloatArray
-    """(n, m) from them to the photos of the belief after it; what is missing to 1 was pruned"""
+    """(n, m) from them to the photos of the belief after it; what is missing to 1 is elsewhere"""
     stay: float
     """1 - r - e"""
     carried_away: float
@@ -171,6 +183,22 @@ class TrackFilter:
                 del steps[:SMOOTHED_AT_ONCE]
         return smoothed + _backward(steps, count)
 
+    def smoothed_states(
+        self, frames: Sequence[FrameEvidence], start: Belief | None = None
+    ) -> list[TrackState]:
+        """Return where the camera is at each frame given all frames; arguments as of `smooth`.
+
+        The status follows from the smoothed probabilities, as that of `advance` does from those
+        that were known at the frame.
+        """
+        states: list[TrackState] = []
+        for belief in self.smooth(frames, start):
+            state = self.state(belief)
+            before = states[-1].status if states else start.status if start else "converging"
+            status = next_status(before, state.probability, state.outside)
+            states.append(replace(state, status=status))
+        return states
+
     def _step(self, before: Belief, evidence: FrameEvidence) -> _Step:
         seconds = (evidence.time - before.time).total_seconds()
         if seconds < 0:
@@ -182,8 +210,11 @@ class TrackFilter:
         reach_m = self._reach_m(seconds, evidence.odometry)
         moving = np.argsort(-before.probabilities[rows], kind="stable")[:MOVING_PHOTOS]
         reach = min(reach_m, MAX_REACH_M)
-        targets = self._targets(sources, sources.take(moving), evidence, reach)
-        kernel = self._kernel(sources, targets, seconds, evidence.odometry)
+        targets, complete_m = self._targets(sources, sources.take(moving), evidence, reach)
+        if evidence.fix is not None:
+            near_fix, fix_complete_m = _near_fix(self._graph, evidence.fix)
+            targets = targets.union(near_fix)
+        kernel = self._kernel(sources, targets, complete_m, seconds, evidence)
         seen = _excess(evidence, count)
         weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
 
@@ -200,7 +231,10 @@ class TrackFilter:
         predicted = stay * (own @ kernel + density * is_new) + entered
         remaining = max(count - len(targets), 0)
         unseen = count - len(own) - int(is_new.sum())
-        predicted_elsewhere = stay * density * max(unseen, 0) + entered * remaining
+        moved_elsewhere = max(0.0, float(own @ (1 - kernel.sum(axis=1))))
+        predicted_elsewhere = (
+            stay * (density * max(unseen, 0) + moved_elsewhere) + entered * remaining
+        )
         predicted_outside = (1 - entering) * before.outside + leaving * inside
 
         likelihoods, likelihood_elsewhere = _likelihoods(targets, evidence, count)
@@ -210,8 +244,8 @@ class TrackFilter:
         outside_gain = OUTSIDE_GAIN * max(0.0, before.gain - CHANCE_GAIN)
         weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
         if evidence.fix is not None:
-            weights = weights * _fix_weights(targets, evidence.fix, count)
-            weight_elsewhere *= FIX_OUTLIERS
+            near, elsewhere_near = _fix_weights(targets, evidence.fix, fix_complete_m, count)
+            weights, weight_elsewhere = weights * near, weight_elsewhere * elsewhere_near
         posterior = predicted * weights
         posterior_elsewhere = predicted_elsewhere * weight_elsewhere
         posterior_outside = predicted_outside * weight_outside
@@ -254,69 +288,153 @@ class TrackFilter:
 
     def _targets(
         self, sources: PhotoTable, moving: PhotoTable, evidence: FrameEvidence, reach_m: float
-    ) -> PhotoTable:
-        reach_seconds = reach_m / self._motion.typical_speed_mps
-        tables = [self._graph.photos([hit.photo for hit in evidence.hits])]
-        if len(moving):
-            tables.append(self._graph.around(moving, reach_m, reach_seconds))
-        if evidence.fix is not None:
-            tables.append(_near_fix(self._graph, evidence.fix))
-        return sources.union(*tables)
+    ) -> tuple[PhotoTable, float]:
+        """Return the photos that have a probability after the step, and the reach of all of them.
+
+        Photos farther from `moving` than that, up to `reach_m`, are among them if they are hits.
+        """
+        hits = self._graph.photos([hit.photo for hit in evidence.hits])
+        if not len(moving):
+            return sources.union(hits), reach_m
+        speed = self._motion.typical_speed_mps
+        near, complete_m = find_nearest(
+            lambda reach, limit: self._graph.around(moving, reach, reach / speed, limit),
+            reach_m,
+            MAX_NEAR,
+        )
+        return sources.union(hits, near), complete_m
 
     def _kernel(
-        self, sources: PhotoTable, targets: PhotoTable, seconds: float, odometry: Odometry | None
+        self,
+        sources: PhotoTable,
+        targets: PhotoTable,
+        complete_m: float,
+        seconds: float,
+        evidence: FrameEvidence,
     ) -> FloatArray:
-        """Return (n, m) probabilities to move from source to target photos; rows add up to 1.
+        """Return (n, m) probabilities to move from source to target photos.
+
+        Rows add up to 1, and to less where photos that can be reached are no targets.
+        """
+        numbers = _photos_of_targets(self._graph, targets, evidence)
+        kernel = np.zeros((len(sources), len(targets)))
+        for first in range(0, len(sources), KERNEL_ROWS):
+            rows = np.arange(first, min(first + KERNEL_ROWS, len(sources)))
+            kernel[rows], moving = self._kernel_rows(
+                sources.take(rows), targets, numbers, complete_m, seconds, evidence.odometry
+            )
+            kernel[rows, rows] += 1 - moving  # the sources are the first targets
+        return kernel
+
+    def _kernel_rows(
+        self,
+        sources: PhotoTable,
+        targets: PhotoTable,
+        numbers: FloatArray,
+        complete_m: float,
+        seconds: float,
+        odometry: Odometry | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return (n, m) probabilities to move, and (n,) how probable it is to move at all.
 
         The photos are coarser than the motion between two frames, so a camera changes its photo
         only so often that it moves no farther than it can on average.
         """
         away = distance_matrix_m(sources, targets, self._motion.typical_speed_mps)
+        reach_m = min(self._reach_m(seconds, odometry), MAX_REACH_M)
         if odometry is None:
             moved_m = self._motion.max_speed_mps * seconds
-            width = np.hypot(SPACING_M, moved_m / 2)
-            kernel = np.exp(-0.5 * (np.minimum(away, 1e9) / width) ** 2)
+            width = float(np.hypot(SPACING_M, moved_m / 2))
+            weigh = partial(_gaussian, width=width)
+            kernel = weigh(away)
         else:
             moved_m = odometry.distance_m + odometry.distance_accuracy_m
-            kernel = _odometry_kernel(away, sources, targets, odometry)
-        kernel[away > min(self._reach_m(seconds, odometry), MAX_REACH_M)] = 0.0
-        total = kernel.sum(axis=1, keepdims=True)
+            weigh = partial(_odometry_weights, odometry=odometry)
+            kernel = weigh(away) * _heading_weights(sources, targets, odometry)
+        kernel[away > reach_m] = 0.0
+        kernel *= numbers
+        total = kernel.sum(axis=1)
+        total_m = np.sum(kernel * np.where(kernel > 0, away, 0.0), axis=1)
+        if complete_m < reach_m:
+            within = (away <= complete_m) @ numbers
+            beyond = np.where(away > complete_m, kernel, 0.0).sum(axis=1)
+            located = ~np.isnan(sources.latitudes)
+            for dimensions, rows in ((1, ~located), (2, located)):
+                ring, ring_m = weigh_rings(weigh, complete_m, reach_m, dimensions)
+                unseen = np.maximum(0.0, within[rows] * ring - beyond[rows])
+                total[rows] += unseen
+                total_m[rows] += unseen * ring_m / max(ring, sys.float_info.min)
         # A photo that nothing can be reached from keeps its probability.
-        kernel = np.divide(kernel, total, out=np.zeros_like(kernel), where=total > 0)
-        mean_m = np.sum(kernel * np.where(kernel > 0, away, 0.0), axis=1)
+        kernel = np.divide(kernel, total[:, None], out=kernel, where=total[:, None] > 0)
         moving = np.minimum(
-            1.0, np.divide(moved_m, mean_m, out=np.ones_like(mean_m), where=mean_m > 0)
+            1.0,
+            np.divide(moved_m * total, total_m, out=np.ones_like(total), where=total_m > 0),
         )
-        moving[total[:, 0] <= 0] = 0.0
-        kernel *= moving[:, None]
-        diagonal = np.arange(len(sources))  # the sources are the first targets
-        kernel[diagonal, diagonal] += 1 - moving
-        moves: FloatArray = kernel
-        return moves
+        moving[total <= 0] = 0.0
+        return kernel * moving[:, None], moving
 
 
 def _start(time: datetime) -> Belief:
     return Belief(time, (), np.zeros(0), 1 - OUT_OF_MAP_SHARE, OUT_OF_MAP_SHARE, {})
 
 
-def _odometry_kernel(
-    away: FloatArray, sources: PhotoTable, targets: PhotoTable, odometry: Odometry
+def _photos_of_targets(
+    graph: PhotoGraph, targets: PhotoTable, evidence: FrameEvidence
 ) -> FloatArray:
-    """Weigh moves by odometry. The distance between the ends may be shorter than the path."""
+    """Return (m,) how many photos each target stands for.
+
+    That is more than 1 where a label has more photos without coordinates than are found by their
+    labels. They are all in one place, so those that are no hits may stand for each other.
+    """
+    numbers = np.ones(len(targets))
+    labelled = np.isnan(targets.latitudes) & (targets.places != None)  # noqa: E711
+    if labelled.sum() < MAX_SAME_LABEL:
+        return numbers
+    hits = {hit.photo for hit in evidence.hits}
+    is_hit = np.array([photo in hits for photo in targets.ids], dtype=bool)
+    counts = graph.count_labels(set(targets.places[labelled].tolist()))
+    for place, count in counts.items():
+        members = labelled & (targets.places == place)
+        others = members & ~is_hit
+        unseen = max(0, count - int(members.sum()))
+        numbers[others] += unseen / max(1, int(others.sum()))
+    return numbers
+
+
+def _gaussian(away: FloatArray, width: float) -> FloatArray:
+    """Return (n,) or (n, m) weights of distances in metres; 1 for 0 m."""
+    weights: FloatArray = np.exp(-0.5 * (np.minimum(away, 1e9) / width) ** 2)
+    return weights
+
+
+def _odometry_weights(away: FloatArray, odometry: Odometry) -> FloatArray:
+    """Weigh distances by odometry. The distance between the ends may be shorter than the path."""
     width = np.hypot(odometry.distance_accuracy_m, SPACING_M)
     shorter = np.hypot(width, 0.3 * odometry.distance_m)
     difference = np.minimum(away, 1e9) - odometry.distance_m
-    kernel = np.exp(-0.5 * (difference / np.where(difference > 0, width, shorter)) ** 2)
-    if odometry.heading_change_degrees is not None:
-        turned = targets.headings[None, :] - sources.headings[:, None]
-        turned = (turned - odometry.heading_change_degrees + 180) % 360 - 180
-        fit = np.exp(-0.5 * (turned / odometry.heading_accuracy_degrees) ** 2)
-        kernel *= np.where(np.isnan(turned), 1.0, HEADING_FLOOR + (1 - HEADING_FLOOR) * fit)
-    return kernel
+    return _gaussian(difference / np.where(difference > 0, width, shorter), 1.0)
 
 
-def _near_fix(graph: PhotoGraph, fix: PositionFix) -> PhotoTable:
-    return graph.near(fix.latitude, fix.longitude, 3 * np.hypot(fix.accuracy_m, SPACING_M))
+def _heading_weights(sources: PhotoTable, targets: PhotoTable, odometry: Odometry) -> FloatArray:
+    """Return (n, m) weights of the changes of the heading; 1 where it is not known."""
+    if odometry.heading_change_degrees is None:
+        return np.ones((len(sources), len(targets)))
+    turned = targets.headings[None, :] - sources.headings[:, None]
+    turned = (turned - odometry.heading_change_degrees + 180) % 360 - 180
+    fit = _gaussian(np.abs(turned), odometry.heading_accuracy_degrees)
+    return np.where(np.isnan(turned), 1.0, HEADING_FLOOR + (1 - HEADING_FLOOR) * fit)
+
+
+def _fix_reach_m(fix: PositionFix) -> float:
+    return 3 * math.hypot(fix.accuracy_m, SPACING_M)
+
+
+def _near_fix(graph: PhotoGraph, fix: PositionFix) -> tuple[PhotoTable, float]:
+    return find_nearest(
+        lambda reach, limit: graph.near(fix.latitude, fix.longitude, reach, limit),
+        _fix_reach_m(fix),
+        MAX_NEAR,
+    )
 
 
 def _excess(evidence: FrameEvidence, count: int) -> dict[str, float]:
@@ -358,17 +476,26 @@ def _learn_gain(belief: Belief, log_fit: float, weight: float, tracked: float) -
     return replace(belief, gain=max(0.0, mean), gain_weight=total)
 
 
-def _fix_weights(targets: PhotoTable, fix: PositionFix, count: int) -> FloatArray:
-    """Return the likelihoods of a position fix, 1 on average over the map."""
+def _fix_weights(
+    targets: PhotoTable, fix: PositionFix, complete_m: float, count: int
+) -> tuple[FloatArray, float]:
+    """Return the likelihoods of a position fix for the targets and for any other photo.
+
+    They are 1 on average over the map. Within `complete_m` of the fix, all photos are targets.
+    """
     point = PhotoTable.of_rows([("", fix.latitude, fix.longitude, None, None, None, None)])
     chords = np.linalg.norm(unit_vectors(targets) - unit_vectors(point), axis=1) * EARTH_RADIUS_M
     # A Rayleigh distribution has 68 % within 1.51 standard deviations.
-    width = np.hypot(fix.accuracy_m / 1.51, SPACING_M)
-    near = np.nan_to_num(np.exp(-0.5 * (chords / width) ** 2))
-    total = float(near.sum())
-    share = near * count / total if total > 1e-9 else near
-    weights: FloatArray = FIX_OUTLIERS + (1 - FIX_OUTLIERS) * share
-    return weights
+    weigh = partial(_gaussian, width=math.hypot(fix.accuracy_m / 1.51, SPACING_M))
+    near = np.nan_to_num(weigh(chords))
+    others = count - len(targets)
+    ring, _ = weigh_rings(weigh, complete_m, _fix_reach_m(fix), 2)
+    unseen = np.sum(chords <= complete_m) * ring - near[chords > complete_m].sum()
+    unseen = float(np.clip(unseen, 0.0, max(others, 0)))
+    total = float(near.sum()) + unseen
+    # `near` is NaN-free, and a fix far from all photos says nothing but that it is wrong.
+    scale = (1 - FIX_OUTLIERS) * (count / total if total > 1e-9 else 1.0)
+    return FIX_OUTLIERS + scale * near, FIX_OUTLIERS + scale * unseen / max(others, 1)
 
 
 def _kept(posterior: FloatArray, density: float) -> Indices:

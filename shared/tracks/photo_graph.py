@@ -7,8 +7,9 @@ moves at its typical speed between them, and photos with the same label show the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +22,11 @@ ObjectArray = NDArray[np.object_]
 Indices = NDArray[np.int64]
 
 CELL_M = 100.0
+MAX_GRID_REACH_M = 2000.0
+"""Farther away, the cells of `ArrayPhotoGraph` would be more than the photos"""
+MAX_SAME_LABEL = 500
+"""Number of photos that `PhotoGraph.around` finds by their labels alone, at most, in any one step
+of a way"""
 _OFFSET, _AXIS = 1 << 19, 1 << 20
 
 
@@ -97,17 +103,26 @@ class PhotoGraph(Protocol):
         """Return the photos that have one of these ids and are still in the map."""
         ...
 
-    def around(self, photos: PhotoTable, reach_m: float, reach_seconds: float) -> PhotoTable:
-        """Return all photos near any of `photos`, which may be among them.
+    def around(
+        self, photos: PhotoTable, reach_m: float, reach_seconds: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        """Return the photos near any of `photos`, which may be among them, and whether all.
 
         Near are those with coordinates within `reach_m`; those of the same sequence within
-        `reach_seconds`, if one of both photos has no coordinates; and all that have a label in
-        common with a photo without coordinates that is found.
+        `reach_seconds`, if one of both photos has no coordinates; and up to MAX_SAME_LABEL that
+        have a label in common with a photo without coordinates that is found. Where more than
+        `limit` are near by coordinates or by time, any of them.
         """
         ...
 
-    def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
-        """Return the photos with coordinates within a radius."""
+    def near(
+        self, latitude: float, longitude: float, radius_m: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        """Return up to `limit` photos with coordinates within a radius, and whether all."""
+        ...
+
+    def count_labels(self, places: Collection[str]) -> Mapping[str, int]:
+        """Return the number of photos without coordinates that have each of these labels."""
         ...
 
 
@@ -146,17 +161,27 @@ def _travel_seconds(sources: PhotoTable, targets: PhotoTable) -> FloatArray:
     if not labels:
         return seconds
     # From a photo to a label: over the nearest photo of its sequence that has the label.
-    leave, arrive = (np.full((len(table), len(labels)), np.inf) for table in (sources, targets))
-    within = _gap_seconds(targets, targets)
-    for column, label in enumerate(labels):
-        members = targets.places == label
-        leave[:, column] = seconds[:, members].min(axis=1)
-        leave[sources.places == label, column] = 0.0
-        arrive[:, column] = within[:, members].min(axis=1)
-        arrive[members, column] = 0.0
-    for column in range(len(labels)):
-        np.minimum(seconds, leave[:, column, None] + arrive[None, :, column], out=seconds)
+    for label in labels:
+        members = targets.take(targets.places == label)
+        leave, arrive = _nearest_seconds(sources, members), _nearest_seconds(targets, members)
+        leave[sources.places == label] = 0.0
+        arrive[targets.places == label] = 0.0
+        np.minimum(seconds, leave[:, None] + arrive[None, :], out=seconds)
     return seconds
+
+
+def _nearest_seconds(photos: PhotoTable, members: PhotoTable) -> FloatArray:
+    """Return (n,) seconds from each photo to the nearest of `members` in its sequence, if any."""
+    nearest = np.full(len(photos), np.inf)
+    for name in set(members.sequences.tolist()) - {None}:
+        times = np.sort(members.seconds[members.sequences == name])
+        times = times[~np.isnan(times)]
+        rows = np.flatnonzero((photos.sequences == name) & ~np.isnan(photos.seconds))
+        if len(times):
+            seconds = photos.seconds[rows]
+            after = np.searchsorted(times, seconds).clip(1, len(times) - 1) if len(times) > 1 else 0
+            nearest[rows] = np.minimum(abs(times[after] - seconds), abs(times[after - 1] - seconds))
+    return nearest
 
 
 def _gap_seconds(a: PhotoTable, b: PhotoTable) -> FloatArray:
@@ -207,25 +232,39 @@ class ArrayPhotoGraph:
         rows = [row for photo in ids if (row := self._row_of.get(photo)) is not None]
         return self._table.take(np.array(rows, dtype=np.int64))
 
-    def around(self, photos: PhotoTable, reach_m: float, reach_seconds: float) -> PhotoTable:
+    def around(
+        self, photos: PhotoTable, reach_m: float, reach_seconds: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
         rows = {self._row_of[photo] for photo in photos.ids.tolist() if photo in self._row_of}
         located = ~np.isnan(photos.latitudes)
         found = self._within(photos.take(located), reach_m)
         # A way leads along a sequence, at a label to another sequence, and along that one.
         chain = rows - set(self._located.tolist()) if not located.all() else set()
+        along: set[int] = set()
         if chain:
             chain |= self._same_label(chain)
-            chain |= self._along_sequences(chain, reach_seconds)
+            along = self._along_sequences(chain, reach_seconds)
+            chain |= set(sorted(along)[:limit])
             chain |= self._same_label(chain)
-        return self._table.take(np.array(sorted(set(found.tolist()) | chain), dtype=np.int64))
+        complete = max(len(found), len(along)) <= limit
+        rows = set(found[:limit].tolist()) | chain
+        return self._table.take(np.array(sorted(rows), dtype=np.int64)), complete
 
-    def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
+    def near(
+        self, latitude: float, longitude: float, radius_m: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
         point = PhotoTable.of_rows([("", latitude, longitude, None, None, None, None)])
-        return self._table.take(self._within(point, radius_m))
+        rows = self._within(point, radius_m)
+        return self._table.take(rows[:limit]), len(rows) <= limit
+
+    def count_labels(self, places: Collection[str]) -> Mapping[str, int]:
+        return {place: len(self._by_place.get(place, ())) for place in places}
 
     def _within(self, points: PhotoTable, reach_m: float) -> Indices:
         if not len(points) or not len(self._located):
             return np.zeros(0, dtype=np.int64)
+        if reach_m > MAX_GRID_REACH_M:
+            return self._near_any(points, np.sort(self._located), reach_m)
         steps = int(np.ceil(reach_m / CELL_M))
         axis = np.arange(-steps, steps + 1)
         shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -234,13 +273,18 @@ class ArrayPhotoGraph:
         starts, ends = (np.searchsorted(self._keys, keys, side) for side in ("left", "right"))
         rows = [self._located[a:b] for a, b in zip(starts, ends, strict=True) if b > a]
         candidates = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+        return self._near_any(points, np.sort(candidates), reach_m)
+
+    def _near_any(self, points: PhotoTable, candidates: Indices, reach_m: float) -> Indices:
         cosines = self._vectors[candidates] @ unit_vectors(points).T
         limit = 1 - (reach_m / EARTH_RADIUS_M) ** 2 / 2 - 1e-15
-        return np.sort(candidates[cosines.max(axis=1, initial=-1.0) >= limit])
+        found: Indices = candidates[cosines.max(axis=1, initial=-1.0) >= limit]
+        return found
 
     def _same_label(self, rows: set[int]) -> set[int]:
         labels = {self._table.places[row] for row in rows} - {None}
-        return {row for label in labels for row in self._by_place.get(label, [])}
+        members = (row for label in sorted(labels) for row in self._by_place.get(label, []))
+        return set(islice(members, MAX_SAME_LABEL))
 
     def _along_sequences(self, rows: set[int], reach_seconds: float) -> set[int]:
         found: set[int] = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
@@ -12,8 +13,14 @@ from fastapi.responses import JSONResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.admission import ADMIT_QUERY, AdmissionDep
-from services.gateway.authentication import READ, WRITE
+from services.gateway.admission import (
+    ADMIT_QUERY,
+    CHECK_DISK,
+    CHECK_PHOTO_QUOTA,
+    AdmissionDep,
+    reserve_photo_quota,
+)
+from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import (
     FrameId,
     GatewayContext,
@@ -138,16 +145,23 @@ FRAME_PENDING: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.post("/tracks", operation_id="begin_track", status_code=201, dependencies=[READ])
+@router.post(
+    "/tracks", operation_id="begin_track", status_code=201, dependencies=[READ, CHECK_DISK]
+)
 def begin_track(
-    gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, body: TrackParams
+    request: Request,
+    gateway: GatewayDep,
+    idempotent: IdempotentDep,
+    query: MapQuery,
+    body: TrackParams,
 ) -> TrackResponse:
     """Begin a track in the map. Then add frames in the order of their times."""
-    with gateway.catalog.write() as session:
+    with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
         track = Track(
             id=new_id(),
             map_id=get_map(session, query.map).id,
             params=body.model_dump(mode="json", exclude_none=True),
+            key_id=get_caller(request).key_id,
         )
         session.add(track)
         session.flush()
@@ -172,15 +186,31 @@ def read_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
     )
 
 
-@router.get("/tracks/{track_id}", operation_id="get_track", dependencies=[READ])
-def read_track(
-    gateway: GatewayDep, track_id: TrackId, query: Annotated[TrackReadParams, Query()]
-) -> TrackDetailResponse:
+@router.get(
+    "/tracks/{track_id}",
+    operation_id="get_track",
+    response_model=TrackDetailResponse,
+    dependencies=[READ],
+)
+async def read_track(
+    request: Request,
+    gateway: GatewayDep,
+    admission: AdmissionDep,
+    track_id: TrackId,
+    query: Annotated[TrackReadParams, Query()],
+) -> Any:
     """Get a track with all frames; `smoothed=true` also uses the later frames for each state.
 
     Frames whose photos have been described since are applied first. `pending` counts those that
-    remain. 409 (`track_too_long`) if more than 3,000 frames are to be smoothed.
+    remain. 409 (`track_too_long`) if more than 3,000 frames are to be smoothed. A gateway smooths
+    one track of a caller at a time, and two of all (429, `too_many_smoothed_tracks`, beyond).
     """
+    limit = admission.smoothed_tracks.hold(request) if query.smoothed else contextlib.nullcontext()
+    with limit:
+        return await run_in_threadpool(_read_track, gateway, track_id, query)
+
+
+def _read_track(gateway: GatewayContext, track_id: UUID, query: TrackReadParams) -> Response:
     with gateway.catalog.read() as session:
         get_track(session, get_map(session, query.map).id, track_id)
     apply_pending_frames(gateway, track_id, APPLY_SECONDS)
@@ -195,11 +225,13 @@ def read_track(
         frames = list(session.scalars(select_frames(track_id, with_evidence=query.smoothed)))
     last = next((frame for frame in reversed(frames) if frame.state is not None), None)
     smoothed = smooth_states(gateway, track, frames) if query.smoothed else {}
-    return TrackDetailResponse(
+    body = TrackDetailResponse(
         **_track_fields(gateway, track, last),
         smoothed=query.smoothed,
         frames=[_frame_response(frame, query.map, smoothed.get(frame.id)) for frame in frames],
     )
+    # Not by FastAPI, which would serialize up to 10,000 frames on the event loop.
+    return Response(body.model_dump_json(), media_type="application/json")
 
 
 @router.delete("/tracks/{track_id}", operation_id="delete_track", dependencies=[WRITE])
@@ -219,7 +251,7 @@ def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> Del
     response_model=TrackFrameResponse,
     responses=FRAME_PENDING,
     openapi_extra=multipart_schema("the frame's photo", ["captured_at"], **FRAME_FIELDS),
-    dependencies=[READ, ADMIT_QUERY],
+    dependencies=[READ, CHECK_PHOTO_QUOTA, CHECK_DISK, ADMIT_QUERY],
 )
 async def add_track_frame(
     request: Request,
@@ -242,7 +274,7 @@ async def add_track_frame(
     await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
     job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
     frame = await run_in_threadpool(
-        _accept_frame, gateway, query.map, track_id, job_id, received, idempotent
+        _accept_frame, request, gateway, query.map, track_id, job_id, received, idempotent
     )
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
     if wait:
@@ -279,6 +311,7 @@ def _check_track(catalog: Catalog, map_name: str, track_id: UUID) -> None:
 
 
 def _accept_frame(
+    request: Request,
     gateway: GatewayContext,
     map_name: str,
     track_id: UUID,
@@ -291,7 +324,7 @@ def _accept_frame(
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
-        with gateway.catalog.write() as session:
+        with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
             frame = TrackFrame(
                 id=new_id(),
@@ -303,6 +336,7 @@ def _accept_frame(
                 measurements=form.model_dump(
                     mode="json", exclude={"expected_version"}, exclude_none=True
                 ),
+                key_id=get_caller(request).key_id,
             )
             stored = add_frame(session, track, frame, form.expected_version)
             if stored is frame:

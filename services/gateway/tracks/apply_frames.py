@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from typing import Any
 from uuid import UUID
 
@@ -37,6 +36,7 @@ from shared.catalog.tracks import (
 from shared.errors import Conflict, Gone, PlacewiseError
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
+from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job
 from shared.jobs.wakeups import WakeupQueue
@@ -45,7 +45,8 @@ from shared.search_api.comparison import query_expired_error
 from shared.search_api.protocol import RowReference
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
-from shared.tracks.filter import TrackFilter
+from shared.tracks.filter import MAX_PHOTOS, TrackFilter
+from shared.tracks.nearest import find_nearest
 
 START_ACCURACY_M = 50.0
 START_PROBABILITY = 0.9  # of the photos at a stated start, together
@@ -172,7 +173,7 @@ def _advance(
         ).all()
         track_filter, graph = _open_filter(gateway, session, pending.track)
         belief = (
-            _start_belief(graph, pending.track, frame.captured_at)
+            _start_belief(graph, pending.track, evidence)
             if before is None
             else Belief.from_bytes(before)
         )
@@ -226,13 +227,11 @@ def smooth_states(
         return {}
     with gateway.catalog.read() as session:
         track_filter, graph = _open_filter(gateway, session, track)
-        beliefs = track_filter.smooth(
-            [_evidence_of(frame) for frame in applied],
-            _start_belief(graph, track, applied[0].captured_at),
-        )
+        evidence = [_evidence_of(frame) for frame in applied]
+        states = track_filter.smoothed_states(evidence, _start_belief(graph, track, evidence[0]))
         return {
-            frame.id: TrackStateResponse.of(track_filter.state(belief))
-            for frame, belief in zip(applied, beliefs, strict=True)
+            frame.id: TrackStateResponse.of(state)
+            for frame, state in zip(applied, states, strict=True)
         }
 
 
@@ -252,23 +251,41 @@ def _open_filter(
     return TrackFilter(graph, motion, scheme), graph
 
 
-def _start_belief(graph: CatalogPhotoGraph, track: Track, first_time: datetime) -> Belief | None:
-    """Return the belief before the first frame; None if no photo is at the stated start, if any."""
+def _start_belief(graph: CatalogPhotoGraph, track: Track, first: FrameEvidence) -> Belief | None:
+    """Return the belief before the first frame; None if no photo is at the stated start, if any.
+
+    If more than MAX_PHOTOS photos are there, the hits of the first frame among them and the
+    nearest have a probability of their own; that of the others is elsewhere.
+    """
     params = TrackParams.model_validate(track.params)
+    hits = graph.photos([hit.photo for hit in first.hits])
     if params.place is not None:
-        start = graph.labelled(params.place)
+        near, count = graph.labelled(params.place, MAX_PHOTOS)
+        start = hits.take(hits.places == params.place).union(near)
     elif params.latitude is not None and params.longitude is not None:
+        latitude, longitude = params.latitude, params.longitude
         accuracy_m = params.accuracy_m or START_ACCURACY_M
-        start = graph.near(params.latitude, params.longitude, accuracy_m)
+        near, complete_m = find_nearest(
+            lambda radius_m, limit: graph.near(latitude, longitude, radius_m, limit),
+            accuracy_m,
+            MAX_PHOTOS,
+        )
+        away = distances_m(latitude, longitude, hits.latitudes, hits.longitudes)
+        start = hits.take(away <= accuracy_m).union(near)
+        # The others lie as densely as the nearest ones.
+        count = round(len(near) * (accuracy_m / complete_m) ** 2)
     else:
         return None
     if not len(start):
         return None
+    start = start.take(np.arange(min(len(start), MAX_PHOTOS)))
+    count = max(len(start), min(count, graph.photo_count))
+    there = START_PROBABILITY * len(start) / count
     return Belief(
-        time=first_time,
+        time=first.time,
         photos=tuple(start.ids.tolist()),
-        probabilities=np.full(len(start), START_PROBABILITY / len(start)),
-        elsewhere=(1 - START_PROBABILITY) * (1 - OUT_OF_MAP_SHARE),
+        probabilities=np.full(len(start), START_PROBABILITY / count),
+        elsewhere=START_PROBABILITY - there + (1 - START_PROBABILITY) * (1 - OUT_OF_MAP_SHARE),
         outside=(1 - START_PROBABILITY) * OUT_OF_MAP_SHARE,
         seen={},
     )

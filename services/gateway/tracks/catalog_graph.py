@@ -8,25 +8,39 @@ coordinates.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import ColumnElement, Float, and_, cast, func, literal, literal_column, or_, select
+from sqlalchemy import (
+    ColumnElement,
+    Float,
+    Select,
+    and_,
+    cast,
+    func,
+    literal,
+    literal_column,
+    or_,
+    select,
+)
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.base import Condition
+from shared.catalog.database.base import Condition, count_rows
 from shared.catalog.maps import CachedMapStatistics
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
-from shared.geodesy import distances_m, latitude_bounds, longitude_half_width
-from shared.tracks.photo_graph import PhotoTable
+from shared.geodesy import EARTH_RADIUS_M, distances_m, latitude_bounds, longitude_half_width
+from shared.tracks.photo_graph import MAX_SAME_LABEL, PhotoTable
 
-CELL_DEGREES = 0.001  # photos within a cell of this size are looked up together
+CELL_DEGREES = 0.001  # least height of the strips in which photos are looked up together
 INTERVALS_PER_QUERY = 100
+MAX_COUNTED = 50_000
+"""Number of photos that are counted to learn how many have a label."""
 COLUMNS = (
     Photo.id,
     Photo.latitude,
@@ -78,48 +92,77 @@ class CatalogPhotoGraph:
         rows = (self._read[photo_id] for photo_id in ids)
         return PhotoTable.of_rows(row for row in rows if row is not None)
 
-    def near(self, latitude: float, longitude: float, radius_m: float) -> PhotoTable:
-        """Return the photos with coordinates within a radius."""
-        found = self._inside(_boxes_around(latitude, latitude, longitude, longitude, radius_m))
+    def near(
+        self, latitude: float, longitude: float, radius_m: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        """Return up to `limit` photos with coordinates within a radius, and whether all."""
+        boxes = _boxes_around(latitude, longitude, radius_m)
+        found, is_all = self._inside(boxes, limit)
         away = distances_m(latitude, longitude, found.latitudes, found.longitudes)
-        return found.take(away <= radius_m)
+        return found.take(away <= radius_m), is_all
 
-    def labelled(self, place: str) -> PhotoTable:
-        """Return the photos with exactly this place label."""
-        return self._select(Photo.map_id == self._map_id, Photo.place == place)
+    def labelled(self, place: str, limit: int) -> tuple[PhotoTable, int]:
+        """Return up to `limit` photos with exactly this place label, and the number of all."""
+        of_label = (Photo.map_id == self._map_id, Photo.place == place)
+        found = self._select(*of_label, limit=limit)
+        return found, count_rows(self._session, _live_photos(Photo.id).where(*of_label))
 
-    def around(self, photos: PhotoTable, reach_m: float, reach_seconds: float) -> PhotoTable:
-        """Return all photos near any of `photos`; see `PhotoGraph.around`.
+    def count_labels(self, places: Collection[str]) -> Mapping[str, int]:
+        """Return the number of photos without coordinates that have each of these labels.
+
+        They are counted up to MAX_COUNTED, for all labels together.
+        """
+        rows = (
+            _live_photos(Photo.place)
+            .where(
+                Photo.map_id == self._map_id,
+                Photo.place.in_(sorted(places)),
+                Photo.latitude.is_(None),
+            )
+            .limit(MAX_COUNTED)
+            .subquery()
+        )
+        counts = self._session.execute(select(rows.c.place, func.count()).group_by(rows.c.place))
+        return dict.fromkeys(places, 0) | {place: int(count) for place, count in counts}
+
+    def around(
+        self, photos: PhotoTable, reach_m: float, reach_seconds: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        """Return the photos near any of `photos`, and whether all; see `PhotoGraph.around`.
 
         Some that are a little farther than `reach_m` are among them.
         """
         located = ~np.isnan(photos.latitudes)
-        found = self._around_points(photos.take(located), reach_m)
+        found, is_all = self._around_points(photos.take(located), reach_m, limit)
         if located.all():
-            return found
+            return found, is_all
         # A way leads along a sequence, at a label to another place of it, and along it again.
         chain = photos.take(~located)
         chain = chain.union(self._same_label(chain))
-        chain = chain.union(self._taken_within(chain, reach_seconds))
+        along, is_all_along = self._taken_within(chain, reach_seconds, limit)
+        chain = chain.union(along)
         chain = chain.union(self._same_label(chain))
-        return found.union(chain)
+        return found.union(chain), is_all and is_all_along
 
-    def _around_points(self, points: PhotoTable, reach_m: float) -> PhotoTable:
-        cells: dict[tuple[float, float], list[int]] = {}
-        for row, cell in enumerate(
-            zip(points.latitudes // CELL_DEGREES, points.longitudes // CELL_DEGREES, strict=True)
-        ):
-            cells.setdefault(cell, []).append(row)
-        boxes: list[Box] = []
-        for rows in cells.values():
-            latitudes, longitudes = points.latitudes[rows], points.longitudes[rows]
-            boxes += _boxes_around(
-                latitudes.min(), latitudes.max(), longitudes.min(), longitudes.max(), reach_m
-            )
-        return self._inside(boxes)
+    def _around_points(
+        self, points: PhotoTable, reach_m: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        # In strips of the map: boxes around the points would overlap, and find a photo many times.
+        height = max(CELL_DEGREES, math.degrees(reach_m / EARTH_RADIUS_M))
+        strips: dict[int, list[tuple[float, float]]] = {}
+        for latitude, longitude in zip(points.latitudes, points.longitudes, strict=True):
+            for south, north, west, east in _boxes_around(latitude, longitude, reach_m):
+                for strip in range(int(south // height), int(north // height) + 1):
+                    strips.setdefault(strip, []).append((west, east))
+        boxes = [
+            (strip * height, (strip + 1) * height, west, east)
+            for strip, intervals in strips.items()
+            for west, east in _merge(intervals)
+        ]
+        return self._inside(boxes, limit)
 
-    def _inside(self, boxes: Sequence[Box]) -> PhotoTable:
-        """Return the photos inside any of the boxes."""
+    def _inside(self, boxes: Sequence[Box], limit: int) -> tuple[PhotoTable, bool]:
+        """Return up to `limit` photos inside any of the boxes, and whether all."""
         # The boxes are one parameter: building and parsing a condition for each takes far longer.
         sides: list[ColumnElement[float]]
         if self._session.get_bind().dialect.name == "postgresql":
@@ -143,22 +186,27 @@ class CatalogPhotoGraph:
                     Photo.role == PhotoRole.DATABASE,
                 ),
             )
+            .limit(limit + 1 + len(boxes))  # a box without photos is a row, too
         )
-        return self._table(row for row in found if row.id)
+        # A photo on the border of two boxes is two rows, of which the limit counts both.
+        photos = [row for row in found if row.id]
+        table = self._table(photos)
+        return table.take(np.arange(min(len(table), limit))), len(photos) <= limit
 
     def _same_label(self, photos: PhotoTable) -> PhotoTable:
         labels = sorted({place for place in photos.places.tolist() if place is not None})
         return self._select(
-            Photo.map_id == self._map_id, Photo.place.in_(labels), Photo.latitude.is_(None)
+            Photo.map_id == self._map_id,
+            Photo.place.in_(labels),
+            Photo.latitude.is_(None),
+            limit=MAX_SAME_LABEL,
         )
 
-    def _taken_within(self, photos: PhotoTable, reach_seconds: float) -> PhotoTable:
-        intervals: list[tuple[float, float]] = []
-        for second in np.sort(photos.seconds[~np.isnan(photos.seconds)]).tolist():
-            if intervals and second - reach_seconds <= intervals[-1][1]:
-                intervals[-1] = (intervals[-1][0], second + reach_seconds)
-            else:
-                intervals.append((second - reach_seconds, second + reach_seconds))
+    def _taken_within(
+        self, photos: PhotoTable, reach_seconds: float, limit: int
+    ) -> tuple[PhotoTable, bool]:
+        seconds = photos.seconds[~np.isnan(photos.seconds)].tolist()
+        intervals = _merge((each - reach_seconds, each + reach_seconds) for each in seconds)
         # The map in each alternative, so that each uses an index, which begins with it.
         alternatives = [
             and_(
@@ -170,15 +218,14 @@ class CatalogPhotoGraph:
         found = photos.take(np.zeros(0, dtype=np.int64))
         for begin in range(0, len(alternatives), INTERVALS_PER_QUERY):
             any_of = or_(*alternatives[begin : begin + INTERVALS_PER_QUERY])
-            found = found.union(self._select(any_of, Photo.latitude.is_(None)))
-        return found
+            room = limit + 1 - len(found)
+            found = found.union(self._select(any_of, Photo.latitude.is_(None), limit=room))
+            if len(found) > limit:
+                return found.take(np.arange(limit)), False
+        return found, True
 
-    def _select(self, *conditions: Condition) -> PhotoTable:
-        rows = self._session.execute(
-            select(*COLUMNS).where(
-                Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE, *conditions
-            )
-        )
+    def _select(self, *conditions: Condition, limit: int | None = None) -> PhotoTable:
+        rows = self._session.execute(_live_photos(*COLUMNS).where(*conditions).limit(limit))
         return self._table(rows)
 
     def _table(self, rows: Iterable[Any]) -> PhotoTable:
@@ -192,17 +239,30 @@ class CatalogPhotoGraph:
         return PhotoTable.of_rows(found.values())
 
 
-def _boxes_around(
-    south: float, north: float, west: float, east: float, margin_m: float
-) -> list[Box]:
-    """Return boxes that contain a box and all points within a margin of it."""
-    low, high = latitude_bounds(south, margin_m)[0], latitude_bounds(north, margin_m)[1]
-    width = longitude_half_width(max(abs(south), abs(north)), margin_m)
+def _live_photos(*columns: Any) -> Select[Any]:
+    return select(*columns).where(Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE)
+
+
+def _boxes_around(latitude: float, longitude: float, margin_m: float) -> list[Box]:
+    """Return boxes that contain all points within a margin of a point."""
+    low, high = map(float, latitude_bounds(latitude, margin_m))
+    width = longitude_half_width(latitude, margin_m)
     if width is None:
-        return [(float(low), float(high), -180.0, 180.0)]
-    west, east = float(west - width), float(east + width)
+        return [(low, high, -180.0, 180.0)]
+    west, east = float(longitude - width), float(longitude + width)
     parts = [(west, east), (west + 360, 180.0), (-180.0, east - 360)]
-    return [(float(low), float(high), a, b) for a, b in parts if a <= b and a <= 180 and b >= -180]
+    return [(low, high, a, b) for a, b in parts if a <= b and a <= 180 and b >= -180]
+
+
+def _merge(intervals: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return intervals in ascending order, those that overlap as one."""
+    merged: list[tuple[float, float]] = []
+    for first, last in sorted(intervals):
+        if merged and first <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(last, merged[-1][1]))
+        else:
+            merged.append((first, last))
+    return merged
 
 
 def _to_time(seconds: float) -> datetime:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
@@ -81,7 +83,14 @@ def ride(service: Service, track_id: str, *numbers: int) -> Any:
     for number in numbers:
         send(service, track_id, number)
     service.drain()
-    return read(service, track_id)
+    return read_applied(service, track_id)
+
+
+def read_applied(service: Service, track_id: str) -> Any:
+    """Read the track until no frame is pending: one read applies frames for a limited time."""
+    while (track := read(service, track_id))["pending"]:
+        pass
+    return track
 
 
 def test_a_ride_is_followed_frame_by_frame(street: Service, catalog: Catalog) -> None:
@@ -131,6 +140,33 @@ def test_a_ride_is_followed_frame_by_frame(street: Service, catalog: Catalog) ->
 def count(catalog: Catalog, table: Any) -> int:
     with catalog.read() as session:
         return session.scalar(select(func.count()).select_from(table)) or 0
+
+
+@pytest.mark.databases("sqlite")
+def test_one_track_of_a_caller_is_smoothed_at_a_time(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    track_id = begin(service)
+    service.let_threads_call()
+    smoothing, refused = threading.Event(), threading.Event()
+
+    def smooth(*_: Any) -> dict[UUID, Any]:
+        smoothing.set()
+        assert refused.wait(60)
+        return {}
+
+    monkeypatch.setattr("services.gateway.routes.tracks.smooth_states", smooth)
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(read, service, track_id, smoothed=True)
+        assert smoothing.wait(60)
+        answer = service("GET", f"/tracks/{track_id}", params={"smoothed": True})
+        plain = read(service, track_id)
+        refused.set()
+        assert first.result()["smoothed"] is True
+    problem(answer, 429, "too_many_smoothed_tracks")
+    assert int(answer.headers["retry-after"]) > 0
+    assert plain["smoothed"] is False
+    assert read(service, track_id, smoothed=True)["smoothed"] is True
 
 
 @pytest.mark.databases("sqlite")

@@ -10,6 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
+from shared.geodesy import EARTH_RADIUS_M
+from shared.tracks import filter as filter_module
+from shared.tracks import photo_graph as photo_graph_module
 from shared.tracks.belief import START_GAIN, Belief
 from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
 from shared.tracks.filter import (
@@ -23,7 +26,11 @@ from shared.tracks.filter import (
     TrackFilter,
 )
 from shared.tracks.motion import MOTION_MODELS, motion_model
+from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+from shared.tracks.state import TrackState
 from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_map
+
+pytestmark = pytest.mark.numerics
 
 COUNT = 4
 WALK = MOTION_MODELS["walk"]
@@ -117,7 +124,7 @@ def test_a_camera_that_stands_still_learns_nothing_from_more_frames_of_the_same_
     for _ in range(30):
         belief = track_filter.advance(belief, pointing_at(7, 20, 0))
     state, before = track_filter.state(belief), track_filter.state(first)
-    assert state.probability == pytest.approx(before.probability, abs=0.1)
+    assert state.probability == pytest.approx(before.probability, abs=0.15)
 
 
 def test_frames_that_follow_the_street_are_tracked_with_their_position_and_heading() -> None:
@@ -318,6 +325,19 @@ def replace_hits(evidence: FrameEvidence, count: int) -> FrameEvidence:
     return evidence.model_copy(update={"hits": tuple(hits)})
 
 
+def test_the_status_of_a_smoothed_state_follows_from_its_own_probability() -> None:
+    track_filter = TrackFilter(line_map(50), WALK)
+    frames = [pointing_at(7 + step, 50, step) for step in range(8)]
+    belief, live = None, []
+    for each in frames:
+        belief = track_filter.advance(belief, each)
+        live.append(track_filter.state(belief))
+    smoothed = track_filter.smoothed_states(frames)
+    assert (live[0].status, smoothed[0].status) == ("converging", "tracking")
+    assert all(state.probability >= 0.8 for state in smoothed)
+    assert smoothed[-1].status == live[-1].status
+
+
 def test_smoothing_of_no_frames_is_empty() -> None:
     assert TrackFilter(line_map(3)).smooth([]) == []
 
@@ -339,3 +359,50 @@ def test_frames_in_a_map_without_photos_are_smoothed_to_elsewhere() -> None:
     for belief in TrackFilter(line_map(0), WALK).smooth(frames):
         assert belief.photos == ()
         assert belief.elsewhere + belief.outside == pytest.approx(1)
+
+
+def grid_map(*, is_located: bool) -> ArrayPhotoGraph:
+    """A square of 30 x 30 photos 10 m apart; or 180 photos of each of five halls."""
+    degrees = np.degrees(10.0 / EARTH_RADIUS_M)
+    return ArrayPhotoGraph(
+        PhotoTable.of_rows(
+            (str(row), row // 30 * degrees, row % 30 * degrees, None, None, None, None)
+            if is_located
+            else (str(row), None, None, None, f"hall {row // 180}", None, None)
+            for row in range(900)
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("is_located", "accuracy_m"),
+    [(True, None), (True, 60.0), (True, 100_000.0), (False, None)],
+    ids=["coordinates", "a fix of 60 m", "a fix of 100 km", "labels"],
+)
+def test_photos_that_are_weighed_together_lead_to_the_place_that_they_lead_to_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, is_located: bool, accuracy_m: float | None
+) -> None:
+    rng = np.random.default_rng(0)
+    shown = [310 + 30 * step if is_located else 400 + step for step in range(8)]
+    frames = []
+    for step, right in enumerate(shown):
+        others = dict.fromkeys(rng.choice(900, 40, replace=False).tolist(), 0.01)
+        hits = tuple(
+            Hit(photo=str(photo), score=probability, probability=probability)
+            for photo, probability in (others | {right: 0.08}).items()
+        )
+        fix = None
+        if accuracy_m is not None:
+            fix = PositionFix(latitude=0.001, longitude=0.001, accuracy_m=accuracy_m)
+        frames.append(FrameEvidence(time=at(20 * step), hits=hits, fix=fix))
+    states: dict[int, list[TrackState]] = {}
+    for limit in (900, 100):
+        monkeypatch.setattr(filter_module, "MAX_NEAR", limit if is_located else 900)
+        for module in (filter_module, photo_graph_module):
+            monkeypatch.setattr(module, "MAX_SAME_LABEL", limit)
+        track_filter = TrackFilter(grid_map(is_located=is_located), WALK)
+        states[limit] = [track_filter.state(belief) for belief in track_filter.smooth(frames)]
+    for one_by_one, together in zip(states[900], states[100], strict=True):
+        assert together.photo == one_by_one.photo
+        assert together.probability == pytest.approx(one_by_one.probability, abs=0.15)
+        assert together.outside == pytest.approx(one_by_one.outside, abs=0.01)

@@ -12,6 +12,8 @@ from shared.tracks.evidence import FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
 from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
 
+pytestmark = pytest.mark.numerics
+
 PHOTOS, FRAMES, HITS = 20, 60, 8
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
