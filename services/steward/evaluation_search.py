@@ -24,6 +24,7 @@ from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.geodesy import distances_m, latitude_bounds
+from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchBackend, SearchHit, SearchRequest
 
 
@@ -122,7 +123,7 @@ class EvaluationSearch:
         weights: tuple[float, ...] = (),
         excluded_photos: tuple[UUID, ...] = (),
     ) -> LocatedRanking | None:
-        """Return the k most similar database photos with their locations.
+        """Return the k most similar geotagged database photos with their locations.
 
         The query photo is excluded, too. Without word weights, the ranking is unweighted.
 
@@ -146,6 +147,7 @@ class EvaluationSearch:
                 row=descriptor.row,
                 min_version=self.version,
                 k=k,
+                photos=PhotoFilter(has_place=True),
                 exclude=(query.photo_id, *excluded_photos),
                 word_weights=weights,
             )
@@ -167,12 +169,12 @@ class EvaluationSearch:
                 )
             if answer.missing:
                 raise map_damaged_error(answer.missing)
-            return [(hit, self._location(hit)) for hit in answer.hits]
+            return [
+                (hit, self.photos[hit.photo_id].spot)
+                for hit in answer.hits
+                if hit.photo_id in self.photos  # not one that was given its place since
+            ]
         raise AssertionError("the last attempt returns or raises")
-
-    def _location(self, hit: SearchHit) -> PhotoLocation:
-        photo = self.photos.get(hit.photo_id)
-        return photo.spot if photo else UNKNOWN_LOCATION
 
 
 def map_damaged_error(missing: Sequence[str]) -> Conflict:

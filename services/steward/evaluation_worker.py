@@ -21,10 +21,12 @@ from services.steward.word_weights import WordWeightsFit
 from shared.catalog.chunks import count_searchable
 from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import Evaluation, Generation, active_generation
+from shared.catalog.maps import Map, decide_label_paths
 from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
 from shared.config.settings import Settings
 from shared.errors import Conflict
 from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.levels import LevelScheme
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
@@ -114,14 +116,19 @@ class EvaluationWorker:
             if generation is None:
                 raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
             searchable = count_searchable(session, generation.id)
-            words = _count_words(session, generation) if job.kind == JobKind.WORD_WEIGHTS else 0
+            map_ = session.get_one(Map, job.map_id)
+            words, labels_are_paths = 0, map_.place_labels_are_paths
+            if job.kind == JobKind.WORD_WEIGHTS:
+                words = _count_words(session, generation)
+            else:
+                labels_are_paths = decide_label_paths(session, map_)
         radius_m = self._settings.estimate_radius_m
         evaluation = MapEvaluation(
             self._catalog,
             self._search,
             generation,
             radius_m,
-            self._settings.level_radii_m,
+            LevelScheme(labels_are_paths=labels_are_paths, radii_m=self._settings.level_radii_m),
             progress.advance,
         )
         if job.kind == JobKind.WORD_WEIGHTS:
@@ -149,7 +156,11 @@ class EvaluationWorker:
         }
         evaluation_id = new_id()
         with self._catalog.write() as session:
+            # Before the job, in the order in which a deletion of the map locks them.
+            map_ = session.get(Map, job.map_id, with_for_update=True)
             for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+                if map_ is not None and map_.place_labels_are_automatic:
+                    map_.place_labels_are_paths = evaluation.scheme.labels_are_paths
                 current = session.get_one(Generation, generation.id)
                 current.calibration = unweighted.calibration.model_dump()
                 if weighted:

@@ -171,8 +171,8 @@ class MapEvaluationResult:
 class MapEvaluation:
     """Evaluates one generation of a map.
 
-    Photos within `radius_m` metres show the same place; `level_radii_m` are the radii of the levels
-    of an estimate, in metres. `on_query` is called after every search; an exception that it raises
+    Photos within `radius_m` metres show the same place; `scheme` has the levels of an estimate.
+    `on_query` is called after every search; an exception that it raises
     ends the evaluation.
     """
 
@@ -182,21 +182,18 @@ class MapEvaluation:
         search: SearchBackend,
         generation: Generation,
         radius_m: float,
-        level_radii_m: tuple[float, ...],
+        scheme: LevelScheme,
         on_query: Callable[[], None],
     ) -> None:
         self.radius_m = radius_m
+        self.scheme = scheme
         self.on_query = on_query
         with catalog.read() as session:
             ids = (generation.map_id, generation.id)
             database = read_geotagged_photos(session, *ids, PhotoRole.DATABASE)
             self.database = GeotaggedPhotos(database)
             self.queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
-            map_ = session.get_one(Map, generation.map_id)
-            version = map_.version
-            self.scheme = LevelScheme(
-                labels_are_paths=map_.place_labels_are_paths, radii_m=level_radii_m
-            )
+            version = session.get_one(Map, generation.map_id).version
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
         self._index_of = {photo.photo_id: i for i, photo in enumerate(self.database.photos)}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
@@ -288,13 +285,8 @@ class MapEvaluation:
         self.on_query()
         if ranking is None:
             return None
-        known = [
-            (self._index_of[hit.photo_id], hit.ranked_by)
-            for hit, _ in ranking
-            if hit.photo_id in self._index_of
-        ]
-        indices = np.array([index for index, _ in known], dtype=np.int64)
-        return indices, np.array([score for _, score in known], dtype=np.float64)
+        indices = np.array([self._index_of[hit.photo_id] for hit, _ in ranking], dtype=np.int64)
+        return indices, np.array([hit.ranked_by for hit, _ in ranking], dtype=np.float64)
 
     def _evaluate_places(
         self,

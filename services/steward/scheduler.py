@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.steward.batches.worker import cancel_items_of_ended_batches, resume_batches
 from services.steward.metrics import StewardMetrics
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
+from services.steward.tasks.auto_fit import fit_due_vocabularies
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_garbage
@@ -35,7 +36,6 @@ from services.steward.tasks.maintenance import (
 )
 from services.steward.tasks.model_changes import (
     advance_model_changes,
-    auto_fit_vocabularies,
     remove_dead_search_workers,
 )
 from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
@@ -82,6 +82,7 @@ class PeriodicTask:
     interval_seconds: float
     """Pause between the end of a run and the next one."""
     run: Callable[[], object]
+    """Returns True if the passing of time makes more work due; else a commit has to."""
     own_thread: bool = False
     """Whether it can take so long that the others must not wait for it."""
     uses_catalog: bool = True
@@ -156,11 +157,7 @@ class Scheduler:
             PeriodicTask(
                 "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
             ),
-            PeriodicTask(
-                "fit maps that wait",
-                2.0,
-                lambda: auto_fit_vocabularies(catalog, wakeups, settings.auto_fit_photos),
-            ),
+            PeriodicTask("fit vocabularies", 2.0, lambda: fit_due_vocabularies(catalog, wakeups)),
             PeriodicTask(
                 "count large maps",
                 10.0,
@@ -246,9 +243,9 @@ class Scheduler:
             commits = self._catalog.commits.count
             for task in shared:
                 if time.monotonic() >= task.next_run and not stop.is_set():
-                    self._run_task(task)
+                    waits_for_time = self._run_task(task)
                     self._heartbeat.beat()
-                    task.commits_seen = commits
+                    task.commits_seen = -1 if waits_for_time else commits
             stop.wait(SCHEDULER_TICK_SECONDS)
             if self._catalog.is_sqlite and all(task.commits_seen == commits for task in shared):
                 self._catalog.wait_for_commit(stop, commits, IDLE_SECONDS)
@@ -262,10 +259,11 @@ class Scheduler:
             self._run_task(task)
             poll.wait(stop, task.interval_seconds)
 
-    def _run_task(self, task: PeriodicTask) -> None:
-        started, outcome = time.monotonic(), "done"
+    def _run_task(self, task: PeriodicTask) -> bool:
+        """Run the task; return whether it returned True."""
+        started, outcome, result = time.monotonic(), "done", None
         try:
-            task.run()
+            result = task.run()
             if task.uses_catalog:
                 self._outage.record_success()
         except SQLAlchemyError as error:
@@ -280,6 +278,7 @@ class Scheduler:
             )
         self._metrics.observe_task(task.name, outcome, time.monotonic() - started)
         task.next_run = time.monotonic() + task.interval_seconds
+        return result is True
 
 
 def _collect_orphans(

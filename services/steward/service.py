@@ -10,7 +10,7 @@ import threading
 
 from prometheus_client import CollectorRegistry
 
-from services.service_process import Announce, service_process, start_service_thread
+from services.service_process import Announce, service_process, start_service_threads
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -19,24 +19,22 @@ from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
 from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
 from shared.search_api.client import HttpSearchClient
 from shared.telemetry.metrics_server import serve_metrics
+
+# Python runs a signal's handler when the main thread is awake. A signal that arrives just as the
+# thread blocks is handled when that ends.
+SIGNAL_POLL_SECONDS = 1.0
 
 
 def serve_steward(settings: Settings, announce: Announce) -> None:
     """Run all tasks of the steward until SIGTERM.
 
     Raises:
-        Misconfigured: `search_missing`, `redis_missing`; `thread_crashed` if a thread has crashed.
+        Misconfigured: `search_missing`, `redis_missing`; also as `service_process` raises it.
     """
-    stop, failed = threading.Event(), threading.Event()
-
-    def on_crash() -> None:
-        failed.set()
-        stop.set()
-
+    stop = threading.Event()
     with (
         service_process(settings, "steward") as catalog,
         process_heartbeat(catalog, "steward"),
@@ -53,18 +51,18 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
         scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
         evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
         webhooks = WebhookDispatcher(catalog, settings)
-        threads = [
-            start_service_thread(thread_name, run, stop, on_crash)
-            for thread_name, run in (
-                ("evaluator", evaluator.run),
-                ("batches", batches.run),
-                ("webhooks", webhooks.run),
-                ("steward", scheduler.run),
-            )
-        ]
+        threads = start_service_threads(
+            {
+                "evaluator": evaluator.run,
+                "batches": batches.run,
+                "webhooks": webhooks.run,
+                "steward": scheduler.run,
+            },
+            stop,
+        )
         announce("Placewise steward is running")
         with serve_metrics(settings, registry):
+            while not stop.wait(SIGNAL_POLL_SECONDS):
+                pass
             for thread in threads:
                 thread.join()
-    if failed.is_set():
-        raise Misconfigured("thread_crashed", "A thread of the steward failed. See the log above.")

@@ -5,6 +5,7 @@ The row of a revoked or expired key stays, so that lists and logs can still name
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,7 +22,9 @@ from shared.catalog.database.base import (
     db_now,
     db_now_plus,
 )
+from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.catalog.photos import Photo
+from shared.catalog.tracks import Track, TrackFrame
 from shared.errors import NotFound, Unauthorized, invalid_field_error
 from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
@@ -78,10 +81,16 @@ def create_api_key(
         Its row, and the key itself, which is not stored and only shown once.
 
     Raises:
-        Unprocessable: `invalid_field` for the scope `admin` with `maps`: admins manage all keys.
+        Unprocessable: `invalid_field` for the scope `admin` with `maps`: admins manage all keys;
+            and for what can't be the name of a map, such as `*`.
     """
     if maps is not None and Scope.ADMIN in scopes:
         raise invalid_field_error("maps", "can't be combined with the scope admin")
+    for each in maps or ():
+        if not re.fullmatch(MAP_NAME_PATTERN, each):
+            raise invalid_field_error(
+                "maps", f"{each!r} can't be the name of a map; a key for all maps has no maps"
+            )
     key = generate_api_key()
     row = ApiKey(
         name=name,
@@ -167,6 +176,10 @@ def record_key_use(session: Session, key_id: UUID) -> None:
 
 
 def count_photos_of_key(session: Session, key_id: UUID, limit: int) -> int:
-    """Count the live photos uploaded with the key, up to `limit`."""
-    photos = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None))
-    return count_rows(session, photos, limit)
+    """Count what the key has stored, each kind up to `limit`: live photos, tracks and frames."""
+    stored = (
+        select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)),
+        select(Track.id).where(Track.key_id == key_id),
+        select(TrackFrame.id).where(TrackFrame.key_id == key_id),
+    )
+    return sum(count_rows(session, rows, limit) for rows in stored)

@@ -14,7 +14,8 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import Base, UtcDateTime, count_rows, db_now, partial_index
-from shared.catalog.generations import Generation
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import Job, JobState
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
 
@@ -163,6 +164,26 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
 def count_searchable(session: Session, generation_id: UUID) -> int:
     """Count the photos that searches of the generation can return."""
     return _count_described(session, generation_id, PhotoRole.DATABASE)
+
+
+def select_failed_photos(map_id: UUID) -> sa.Select[UUID]:
+    """Select the map's live photos that can't be searched for, because their description failed."""
+    described = sa.exists().where(
+        Descriptor.photo_id == Photo.id,
+        Descriptor.generation_id == Generation.id,
+        Generation.state == GenerationState.ACTIVE,
+    )
+    return (
+        sa.select(Photo.id)
+        .join(Job, Photo.id == Job.photo_id)
+        .where(
+            Job.map_id == map_id,
+            Job.state == JobState.FAILED,
+            Job.id == Photo.job_id,
+            Photo.deleted_at.is_(None),
+            ~described,
+        )
+    )
 
 
 def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:

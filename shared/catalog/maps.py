@@ -21,7 +21,12 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
+from shared.catalog.chunks import (
+    MAX_EXACT_COUNT,
+    count_geotagged,
+    count_searchable,
+    select_failed_photos,
+)
 from shared.catalog.database.base import (
     Base,
     Journaled,
@@ -41,9 +46,10 @@ from shared.catalog.generations import (
     active_generation,
 )
 from shared.catalog.jobs import Job, WaitingFor
-from shared.catalog.photos import Photo, PhotoRole, count_live_photos
+from shared.catalog.photos import Photo, PhotoRole, count_live_photos, is_geotagged
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
+from shared.place_paths import look_like_paths
 
 DEFAULT_MAP = "default"
 MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
@@ -63,10 +69,18 @@ class Map(Journaled, Base):
         sa.Boolean, default=False, server_default=sa.false()
     )
     """Whether `/` separates the levels of the place labels."""
+    place_labels_are_automatic: Mapped[bool] = mapped_column(
+        sa.Boolean, default=True, server_default=sa.true()
+    )
+    """Whether `decide_label_paths` decides that by the labels."""
     row_type: Mapped[RowType] = mapped_column(
         sa.String(20), default=RowType.FLOAT32, server_default=RowType.FLOAT32
     )
     """Type of the descriptor rows of its new generations."""
+    auto_fit: Mapped[bool] = mapped_column(sa.Boolean, default=True, server_default=sa.true())
+    """Whether the steward fits vocabularies for it."""
+    fitted_photos: Mapped[int | None] = mapped_column(sa.Integer)
+    """Number of its database photos when the last fit of its extractor's vocabulary was started."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
@@ -76,16 +90,22 @@ def create_map(
     name: str,
     extractor: str,
     *,
-    place_labels_are_paths: bool = False,
+    place_labels_are_paths: bool | None = None,
     row_type: RowType = RowType.FLOAT32,
+    auto_fit: bool = True,
 ) -> Map:
-    """Create an empty map; Conflict (`map_exists`) when the name is taken."""
+    """Create an empty map; Conflict (`map_exists`) when the name is taken.
+
+    With None, its labels decide whether they are paths.
+    """
     map_ = Map(
         id=new_id(),
         name=name,
         extractor=extractor,
-        place_labels_are_paths=place_labels_are_paths,
+        place_labels_are_paths=bool(place_labels_are_paths),
+        place_labels_are_automatic=place_labels_are_paths is None,
         row_type=row_type,
+        auto_fit=auto_fit,
     )
     try:
         with session.begin_nested():
@@ -119,6 +139,14 @@ def list_maps_without_vocabulary(session: Session) -> list[str]:
     waiting = sa.exists().where(Job.map_id == Map.id, Job.waiting_for == WaitingFor.VOCABULARY)
     names = sa.select(Map.name).where(Map.deleted_at.is_(None), waiting).order_by(Map.name)
     return list(session.scalars(names))
+
+
+def count_failed_photos(session: Session) -> dict[str, int]:
+    """Return the names of the maps with photos whose description failed, and their number."""
+    counts = {
+        map_.name: count_rows(session, select_failed_photos(map_.id)) for map_ in list_maps(session)
+    }
+    return {name: count for name, count in counts.items() if count}
 
 
 def mark_map_deleted(session: Session, map_: Map) -> None:
@@ -180,6 +208,27 @@ def increment_map_version(session: Session, map_id: UUID) -> int:
     ).scalar_one()
 
 
+def decide_label_paths(session: Session, map_: Map) -> bool:
+    """Return whether the map's labels are paths: by their look, if that is automatic.
+
+    They are if they look like paths (`look_like_paths`) and most photos with a place have a label
+    and no coordinates: the levels of coordinates are circles.
+    """
+    if not map_.place_labels_are_automatic:
+        return map_.place_labels_are_paths
+    is_labelled = Photo.latitude.is_(None)
+    photos = sa.select(is_labelled, Photo.place, sa.func.count()).where(
+        Photo.map_id == map_.id,
+        Photo.deleted_at.is_(None),
+        Photo.role == PhotoRole.DATABASE,
+        is_geotagged(),
+    )
+    counts = session.execute(photos.group_by(is_labelled, Photo.place)).all()
+    labels = {str(place): count for labelled, place, count in counts if labelled}
+    located = sum(count for _, _, count in counts)
+    return 2 * sum(labels.values()) > located and look_like_paths(labels)
+
+
 class Search(Base):
     """A completed similarity search, for the history and the statistics."""
 
@@ -198,6 +247,8 @@ class Search(Base):
     answer_level: Mapped[int | None] = mapped_column(sa.Integer)
     not_in_map_probability: Mapped[float | None] = mapped_column(sa.Float)
     """null if the estimate had no levels"""
+    has_place: Mapped[bool] = mapped_column(sa.Boolean, default=False, server_default=sa.false())
+    """Whether the estimate named a place."""
     searched_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     __table_args__ = (
@@ -253,6 +304,8 @@ class MapStatistics:
     """Longest duration of the searches of the last seven days, in milliseconds."""
     jobs: dict[str, int]
     """State -> number of jobs."""
+    failed_photos: int = 0
+    """Photos that can't be searched for, because their description failed."""
 
 
 def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, datetime]:
@@ -307,7 +360,22 @@ def _compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
         average_ms=average,
         longest_ms=longest,
         jobs={str(state): count for state, count in session.execute(jobs)},
+        failed_photos=count_rows(session, select_failed_photos(map_id)),
     )
+
+
+def has_database_photos(session: Session, map_id: UUID, number: int) -> bool:
+    """Return whether the map has `number` live photos that are no labelled queries.
+
+    Above MAX_EXACT_COUNT the cached statistics answer.
+    """
+    if number > MAX_EXACT_COUNT:
+        cached = session.get(CachedMapStatistics, map_id)
+        return cached is not None and MapStatistics(**cached.figures).photos >= number
+    photos = sa.select(Photo.id).where(
+        Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE
+    )
+    return count_rows(session, photos, number) == number
 
 
 def are_statistics_stale(session: Session, map_id: UUID) -> bool:

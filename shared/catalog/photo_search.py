@@ -14,6 +14,7 @@ from uuid import UUID
 from sqlalchemy import Select, Uuid, func, literal, or_, select, tuple_
 from sqlalchemy.orm import Session, aliased
 
+from shared.catalog.chunks import select_failed_photos
 from shared.catalog.database.base import (
     Condition,
     UtcDateTime,
@@ -23,7 +24,7 @@ from shared.catalog.database.base import (
     json_array_has,
     json_array_has_part,
 )
-from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.photos import Photo, PhotoRole, is_geotagged
 from shared.geodesy import latitude_bounds, longitude_half_width
 from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
@@ -38,7 +39,8 @@ class MetadataFilter:
     """Conditions of a metadata search; None means "any". Bounds are inclusive."""
 
     filename: str | None = None
-    """Substring of the file name, case-insensitive; `%` and `_` are ordinary characters."""
+    """Substring of the file name or the relative path, case-insensitive; `%` and `_` are ordinary
+    characters."""
     upload_after: datetime | None = None
     upload_before: datetime | None = None
     min_file_size: int | None = None
@@ -46,15 +48,20 @@ class MetadataFilter:
     photos: PhotoFilter = NO_FILTER
     """Filter by location, time, place and tags."""
     role: PhotoRole | None = None
+    failed: bool = False
+    """Whether the photo's description has to have failed."""
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
         conditions: list[Condition] = []
         if self.filename is not None:
-            conditions.append(photo.filename.icontains(self.filename, autoescape=True))
+            names = (photo.filename, photo.relative_path)
+            conditions.append(
+                or_(*(name.icontains(self.filename, autoescape=True) for name in names))
+            )
             if trigrams and len(self.filename) >= TRIGRAM_CHARACTERS:
                 part = filename_trigrams(literal(self.filename))
-                conditions.append(filename_trigrams(photo.filename).bool_op("@>")(part))
+                conditions.append(or_(*(filename_trigrams(n).bool_op("@>")(part) for n in names)))
         if self.upload_after is not None:
             conditions.append(photo.uploaded_at >= self.upload_after)
         if self.upload_before is not None:
@@ -90,6 +97,8 @@ def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> 
         )
     if photo_filter.ids is not None:
         conditions.append(photo.id.in_(photo_filter.ids))
+    if photo_filter.has_place:
+        conditions.append(is_geotagged(photo))
     conditions.extend(json_array_has(photo.tags, tag) for tag in photo_filter.tags)
     conditions.extend(json_array_has_part(photo.tags, part) for part in photo_filter.tags_like)
     return conditions
@@ -112,6 +121,8 @@ def search_photos(
     """
     on_postgres = session.get_bind().dialect.name == "postgresql"
     live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
+    if metadata_filter.failed:
+        live.append(Photo.id.in_(select_failed_photos(map_id)))
     conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
     total = count_rows(session, select(Photo.id).where(*conditions), MAX_COUNTED_MATCHES)
     newest = (Photo.uploaded_at.desc(), Photo.id.desc())

@@ -120,6 +120,12 @@ class Photo(Journaled, Base):
             postgresql_using="gin",
             postgresql_where=deleted_at.is_(None),
         ).ddl_if(dialect="postgresql"),
+        sa.Index(
+            "ix_photos_relative_path",
+            filename_trigrams(relative_path),
+            postgresql_using="gin",
+            postgresql_where=deleted_at.is_(None),
+        ).ddl_if(dialect="postgresql"),
         partial_index("ix_photos_deleted", "deleted_at", only=deleted_at.is_not(None)),
     )
 
@@ -211,9 +217,9 @@ def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     return session.scalar(statement.limit(1)) is not None
 
 
-def is_geotagged() -> Condition:
+def is_geotagged(photo: type[Photo] = Photo) -> Condition:
     """Condition for photos with coordinates or a place label."""
-    return sa.or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
+    return sa.or_(photo.latitude.is_not(None), photo.place.is_not(None))
 
 
 def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:

@@ -13,8 +13,12 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
-from shared.errors import Conflict
-from shared.extractor_config.configs import ANYLOC_PREPROCESSING_NAMES, get_extractor_config
+from shared.errors import Conflict, Misconfigured
+from shared.extractor_config.configs import (
+    ANYLOC_PREPROCESSING_NAMES,
+    MIN_PHOTOS_TO_FIT,
+    get_extractor_config,
+)
 from shared.ids import new_id
 
 
@@ -65,6 +69,24 @@ def vocabulary_standing(session: Session, generation: Generation) -> str:
         needed = get_extractor_config(name, allow_test_extractors=True).needs_vocabulary
         return "pending" if needed else "none"
     return session.get_one(Vocabulary, generation.vocabulary_id).standing
+
+
+def next_fit_photos(session: Session, map_: Map) -> int | None:
+    """Return the number of photos at which the steward fits the map's next vocabulary.
+
+    That is MIN_PHOTOS_TO_FIT, and after a fit, also a failed or cancelled one, twice the photos
+    that the map had then. None if the steward fits none: it is switched off, the extractor uses no
+    vocabulary, or the descriptors are reduced by a PCA that was fitted with the present one.
+    """
+    try:
+        config = get_extractor_config(map_.extractor, allow_test_extractors=True)
+    except Misconfigured:  # of another release: nothing can be described here
+        return None
+    active = active_generation(session, map_.id)
+    is_reduced = active is not None and active.pca_from is not None
+    if not map_.auto_fit or not config.needs_vocabulary or is_reduced:
+        return None
+    return max(MIN_PHOTOS_TO_FIT, 2 * (map_.fitted_photos or 0))
 
 
 def word_weights_unavailable_reason(session: Session, generation: Generation) -> str | None:

@@ -276,8 +276,9 @@ class PhotoQuota:
         if photos.counted >= limit:
             raise TooManyRequests(
                 "photo_quota_reached",
-                f"The API key has reached its limit of {limit} photos. Delete some, or ask an "
-                "administrator for a key with a higher limit.",
+                f"The API key has reached its limit of {limit} photos; tracks and their frames "
+                "count as well. Delete some, or ask an administrator for a key with a higher "
+                "limit.",
                 retry_after_seconds=QUOTA_RETRY_SECONDS,
                 limit=limit,
             )

@@ -35,6 +35,7 @@ from shared.catalog.jobs import (
     WaitingFor,
 )
 from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.jobs.transitions import (
@@ -50,10 +51,13 @@ def start_model_change(
 ) -> Job:
     """Queue a model change for the map.
 
+    The next automatic vocabulary fit starts when the map has twice the photos that it has at this
+    one, however it ends (`next_fit_photos`).
+
     Raises:
         Conflict: `model_change_running`, naming the unfinished one.
     """
-    lock_map(session, map_id)
+    map_ = lock_map(session, map_id)
     running = get_unfinished_model_change(session, map_id)
     if running is not None:
         raise Conflict(
@@ -70,6 +74,8 @@ def start_model_change(
         params=params,
     )
     session.add(job)
+    if kind == JobKind.FIT:
+        map_.fitted_photos = count_live_photos(session, map_id, PhotoRole.DATABASE)
     session.flush()
     return job
 

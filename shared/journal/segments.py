@@ -19,10 +19,21 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from math import isfinite
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import RowMapping, Table
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Float,
+    Integer,
+    RowMapping,
+    String,
+    Table,
+    TypeDecorator,
+)
 
 from shared.catalog.database.base import Journaled, from_json, to_json
 from shared.catalog.generations import Generation
@@ -109,20 +120,74 @@ def read_segment(store: ObjectStore, key: str) -> SegmentContent:
         Unavailable: `journal_damaged` for a damaged segment or an unknown format.
     """
     data = store.get(key)
+    number = 0
     try:
-        head, *lines = (json.loads(line) for line in gzip.decompress(data).splitlines())
+        texts = gzip.decompress(data).splitlines()
+        number = 1
+        head = json.loads(texts[0])
         if head["placewise_journal"] != FORMAT:
             raise ValueError(f"unknown format {head['placewise_journal']}")
-        return SegmentContent(
-            UUID(head["installation_id"]),
-            [Line(one["table"], UUID(one["id"]), one["revision"], one["row"]) for one in lines],
-        )
-    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
+        installation_id = UUID(head["installation_id"])
+        lines = []
+        for number, text in enumerate(texts[1:], start=2):  # noqa: B007 used by the error
+            lines.append(_decode_line(text))
+    except _DECODE_ERRORS as error:
+        reason = f"line {number}: {error!r}" if number else str(error)
         raise Unavailable(
             "journal_damaged",
-            f"The journal segment {key} can't be read ({error}). Restore the object from a backup.",
+            f"The journal segment {key} can't be read ({reason}). "
+            "Restore the object from a backup.",
             object_key=key,
+            reason=reason,
         ) from error
+    return SegmentContent(installation_id, lines)
+
+
+_DECODE_ERRORS = (
+    *(OSError, EOFError, zlib.error),
+    *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
+)
+
+
+def _decode_line(text: bytes) -> Line:
+    """Decode a line whose values fit the columns of its table; raises `_DECODE_ERRORS`."""
+    one = json.loads(text)
+    line = Line(one["table"], UUID(one["id"]), one["revision"], one["row"])
+    if type(line.revision) is not int or not 0 <= line.revision < 2**63:
+        raise ValueError(f"revision can't be {line.revision!r:.40}")
+    if not isinstance(line.row, dict):
+        raise TypeError("row is no object")
+    if line.table in TABLES:  # a later release may journal more
+        values = columns_of(line)
+        missing = sorted(_REQUIRED_COLUMNS[line.table] - values.keys())
+        if missing or values.get("id", line.id) != line.id:
+            raise ValueError(f"row lacks {', '.join(missing)}" if missing else "row has another id")
+        for name, value in values.items():
+            _check_value(table_of(line.table).columns[name], value)
+    return line
+
+
+def _check_value(column: Column[Any], value: Any) -> None:
+    """Raise TypeError or ValueError for a value that a database can't store in the column."""
+    kind = column.type
+    if isinstance(kind, TypeDecorator):
+        kind = kind.impl_instance
+    if value is None:
+        is_valid = bool(column.nullable)
+    elif isinstance(kind, String):
+        value.encode()  # raises for half a surrogate pair
+        is_valid = "\0" not in value and (kind.length is None or len(value) <= kind.length)
+    elif isinstance(kind, Integer):
+        bits = 63 if isinstance(kind, BigInteger) else 31
+        is_valid = type(value) is int and abs(value) < 2**bits
+    elif isinstance(kind, Float):
+        is_valid = type(value) in (int, float) and isfinite(value)
+    elif isinstance(kind, Boolean):
+        is_valid = type(value) is bool
+    else:
+        is_valid = not isinstance(value, datetime) or value.tzinfo is not None
+    if not is_valid:
+        raise ValueError(f"{column.name} can't be {value!r:.40}")
 
 
 def last_states(lines: Iterable[Line]) -> list[Line]:
@@ -197,6 +262,20 @@ def table_of(name: str) -> Table:
     table = TABLES[name].__table__  # type: ignore[attr-defined]
     assert isinstance(table, Table)
     return table
+
+
+# Those that a row can't be inserted or recovered without.
+_REQUIRED_COLUMNS: dict[str, set[str]] = {
+    name: {
+        column.name
+        for column in table_of(name).columns
+        if (not column.nullable and column.default is None and column.server_default is None)
+        or column.name in ("deleted_at", "vocabulary_id", "model_id", "whitening_id")
+    }
+    - REVISION_COLUMNS
+    - UNJOURNALED_COLUMNS.get(name, set())
+    for name in TABLES
+}
 
 
 def line_of(name: str, row: RowMapping) -> Line:

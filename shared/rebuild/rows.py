@@ -61,7 +61,7 @@ class LatestStates:
     Attributes:
         sequence: highest sequence number of the journal, 0 without a journal.
         installation_id: id of the catalog that wrote the journal.
-        damaged: keys of unreadable segments.
+        damaged: keys of unreadable segments, with the reasons.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class LatestStates:
             except Unavailable as error:
                 if error.code != "journal_damaged":
                     raise
-                self.damaged.append(segment.key)
+                self.damaged.append(f"{segment.key} ({error.extra['reason']})")
             else:
                 self.installation_id = content.installation_id
                 self._add(content.lines)

@@ -15,8 +15,9 @@ from sqlalchemy.orm import Session
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
-from shared.catalog.maps import get_map_statistics, list_maps, lock_map
+from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
 from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
+from shared.evaluation.calibration import Calibration
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.word_weights.record import parse_word_weights
@@ -77,6 +78,7 @@ def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool
         evaluated is None
         or _changed_enough(searchable, evaluated[0])
         or _changed_enough(queries, evaluated[1])
+        or _levels_changed(session, generation)
     ):
         return JobKind.EVALUATE, params
     if not word_weights or not _has_own_vocabulary(session, generation):
@@ -140,6 +142,15 @@ def _failed_job_params(
     ):
         return job.params
     return None
+
+
+def _levels_changed(session: Session, generation: Generation) -> bool:
+    """Return whether labels have become paths, or names, since the place model was fitted."""
+    if generation.calibration is None or _failed_job_params(session, generation, JobKind.EVALUATE):
+        return False
+    model = Calibration.model_validate(generation.calibration).places
+    are_paths = session.get_one(Map, generation.map_id).place_labels_are_paths
+    return bool(model and model.scheme and model.scheme.labels_are_paths != are_paths)
 
 
 def _changed_enough(current: int, previous: int) -> bool:

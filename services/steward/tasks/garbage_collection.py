@@ -17,7 +17,7 @@ from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
-from services.steward.tasks.reindex_jobs import adopt_failed_reindex_jobs, delete_done_reindex_jobs
+from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs, settle_photo_jobs
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
@@ -298,7 +298,7 @@ def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: J
 
 def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     """Run every collection of this module once, and complete the switch to new generations."""
-    adopt_failed_reindex_jobs(catalog)
+    settle_photo_jobs(catalog)
     delete_done_reindex_jobs(catalog)
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)

@@ -7,6 +7,9 @@ photo can be missed between them. Search workers that died are removed, or they 
 
 The photos are queued by `reindex_jobs`, without that lock; the last check reads only the chunks
 published since.
+
+A model change fails as soon as it would lose more than MAX_LOST_SHARE of the searchable photos, and
+the active generation stays.
 """
 
 from __future__ import annotations
@@ -20,12 +23,17 @@ from sqlalchemy.orm import Session
 from services.steward.tasks.reindex_jobs import (
     ADVANCED_WAITS,
     QueuedChunks,
-    adopt_failed_reindex_jobs,
     has_missing_photos,
     queue_missing_photos,
+    settle_photo_jobs,
 )
-from shared.catalog.chunks import estimate_described
-from shared.catalog.database.base import Condition, db_now, db_now_plus
+from shared.catalog.chunks import (
+    MAX_EXACT_COUNT,
+    Descriptor,
+    count_searchable,
+    estimate_described,
+)
+from shared.catalog.database.base import Condition, count_rows, db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
     Generation,
@@ -34,21 +42,23 @@ from shared.catalog.generations import (
     lock_generation,
 )
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
-from shared.catalog.maps import Map, increment_map_version, list_maps, lock_map
+from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.processes import delete_dead_search_workers, list_lagging_workers
-from shared.catalog.vocabularies import StoredWhitening, vocabulary_standing
+from shared.catalog.vocabularies import StoredWhitening
 from shared.catalog.webhooks import EventKind, enqueue_event
-from shared.errors import Conflict
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from shared.errors import Unprocessable
 from shared.jobs import Job, JobKind, JobState, Wakeups
-from shared.jobs.model_changes import start_model_change
-from shared.jobs.transitions import succeed_job
+from shared.jobs.model_changes import abandon_generation
+from shared.jobs.transitions import fail_job, succeed_job
 
 log = logging.getLogger(__name__)
 
 # A search worker that takes longer to load a generation is named in the job and in the log.
 SLOW_LOAD_SECONDS = 60.0
+
+MAX_LOST_SHARE = 0.01  # of the searchable photos that a model change may fail to describe
+MAX_LISTED_PHOTOS = 10
 
 
 def remove_dead_search_workers(catalog: Catalog) -> None:
@@ -92,10 +102,6 @@ def _search_workers_have_loaded(session: Session, job: Job, generation: Generati
     return False
 
 
-# The defaults of `POST /vocabularies`; without `clusters` the extractor's own number is used.
-DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
-
-
 def advance_model_changes(
     catalog: Catalog, wakeups: Wakeups, queued_chunks: QueuedChunks | None = None
 ) -> None:
@@ -137,81 +143,19 @@ def _advance_model_change(
         if job.waiting_for not in ADVANCED_WAITS:
             return  # cancelled, or finished by another steward
         generation = lock_generation(session, generation_id)
+        loss = _check_losses(session, job, generation)
+        if loss is not None:
+            log.error("model change %s failed: %s", job.id, loss.detail)
+            fail_job(job, loss.as_problem())
+            abandon_generation(session, job)
+            return
         if not seems_complete or not _is_complete(session, job, generation, queued_chunks):
             _report_progress(session, job, generation)
             return
         switched = generation.state == GenerationState.BUILDING
         _finish_model_change(session, job, generation)
     if switched:
-        adopt_failed_reindex_jobs(catalog)
-
-
-def auto_fit_vocabularies(catalog: Catalog, wakeups: Wakeups, auto_fit_photos: int) -> None:
-    """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one.
-
-    Pooled descriptors are replaced by those of a vocabulary at the same number, a provisional
-    vocabulary once the map has at least MIN_PHOTOS_TO_FIT, too.
-    """
-    with catalog.read() as session:
-        maps = [map_.id for map_ in list_maps(session)]
-        ready = [
-            id_
-            for id_ in maps
-            if _has_enough_waiting_photos(session, id_, auto_fit_photos)
-            or _has_outgrown_its_vocabulary(session, id_, auto_fit_photos)
-        ]
-    for map_id in ready:
-        with catalog.write() as session:
-            if _last_change_failed(session, map_id):
-                continue  # the error is in the job; a user has to act
-            try:
-                job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
-            except Conflict:
-                continue  # a model change is running
-        log.info(
-            "fitting a vocabulary for map %s, which has enough photos (job %s)", map_id, job.id
-        )
-        wakeups.send()
-
-
-def _has_enough_waiting_photos(session: Session, map_id: UUID, min_photos: int) -> bool:
-    """Return whether at least `min_photos` database photos of the map wait for a vocabulary."""
-    waiting = (
-        select(Job.id)
-        .join(Photo, Photo.id == Job.photo_id)
-        .where(
-            Job.map_id == map_id,
-            Job.waiting_for == WaitingFor.VOCABULARY,
-            Job.kind == JobKind.INDEX,
-            Photo.role == PhotoRole.DATABASE,
-        )
-        .limit(min_photos)
-    )
-    return session.scalar(select(func.count()).select_from(waiting.subquery())) == min_photos
-
-
-def _has_outgrown_its_vocabulary(session: Session, map_id: UUID, min_photos: int) -> bool:
-    """Return whether the map's vocabulary is pending or provisional, and it has enough photos.
-
-    A PCA whitening was fitted on descriptors of the vocabulary, so a user has to replace both.
-    """
-    active = active_generation(session, map_id)
-    if active is None or active.pca_from is not None:
-        return False
-    standing = vocabulary_standing(session, active)
-    if standing not in ("pending", "provisional"):
-        return False
-    required = min_photos if standing == "pending" else max(min_photos, MIN_PHOTOS_TO_FIT)
-    photos = (
-        select(Photo.id)
-        .where(
-            Photo.map_id == map_id,
-            Photo.deleted_at.is_(None),
-            Photo.role == PhotoRole.DATABASE,
-        )
-        .limit(required)
-    )
-    return session.scalar(select(func.count()).select_from(photos.subquery())) == required
+        settle_photo_jobs(catalog)
 
 
 def _open_jobs(job: Job, generation: Generation) -> Condition:
@@ -242,6 +186,46 @@ def _is_complete(
     return not has_missing_photos(session, generation, queued_chunks)
 
 
+def _check_losses(session: Session, job: Job, generation: Generation) -> Unprocessable | None:
+    """Count the job's failed photos; return the error if too many of them are searchable now."""
+    job.progress_failed = _count_jobs(
+        session, _open_jobs(job, generation) & (Job.state == JobState.FAILED)
+    )
+    active = active_generation(session, generation.map_id)
+    if not job.progress_failed or active is None or active.id == generation.id:
+        return None
+    lost_jobs = (
+        select(Job.photo_id, Job.error)
+        .join(Photo, Photo.id == Job.photo_id)
+        .join(Descriptor, Descriptor.photo_id == Photo.id)
+        .where(
+            _open_jobs(job, generation),
+            Job.state == JobState.FAILED,
+            Descriptor.generation_id == active.id,
+            Photo.deleted_at.is_(None),
+            Photo.role == PhotoRole.DATABASE,
+        )
+    )
+    lost = count_rows(session, lost_jobs)
+    searchable = estimate_described(session, active.id)
+    if searchable <= MAX_EXACT_COUNT:
+        searchable = count_searchable(session, active.id)  # without labelled queries
+    if lost <= MAX_LOST_SHARE * searchable:
+        return None
+    listed = session.execute(lost_jobs.order_by(Job.id).limit(MAX_LISTED_PHOTOS)).all()
+    return Unprocessable(
+        "change_loses_photos",
+        f"The new model can't describe {lost} of the map's {searchable} searchable photos (at most "
+        f"{MAX_LOST_SHARE:.0%} may fail), so the map keeps the current one. The first failure is "
+        f"that of the photo {listed[0].photo_id}: {listed[0].error['detail']} GET "
+        "/api/v1/jobs?kind=reindex&state=failed lists all. Delete or replace these photos, or use "
+        "another model.",
+        lost=lost,
+        searchable=searchable,
+        file_ids=[str(row.photo_id) for row in listed],
+    )
+
+
 def _report_progress(session: Session, job: Job, generation: Generation) -> None:
     before = int(job.params.get("done_before", 0))
     described = estimate_described(session, generation.id)
@@ -252,13 +236,13 @@ def _report_progress(session: Session, job: Job, generation: Generation) -> None
 
 def _finish_model_change(session: Session, job: Job, generation: Generation) -> None:
     """Activate the complete generation, unless search workers have yet to load it."""
-    failed = _count_jobs(session, _open_jobs(job, generation) & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
         if not _search_workers_have_loaded(session, job, generation):
             return
         _activate_generation(session, job, generation)
-    job.progress_failed = failed
-    job.progress_total = max(job.progress_total, failed)
+    if job.kind == JobKind.IMPORT or job.params.get("vocabulary_chosen"):
+        session.get_one(Map, job.map_id).auto_fit = False
+    job.progress_total = max(job.progress_total, job.progress_failed)
     photos = estimate_described(session, generation.id)
     whitening = None
     if generation.whitening_id is not None:
@@ -272,7 +256,7 @@ def _finish_model_change(session: Session, job: Job, generation: Generation) -> 
             "dimension": generation.dimension,
             "pca": whitening,
             "photos": photos,
-            "failed": failed,
+            "failed": job.progress_failed,
         },
     )
     log.info("activated generation %s with %d photos", generation.id, photos)
@@ -290,6 +274,7 @@ def _activate_generation(session: Session, job: Job, generation: Generation) -> 
     map_ = session.get_one(Map, generation.map_id)
     if job.params.get("extractor") is not None:
         map_.extractor = generation.extractor
+        map_.fitted_photos = None  # the photos were of another extractor's fit
     enqueue_event(
         session,
         EventKind.GENERATION_SWITCHED,
@@ -301,16 +286,6 @@ def _activate_generation(session: Session, job: Job, generation: Generation) -> 
         },
     )
     increment_map_version(session, generation.map_id)
-
-
-def _last_change_failed(session: Session, map_id: UUID) -> bool:
-    last = session.scalar(
-        select(Job.state)
-        .where(Job.map_id == map_id, Job.kind.in_(MODEL_CHANGE_JOBS))
-        .order_by(Job.id.desc())
-        .limit(1)
-    )
-    return last in (JobState.FAILED, JobState.CANCELLED)
 
 
 def _count_jobs(session: Session, condition: Condition) -> int:

@@ -1,8 +1,8 @@
 """Reindex jobs of model changes: one for each photo that a new generation has to describe.
 
 Photos are queued chunk by chunk of the active generation, without the map's lock, and the chunks
-that are done are remembered. Jobs of ended model changes are cancelled or deleted, and failed ones
-become the jobs of their photos.
+that are done are remembered. The photos whose description failed are queued as well, once. Jobs of
+ended model changes are cancelled or deleted, and failed ones become the jobs of their photos.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from uuid import UUID
 from sqlalchemy import Select, delete, insert, or_, select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import IDS_PER_QUERY, Chunk, Descriptor
+from shared.catalog.chunks import IDS_PER_QUERY, Chunk, Descriptor, select_failed_photos
 from shared.catalog.database.base import affected_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (
@@ -27,7 +27,7 @@ from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs
+from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs, succeed_job
 
 # What a model change waits for that the steward advances.
 ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
@@ -37,7 +37,10 @@ DELETED_JOBS_PER_TRANSACTION = 1000
 SLICE_SECONDS = 0.5  # of one run for each model change, so that other tasks are not delayed
 
 QueuedChunks = dict[UUID, set[UUID]]
-"""Building generation -> chunks of the active one whose photos have all been queued."""
+"""Building generation -> chunks of the active one whose photos have all been queued.
+
+The id of the active generation itself stands for the photos whose description failed.
+"""
 
 
 def queue_missing_photos(
@@ -45,23 +48,23 @@ def queue_missing_photos(
 ) -> tuple[int, bool]:
     """Queue a reindex job for each photo without one, for about SLICE_SECONDS.
 
-    Every call reaches one more chunk, however slow the catalog is. Adds the chunks of the active
-    generation whose photos are all queued to `queued_chunks`.
+    Every call reaches one more source of photos, however slow the catalog is. Adds those whose
+    photos are all queued to `queued_chunks`.
 
     Returns:
-        The number of queued jobs, and whether every chunk was reached.
+        The number of queued jobs, and whether every source was reached.
     """
     deadline = time.monotonic() + SLICE_SECONDS
     queued = _queue_photos(catalog, job, generation, _photos_of_cancelled_jobs(generation.id))
     with catalog.read() as session:
-        chunk_ids = _active_chunk_ids(session, generation.map_id)
-    queued_chunks &= chunk_ids
-    for chunk_id in sorted(chunk_ids - queued_chunks):
-        queued += _queue_photos(catalog, job, generation, _photos_of_chunk(chunk_id))
-        queued_chunks.add(chunk_id)
+        sources = _photo_sources(session, generation.map_id)
+    queued_chunks.intersection_update(sources)
+    for source_id in sorted(sources.keys() - queued_chunks):
+        queued += _queue_photos(catalog, job, generation, sources[source_id])
+        queued_chunks.add(source_id)
         if time.monotonic() > deadline:
             break
-    return queued, chunk_ids == queued_chunks
+    return queued, sources.keys() == queued_chunks
 
 
 def _queue_photos(
@@ -106,11 +109,11 @@ def has_missing_photos(session: Session, generation: Generation, queued_chunks: 
 
     Reads the chunks that are not in `queued_chunks` only, and the photos of cancelled jobs.
     """
-    new_chunks = _active_chunk_ids(session, generation.map_id) - queued_chunks
-    sources = [_photos_of_cancelled_jobs(generation.id), *map(_photos_of_chunk, new_chunks)]
+    sources = _photo_sources(session, generation.map_id)
+    new = [sources[source_id] for source_id in sources.keys() - queued_chunks]
     return any(
         _find_missing(session, generation.id, session.scalars(photo_ids).all())
-        for photo_ids in sources
+        for photo_ids in (_photos_of_cancelled_jobs(generation.id), *new)
     )
 
 
@@ -157,11 +160,17 @@ def _photos_of_cancelled_jobs(generation_id: UUID) -> Select[UUID]:
     )
 
 
-def _active_chunk_ids(session: Session, map_id: UUID) -> set[UUID]:
+def _photo_sources(session: Session, map_id: UUID) -> dict[UUID, Select[UUID]]:
+    """Return the selections of photos that a new generation describes, by their `QueuedChunks` id.
+
+    The recorded failures of earlier generations are retried, because the new one may describe the
+    photos.
+    """
     active = active_generation(session, map_id)
     assert active is not None, "a generation is built only while another is active"
     live = select(Chunk.id).where(Chunk.generation_id == active.id, Chunk.superseded_at.is_(None))
-    return set(session.scalars(live))
+    chunks = {chunk_id: _photos_of_chunk(chunk_id) for chunk_id in session.scalars(live)}
+    return {active.id: select_failed_photos(map_id), **chunks}
 
 
 def cancel_jobs_of_abandoned_generations(catalog: Catalog) -> None:
@@ -189,11 +198,38 @@ def cancel_jobs_of_abandoned_generations(catalog: Catalog) -> None:
             cancel_jobs(session, Job.id.in_(job_ids))
 
 
-def adopt_failed_reindex_jobs(catalog: Catalog) -> None:
-    """Make the failed reindex jobs of active generations their photos' jobs, which show the error.
+def settle_photo_jobs(catalog: Catalog) -> None:
+    """Set the photos' jobs to what active generations have made of the photos.
 
-    A photo whose job is newer than the reindex job keeps it: it was queued again since.
+    A failed reindex job becomes its photo's job, which shows the error, unless the photo was queued
+    again since. A photo's failed job succeeds if a later generation describes the photo.
     """
+    _adopt_failed_reindex_jobs(catalog)
+    described = (
+        select(Job, Generation.id)
+        .join(Generation, Generation.map_id == Job.map_id)
+        .join(Photo, (Photo.id == Job.photo_id) & (Photo.job_id == Job.id))
+        .join(Descriptor, Descriptor.photo_id == Photo.id)
+        .where(
+            Job.state == JobState.FAILED,
+            Generation.state == GenerationState.ACTIVE,
+            Descriptor.generation_id == Generation.id,
+            Job.finished_at < Generation.activated_at,
+        )
+        .limit(REINDEX_JOBS_PER_TRANSACTION)
+    )
+    while True:
+        with catalog.write() as session:
+            jobs = session.execute(described.with_for_update(of=Job)).all()
+            for job, generation_id in jobs:
+                job.progress_failed = 0
+                file_id = str(job.photo_id)
+                succeed_job(job, {"file_id": file_id, "generation_id": str(generation_id)})
+        if len(jobs) < REINDEX_JOBS_PER_TRANSACTION:
+            return
+
+
+def _adopt_failed_reindex_jobs(catalog: Catalog) -> None:
     failed = (
         select(Job.id)
         .join(Generation, Generation.id == Job.generation_id)

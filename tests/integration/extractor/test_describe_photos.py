@@ -18,7 +18,8 @@ from services.extractor import worker as worker_module
 from services.extractor.generation_resolver import resolve_generation
 from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.model_changes import auto_fit_vocabularies
+from services.steward.tasks import auto_fit
+from services.steward.tasks.auto_fit import fit_due_vocabularies
 from shared.catalog.chunks import Chunk, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import WaitingFor
@@ -26,7 +27,6 @@ from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind, JobState
 from shared.storage.chunks import decode_rows, manifest_key
@@ -278,6 +278,7 @@ def test_a_query_goes_between_the_slices_of_a_fit(
     assert vlads.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
 
 
+@pytest.mark.usefixtures("fit_at_four_photos")
 def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     vlads: Workplace,
 ) -> None:
@@ -293,15 +294,13 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     assert refused.error is not None
     assert refused.error["code"] == "no_vocabulary"
 
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)  # AUTO_FIT_PHOTOS
+    assert vlads.fit_if_due() == []
     assert not vlads.wakeups.wait(0)
     photo_ids += vlads.upload(4)
     vlads.drain()
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
+    vlads.fit_if_due()
     assert vlads.wakeups.wait(0)
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)  # once is enough
-    with vlads.catalog.read() as session:
-        job_id = session.scalars(select(Job.id).where(Job.kind == JobKind.FIT)).one()
+    (job_id,) = vlads.fit_if_due()  # once is enough
     fit = vlads.finish(job_id)
     assert fit.state == JobState.SUCCEEDED
     assert fit.result is not None
@@ -319,46 +318,74 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     assert vlads.job(query).state == JobState.SUCCEEDED
 
 
-def test_a_vocabulary_of_too_few_photos_is_replaced_once_there_are_enough(
-    vlads: Workplace,
+@pytest.mark.usefixtures("fit_at_four_photos")
+def test_a_vocabulary_is_fitted_again_when_the_map_has_doubled(vlads: Workplace) -> None:
+    vlads.upload(*range(5))
+    vlads.drain()
+    (first,) = vlads.fit_if_due()
+    vlads.finish(first)
+    vlads.upload(*range(5, 9))
+    vlads.drain()
+    assert vlads.fit_if_due() == [first]
+    vlads.upload(9)
+    vlads.drain()
+    _, second = vlads.fit_if_due()
+    assert vlads.finish(second).state == JobState.SUCCEEDED
+    assert vlads.fit_if_due() == [first, second]
+    assert vlads.searchable() == 10
+
+
+@pytest.mark.usefixtures("fit_at_four_photos")
+@pytest.mark.parametrize("end", ["failed", "cancelled"])
+def test_after_a_fit_that_did_not_succeed_the_next_one_waits_until_the_map_has_doubled(
+    vlads: Workplace, end: str
 ) -> None:
     vlads.upload(*range(4))
-    vlads.fit(clusters=4)
-    assert standing(vlads) == "provisional"
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
-    assert fit_jobs(vlads) == 1, "another fit on the same photos would be no better"
-
-    vlads.upload(*range(4, MIN_PHOTOS_TO_FIT))
     vlads.drain()
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, MIN_PHOTOS_TO_FIT + 1)
-    assert fit_jobs(vlads) == 1
-    for _ in range(2):
-        auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
-    with vlads.catalog.read() as session:
-        newest = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).all()[-1]
-    assert vlads.finish(newest.id).state == JobState.SUCCEEDED
-    assert standing(vlads) == "own"
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 4)
-    assert fit_jobs(vlads) == 2, "a vocabulary of enough photos stays"
-
-
-def standing(workplace: Workplace) -> str:
-    return workplace.vocabulary(workplace.active().vocabulary_id).standing
-
-
-def fit_jobs(workplace: Workplace) -> int:
-    with workplace.catalog.read() as session:
-        jobs = select(func.count()).select_from(Job).where(Job.kind == JobKind.FIT)
-        return session.scalar(jobs) or 0
-
-
-def test_no_vocabulary_is_fitted_by_itself_after_a_fit_was_cancelled(vlads: Workplace) -> None:
-    vlads.upload(1, 2)
+    (first,) = vlads.fit_if_due()
+    if end == "failed":
+        set_columns(vlads.catalog, first, state=JobState.FAILED)
+    else:
+        vlads.cancel(first)
+    vlads.upload(*range(4, 7))
     vlads.drain()
-    vlads.cancel(vlads.start(JobKind.FIT, clusters=8, sample=100, seed=0))
-    auto_fit_vocabularies(vlads.catalog, vlads.wakeups, 1)
-    with vlads.catalog.read() as session:
-        assert session.scalar(select(func.count()).where(Job.kind == JobKind.FIT)) == 1
+    assert vlads.fit_if_due() == [first]
+    vlads.upload(7)
+    vlads.drain()
+    assert len(vlads.fit_if_due()) == 2
+
+
+@pytest.mark.usefixtures("fit_at_four_photos")
+def test_a_fit_waits_for_the_end_of_an_upload_unless_the_map_is_overdue(
+    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vlads.upload(*range(4))
+    assert vlads.fit_if_due() == [], "photos are queued"
+    vlads.drain()
+    monkeypatch.setattr(auto_fit, "QUIET_SECONDS", 3600.0)
+    assert fit_due_vocabularies(vlads.catalog, vlads.wakeups), "it is due in a while"
+    vlads.upload(*range(4, 15))
+    vlads.drain()
+    assert vlads.fit_if_due() == []
+    vlads.upload(15)
+    vlads.drain()
+    assert len(vlads.fit_if_due()) == 1
+    assert not fit_due_vocabularies(vlads.catalog, vlads.wakeups)
+
+
+@pytest.mark.usefixtures("fit_at_four_photos")
+def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
+    vlads: Workplace, averages: Workplace
+) -> None:
+    for place in (vlads, averages):
+        place.upload(*range(4))
+        place.drain()
+    with vlads.catalog.write() as session:
+        session.get_one(Map, vlads.map_id).auto_fit = False
+    assert vlads.fit_if_due() == averages.fit_if_due() == []
+    with vlads.catalog.write() as session:
+        session.get_one(Map, vlads.map_id).auto_fit = True
+    assert len(vlads.fit_if_due()) == 1
 
 
 def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(

@@ -18,6 +18,7 @@ from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
+from services.steward.tasks import model_changes
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_whitenings
 from services.steward.tasks.orphans import collect_orphans
@@ -40,7 +41,7 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_vocabulary_command.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = [pytest.mark.databases("postgresql"), pytest.mark.numerics]
 
 PHOTOS = 14
 KEPT = 5
@@ -262,6 +263,7 @@ def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
         return found
 
     monkeypatch.setattr(PcaProjection, "project", project)
+    monkeypatch.setattr(model_changes, "MAX_LOST_SHARE", 1 / PHOTOS)
     reduce(described)
     assert described.rows().keys() == before.keys() - {refused}
     with described.catalog.read() as session:

@@ -11,7 +11,6 @@ from sqlalchemy import select
 
 from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.model_changes import auto_fit_vocabularies
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map
@@ -83,16 +82,13 @@ def test_the_first_photo_is_described_by_pooling_the_same_local_features(
     assert pooled.job(query).state == JobState.SUCCEEDED
 
 
+@pytest.mark.usefixtures("fit_at_four_photos")
 def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_answer(
     pooled: Workplace,
 ) -> None:
-    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 5)
-    assert newest_job(pooled, JobKind.FIT) is None
     photo_ids = pooled.upload(4)
     pooled.drain()
-    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 5)
-    fit = newest_job(pooled, JobKind.FIT)
-    assert fit is not None
+    (fit,) = pooled.fit_if_due()
 
     def answers_meanwhile() -> None:
         if pooled.job(fit).state in UNFINISHED_STATES:
@@ -131,14 +127,14 @@ def test_describing_the_photos_again_leaves_the_vocabulary_pending(
     assert extractors(pooled) == (VLAD, POOLED, "pending")
 
 
+@pytest.mark.usefixtures("fit_at_four_photos")
 def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabulary(
     pooled: Workplace,
 ) -> None:
     job = pooled.start(JobKind.SWITCH, vocabulary_id=None, extractor=POOLED)
     assert pooled.finish(job).state == JobState.SUCCEEDED
     assert extractors(pooled) == (POOLED, POOLED, "none")
-    auto_fit_vocabularies(pooled.catalog, pooled.wakeups, 1)
-    assert newest_job(pooled, JobKind.FIT) is None
+    assert pooled.fit_if_due() == []
 
 
 def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(

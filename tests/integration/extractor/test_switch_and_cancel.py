@@ -14,6 +14,7 @@ import pytest
 from services.extractor.model_changes import ModelChangeRunner
 from services.steward.tasks.garbage_collection import collect_model_change_files
 from shared.catalog.generations import GenerationState
+from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.errors import Conflict
@@ -143,6 +144,23 @@ def test_an_imported_vocabulary_describes_the_map(vlads: Workplace) -> None:
     rows = vlads.rows()
     assert set(rows) == set(ids)
     assert same(rows[ids[0]], expected_row("test-tiny-vlad", photo_bytes(1), stored))
+
+
+@pytest.mark.usefixtures("fit_at_four_photos")
+def test_an_imported_vocabulary_is_not_replaced_automatically(vlads: Workplace) -> None:
+    vlads.upload(*range(4))
+    vlads.drain()
+    bad = vlads.finish(import_file(vlads, npy(some_centres(4)[:, :8])))
+    assert bad.state == JobState.FAILED
+    assert auto_fit(vlads), "nothing was imported"
+    assert vlads.finish(import_file(vlads, npy(some_centres(4)))).state == JobState.SUCCEEDED
+    assert not auto_fit(vlads)
+    assert vlads.fit_if_due() == []
+
+
+def auto_fit(workplace: Workplace) -> bool:
+    with workplace.catalog.read() as session:
+        return session.get_one(Map, workplace.map_id).auto_fit
 
 
 def test_an_unfit_vocabulary_is_refused_with_the_reason_and_changes_nothing(

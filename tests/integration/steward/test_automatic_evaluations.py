@@ -48,6 +48,17 @@ def automatic(town: Town, least_photos: int = LEAST) -> bool:
     return bool(jobs)
 
 
+def test_a_map_is_evaluated_again_when_its_labels_become_paths(town: Town) -> None:
+    town.publish([(n, {"place": f"hall {n % 4}"}) for n in range(LEAST)])
+    assert automatic(town)
+    assert not automatic(town)
+    with town.catalog.write() as session:
+        map_ = lock_map(session, town.map_id)
+        map_.place_labels_are_paths, map_.place_labels_are_automatic = True, False
+    assert automatic(town)
+    assert not automatic(town)
+
+
 def test_a_map_is_evaluated_by_itself_once_per_change(town: Town) -> None:
     town.publish([(n, at(n)) for n in range(LEAST - 1)])
     assert not automatic(town), "too few"

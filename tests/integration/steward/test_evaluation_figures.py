@@ -206,7 +206,8 @@ def _publish_pairs(town: Town, places: int, **columns: Any) -> None:
 
 def _use_paths(town: Town) -> None:
     with town.catalog.write() as session:
-        session.get_one(Map, town.map_id).place_labels_are_paths = True
+        map_ = session.get_one(Map, town.map_id)
+        map_.place_labels_are_paths, map_.place_labels_are_automatic = True, False
 
 
 @pytest.mark.parametrize(
@@ -223,6 +224,31 @@ def test_labels_with_empty_levels_mixed_depths_or_one_level_are_evaluated(
     assert places["levels"][0]["samples"] > 0
     for answers in places["answers"]:
         assert 0 <= answers["answered_at_finest_level"]["mean"] <= answers["answered"]["mean"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("columns", "levels"),
+    [
+        ({"place": lambda place: f"tower/{place % 4}/{place}"}, 3),
+        ({"place": lambda place: f"room {place}"}, 1),
+        (
+            {
+                "place": lambda place: f"tower/{place % 4}/{place}",
+                "latitude": float,
+                "longitude": lambda _: 7.0,
+            },
+            4,
+        ),
+    ],
+    ids=["paths", "names", "paths beside coordinates"],
+)
+def test_an_evaluation_decides_by_the_labels_whether_they_are_paths(
+    town: Town, columns: dict[str, Any], levels: int
+) -> None:
+    _publish_pairs(town, 40, **columns)
+    assert len(town.figures()["places"]["levels"]) == levels
+    with town.catalog.read() as session:
+        assert session.get_one(Map, town.map_id).place_labels_are_paths == (levels == 3)
 
 
 def test_thousands_of_labels_are_evaluated(town: Town) -> None:

@@ -10,12 +10,14 @@ import pytest
 from sqlalchemy import select
 
 from services.steward.scheduler import PeriodicTask, Scheduler
+from services.steward.tasks import auto_fit
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import (
     collect_ended_generations,
     collect_garbage,
 )
 from services.steward.tasks.maintenance import resend_wakeups
+from shared.catalog import vocabularies
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
@@ -96,6 +98,23 @@ def test_a_duty_that_raises_does_not_stop_the_others(
     assert done == ["fail", "work", "fail", "work"]  # and it is tried again
 
 
+@pytest.mark.databases("sqlite")
+def test_a_task_that_the_time_makes_due_is_run_again_without_a_commit(
+    chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings)
+    stop, runs, waits = threading.Event(), [True, True, False], []
+
+    def idle(*_: object) -> None:
+        waits.append(len(runs))
+        stop.set()
+
+    monkeypatch.setattr(chunk_map.catalog, "wait_for_commit", idle)
+    steward.tasks = [PeriodicTask("soon due", 0.0, lambda: runs.pop(0))]
+    steward.run(stop)
+    assert waits == [0], "it waits for a commit once no time makes more work due"
+
+
 def test_a_long_task_with_a_thread_of_its_own_delays_no_other(
     chunk_map: ChunkMap, settings: Settings
 ) -> None:
@@ -119,9 +138,9 @@ def test_each_duty_is_done_by_the_loop(
 ) -> None:
     """One round does everything once: each duty leaves its trace."""
     wakeups = InProcessWakeups()
-    soon = settings.model_copy(
-        update={"compact_chunks": 2, "orphan_age_seconds": 0.0, "auto_fit_photos": 1}
-    )
+    soon = settings.model_copy(update={"compact_chunks": 2, "orphan_age_seconds": 0.0})
+    monkeypatch.setattr(vocabularies, "MIN_PHOTOS_TO_FIT", 1)
+    monkeypatch.setattr(auto_fit, "QUIET_SECONDS", -1.0)
     retained = sum_of(chunk_map.chunks(1, 1))
     gone, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"gone")
     chunk_map.delete(gone)

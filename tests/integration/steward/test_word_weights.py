@@ -33,7 +33,7 @@ from tests.support.catalog_rows import add_chunk, add_generation, add_photo, rea
 from tests.support.problems import problem
 
 # tests/e2e/test_word_weights_command.py runs the job on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = [pytest.mark.databases("postgresql"), pytest.mark.numerics]
 
 WORDS, WIDTH = 4, 8
 TRIED = 60  # photos
