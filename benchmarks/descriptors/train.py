@@ -114,7 +114,7 @@ TRAINING_PLACES_PER_BATCH = 16
 
 @dataclass(frozen=True, slots=True)
 class RecallGain:
-    """R@k from 0 to 1; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
+    """R@1 from 0 to 1; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
 
     untrained: float
     trained: float
@@ -166,17 +166,15 @@ def measure_gain(
     evaluation_set: EvaluationSet,
     image_size: int,
     device: Device,
-    k: int = 1,
 ) -> RecallGain:
-    """Return the difference of recall@k of two networks on the same queries."""
+    """Return the difference of R@1 of two networks on the same queries."""
     within = []
     for model in (untrained, trained):
         describe = ModelDescriber(
             model.to(device.torch_device), device.torch_device, (image_size, image_size)
         )
-        ranked = evaluate_recall(describe, evaluation_set, ks=(k,)).ranked.indices
-        hits = compute_hits(ranked, evaluation_set.positives)[:, :k]
-        within.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
+        ranked = evaluate_recall(describe, evaluation_set, ks=(1,)).ranked.indices
+        within.append(compute_hits(ranked, evaluation_set.positives)[:, :1].astype(np.float64))
     (difference,) = paired_differences(
         within[1], within[0], cluster_queries(evaluation_set.queries).labels
     )

@@ -16,13 +16,14 @@ import ast
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
-from shared.errors import InvalidRequest, NotFound
+from shared.errors import InvalidRequest, Misconfigured, NotFound, PlacewiseError
 
 
 def _parse_literal(value: Any) -> Any:
@@ -353,6 +354,50 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     if matches:
         return f" Did you mean {by_lower[matches[0]]}?"
     return f" Known: {', '.join(names)}."
+
+
+GPU_DEVICE_FILES = ("nvidia*", "nvhost*", "kfd", "dxg")
+"""Files in /dev of NVIDIA's drivers, AMD's driver and WSL"""
+
+
+def find_early_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
+    """Return what keeps a run from starting, as far as this shows before PyTorch is imported."""
+    obstacles: list[PlacewiseError] = []
+    if arguments.accelerator in ("gpu", "cuda") and sys.platform == "linux":
+        if not any(any(Path("/dev").glob(name)) for name in GPU_DEVICE_FILES):
+            obstacles.append(no_gpu_error("This machine has no driver of a GPU"))
+    needs_data_root = arguments.experiment_phase != "test" or not arguments.eval_roots
+    if arguments.data_root is None and needs_data_root:
+        obstacles.append(data_root_error())
+    return obstacles
+
+
+def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:
+    """Return the only obstacle, or an error `several_obstacles` that lists all."""
+    if len(obstacles) == 1:
+        return obstacles[0]
+    lines = [f"- {error.code}: {error.detail}" for error in obstacles]
+    return Misconfigured("several_obstacles", "\n".join(["The run can't start:", *lines]))
+
+
+def no_gpu_error(reason: str) -> Misconfigured:
+    """Build the error of a run on a GPU that can't be used."""
+    return Misconfigured(
+        "no_gpu",
+        f"{reason} (--accelerator gpu is the default). Train on the CPU with --accelerator cpu, on "
+        "what the machine has with --accelerator auto, or install the driver and a CUDA build of "
+        "PyTorch.",
+    )
+
+
+def data_root_error() -> InvalidRequest:
+    """Build the error of a run without --data-root."""
+    return InvalidRequest(
+        "data_root_missing",
+        "--data-root DIR is required: the folder of the data set, in a layout that `placewise "
+        "datasets check DIR` recognises. `placewise datasets synth DIR` generates a data set "
+        "for a first try.",
+    )
 
 
 def load_yaml(path: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torchvision import transforms as tv
 
-from services.trainer.arguments import TrainingArguments, suggest_name
+from services.trainer.arguments import TrainingArguments, data_root_error, suggest_name
 from shared.datasets.dataset import EvaluationSet, TrainingSet
 from shared.datasets.open_dataset import (
     TrainingPlace,
@@ -29,7 +29,7 @@ from shared.datasets.open_dataset import (
     open_evaluation_set,
     open_training_set,
 )
-from shared.errors import InvalidRequest, NotFound, Unprocessable
+from shared.errors import NotFound, Unprocessable
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.decode import decode_resized
 
@@ -151,12 +151,7 @@ def summarise_evaluation_set(evaluation_set: EvaluationSet) -> dict[str, Any]:
 
 def _require_data_root(arguments: TrainingArguments) -> Path:
     if arguments.data_root is None:
-        raise InvalidRequest(
-            "data_root_missing",
-            "--data_root DIR is required: the folder of the data set, in a layout that `placewise "
-            "datasets check DIR` recognises. `placewise datasets synth DIR` generates a data set "
-            "for a first try.",
-        )
+        raise data_root_error()
     return arguments.data_root
 
 

@@ -239,7 +239,7 @@ def run_grid(
 ) -> list[RunOutcome]:
     """Execute all unfinished runs sequentially.
 
-    A failed run does not stop the others, unless none of them can start for the same reason.
+    A failed run does not stop the others.
 
     `out` is the root folder of the runs. `after_each` is called with all outcomes after each run.
 
@@ -253,7 +253,9 @@ def run_grid(
     out.mkdir(parents=True, exist_ok=True)
     with lock_folder(out):
         outcomes = [load_outcome(planned, out) for planned in plan.runs]
+        reported: dict[str, str] = {}  # reason -> the first run that failed for it
         for index, outcome in enumerate(outcomes):
+            stop.check()
             planned = outcome.run
             title = f"run {index + 1} of {len(outcomes)}, {planned.name}"
             if outcome.state is RunState.FINISHED:
@@ -262,22 +264,13 @@ def run_grid(
             is_interrupted = outcome.state is RunState.INTERRUPTED
             display.info(f"{title}: {'resuming' if is_interrupted else 'starting'}")
             outcomes[index] = _execute_run(planned, out / planned.name, display, stop)
+            error = outcomes[index].error
+            if error is not None:
+                first = reported.setdefault(error["detail"], planned.name)
+                reason = error["detail"] if first == planned.name else f"as {first}"
+                display.warn(f"{planned.name} failed: {error['code']}: {reason}")
             after_each(outcomes)
-            remaining = [
-                each for each in outcomes[index + 1 :] if each.state is not RunState.FINISHED
-            ]
-            if remaining and all(_fails_likewise(each.run, outcomes[index]) for each in remaining):
-                display.warn(f"Stopped: the other {len(remaining)} runs can't start either.")
-                break
         return outcomes
-
-
-def _fails_likewise(planned: PlannedRun, outcome: RunOutcome) -> bool:
-    """Return whether the run can't start, for the reason that another run failed for."""
-    if outcome.error is None:
-        return False
-    obstacles = run.find_obstacles(build_arguments(planned.arguments))
-    return bool(obstacles) and run.combine_obstacles(obstacles).detail == outcome.error["detail"]
 
 
 # Settings that decide neither the data nor the network.
@@ -327,7 +320,6 @@ def _execute_run(
         folder.mkdir(parents=True, exist_ok=True)
         trace = traceback.format_exception(error)
         (folder / FAILED_FILE).write_text(json.dumps({**reason, "trace": trace}, indent=1) + "\n")
-        display.warn(f"{planned.name} failed: {reason['code']}: {reason['detail']}")
         return RunOutcome(planned, RunState.FAILED, error=reason)
     return RunOutcome(planned, RunState.FINISHED, report=report)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +11,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
+from shared.descriptors.inference import (
+    BatchSizeLimit,
+    PhotoTooLargeForGpu,
+    inference_clock,
+    run_in_batches,
+)
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.evaluation.ranking import Rows, refused_photos_error
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
@@ -36,7 +40,7 @@ class ModelDescriber:
         max_pixels: larger photos are refused.
 
     Attributes:
-        seconds: time spent in the network, in seconds; decoding runs concurrently.
+        seconds: time spent in the network, by `inference_clock`, in seconds.
         photos: number of photos described in that time.
     """
 
@@ -74,6 +78,7 @@ class ModelDescriber:
         refused: list[tuple[Path, PlacewiseError]] = []
         was_training = self._model.training
         self._model.eval()
+        clock, on_cpu = inference_clock(self._device), self._device.type == "cpu"
         threads = ThreadPoolExecutor(max(1, os.cpu_count() or 1))  # decoding releases the GIL
         try:
             prefetched = [threads.submit(self._decode, p) for p in photos[: self._batch_photos]]
@@ -81,7 +86,8 @@ class ModelDescriber:
                 decoded = [future.result() for future in prefetched]
                 end = start + self._batch_photos
                 next_batch = photos[end : end + self._batch_photos]
-                prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
+                if not on_cpu:
+                    prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
                 batch = photos[start:end]
                 refused += [
                     (photo, result)
@@ -90,15 +96,17 @@ class ModelDescriber:
                 ]
                 if not refused:  # after the first error, only look for more unreadable photos
                     pixels = [p for p in decoded if not isinstance(p, PlacewiseError)]
-                    started_at = time.perf_counter()
+                    started_at = clock()
                     try:
                         rows = self._describe(pixels)
                     except PhotoTooLargeForGpu as error:
                         refused.append((batch[error.place], error))
                         continue
-                    self.seconds += time.perf_counter() - started_at
+                    self.seconds += clock() - started_at
                     self.photos += len(rows)
                     yield rows
+                if on_cpu:  # not before: its CPU time would count as that of the inference
+                    prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
         finally:
             threads.shutdown(cancel_futures=True)
             self._model.train(was_training)

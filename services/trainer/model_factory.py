@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from services.trainer.arguments import TrainingArguments
@@ -25,7 +26,7 @@ from shared.descriptors.vpr_models.backbones import register_backbone
 from shared.descriptors.vpr_models.checkpoint import is_checkpoint, load_checkpoint
 from shared.descriptors.vpr_models.config import VprModelConfig, is_own_module
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
-from shared.errors import Conflict, InvalidRequest
+from shared.errors import Conflict, InvalidRequest, Misconfigured
 
 
 def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
@@ -67,7 +68,27 @@ def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool
             f"--layers_to_freeze {config.layers_to_freeze} freezes layers whose weights are random "
             "(--pretrained False): they never learn. Use --layers_to_freeze -1 to train them."
         )
-    return build_vpr_model(config, weights=arguments.weights)
+    return _build_pretrained_model(config, arguments.weights)
+
+
+_missing_weights: dict[tuple[str, str], str] = {}
+"""Details of `weights_missing`, by backbone and torch.hub's folder"""
+
+
+def _build_pretrained_model(config: VprModelConfig, weights: Path | None) -> VprModel:
+    """As `build_vpr_model`, but weights that can't be downloaded are tried once in a process.
+
+    Without a network, a download fails after minutes, and a grid has many runs with one backbone.
+    """
+    key = config.backbone_arch, torch.hub.get_dir()
+    if config.pretrained and weights is None and key in _missing_weights:
+        raise Misconfigured("weights_missing", _missing_weights[key])
+    try:
+        return build_vpr_model(config, weights=weights)
+    except Misconfigured as error:
+        if error.code == "weights_missing" and weights is None:
+            _missing_weights[key] = error.detail
+        raise
 
 
 def _initial_checkpoint(arguments: TrainingArguments) -> Path | None:

@@ -24,7 +24,7 @@ from lightning.pytorch.loggers import (
     WandbLogger,
 )
 
-from services.trainer.arguments import TrainingArguments, to_plain_dict
+from services.trainer.arguments import TrainingArguments, no_gpu_error, to_plain_dict
 from services.trainer.checkpointing import CheckpointNameTemplate, TopKCheckpoints
 from services.trainer.data import EvaluationSets
 from services.trainer.run_control import Display
@@ -93,11 +93,7 @@ def _resolve_accelerator(requested: str) -> str:
         return "mps" if torch.backends.mps.is_available() else "cpu"
     if requested in ("gpu", "cuda"):
         if not torch.cuda.is_available():
-            raise Misconfigured(
-                "no_gpu",
-                "PyTorch finds no CUDA GPU (--accelerator gpu is the default). Train on the CPU "
-                "with --accelerator cpu, or install the driver and a CUDA build of PyTorch.",
-            )
+            raise no_gpu_error("PyTorch finds no CUDA GPU")
         return "gpu"
     if requested == "mps" and not torch.backends.mps.is_available():
         raise Misconfigured("no_gpu", "PyTorch finds no MPS device. Use --accelerator cpu.")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from services.trainer.arguments import TrainingArguments, save_yaml, to_plain_dict
+from services.trainer.arguments import (
+    TrainingArguments,
+    combine_obstacles,
+    save_yaml,
+    to_plain_dict,
+)
 from services.trainer.checkpointing import seed_everything
 from services.trainer.data import (
     EvaluationSets,
@@ -41,8 +44,9 @@ from services.trainer.run_folder import (
 from services.trainer.summary import build_summary, print_data_sets
 from services.trainer.training_loop import TrainingLoop, TrainingRun
 from services.trainer.validation import Validator, write_predictions
+from shared.config.command_line import command_line
 from shared.descriptors.vpr_models.checkpoint import Checkpoint, load_checkpoint
-from shared.errors import Conflict, InvalidRequest, Misconfigured, PlacewiseError
+from shared.errors import Conflict, InvalidRequest, PlacewiseError
 from shared.evaluation.ranking import RecallEvaluation
 
 Json = dict[str, Any]
@@ -72,14 +76,6 @@ def find_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
         except PlacewiseError as error:
             obstacles.setdefault(error.detail, error)
     return list(obstacles.values())
-
-
-def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:
-    """Return the only obstacle, or an error `several_obstacles` that lists all."""
-    if len(obstacles) == 1:
-        return obstacles[0]
-    lines = [f"- {error.code}: {error.detail}" for error in obstacles]
-    return Misconfigured("several_obstacles", "\n".join(["The run can't start:", *lines]))
 
 
 @contextlib.contextmanager
@@ -227,7 +223,7 @@ def _train(
             ) from None
         raise RunStopped(
             f"Stopped. {checkpoints.last_path} holds the full training state; resume with\n"
-            f"  {sys.argv[0]} train --resume {shlex.quote(str(folder))}"
+            f"  {command_line('train', '--resume', folder)}"
         ) from None
     report = build_summary(arguments, folder, prepared.history, checkpoints, sets, tests)
     (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +17,7 @@ from services.trainer.checkpointing import TopKCheckpoints
 from services.trainer.data import EvaluationSets, summarise_evaluation_set
 from services.trainer.run_control import Display
 from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
+from shared.config.command_line import command_line
 from shared.datasets.dataset import TrainingSet
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import is_own_module
@@ -118,17 +118,20 @@ def _checkpoint_details(path: Path, score: float | None) -> Json:
 
 def _next_commands(arguments: TrainingArguments, sets: EvaluationSets, report: Json) -> list[str]:
     """Return commands that show predictions, and evaluate and register the best checkpoint."""
-    best = shlex.quote(report["best"]["path"])
-    root = shlex.quote(str((arguments.eval_roots or (arguments.data_root,))[0]))
+    best = Path(report["best"]["path"])
+    root = (arguments.eval_roots or (arguments.data_root,))[0]
+    assert root is not None  # the sets were found there
     show_predictions = [
-        f"placewise evaluate --predictions {shlex.quote(predictions)} "
-        f"--data {shlex.quote(str(sets.roots[name]))} --set {name} --out report"
+        command_line(
+            *("evaluate", "--predictions", Path(predictions)),
+            *("--data", Path(sets.roots[name]), "--set", name, "--out", "report"),
+        )
         for name, predictions in list(report["predictions"].items())[:1]
     ]
     if is_own_module(arguments.backbone_arch) or is_own_module(arguments.agg_arch):
         return show_predictions  # only the trainer imports the network's code
     return [
         *show_predictions,
-        f"placewise evaluate --data {root} --checkpoint {best}",
-        f"placewise models add {best} --name NAME",
+        command_line("evaluate", "--data", root, "--checkpoint", best),
+        command_line("models", "add", best, "--name", "NAME"),
     ]

@@ -37,7 +37,8 @@ from shared.datasets.open_dataset import (
 )
 from shared.datasets.utm_coordinates import has_position, pairwise_distances_m
 from shared.errors import InvalidRequest, NotFound, PlacewiseError, Unprocessable
-from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count, open_photo
+from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
+from shared.imaging.file_structure import open_photo
 
 MAX_DECODED_PIXELS = 100_000_000
 """Maximum of width x height of a decoded photo; larger ones would exhaust memory."""

@@ -16,6 +16,7 @@ import contextlib
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -34,6 +35,14 @@ DEFAULT_PHOTO_PIXELS = 224 * 224  # the pixels of one photo, for the default siz
 # Serializes GPU work across threads: concurrent passes would not be faster and would need the
 # memory of both.
 _gpu_lock = threading.Lock()
+
+
+def inference_clock(device: torch.device) -> Callable[[], float]:
+    """Return the clock of inference on a device, in seconds.
+
+    On a CPU, the CPU time of the process: it does not grow with the load of other processes.
+    """
+    return time.process_time if device.type == "cpu" else time.perf_counter
 
 
 class PhotoTooLargeForGpu(Unprocessable):

@@ -1,7 +1,7 @@
 """Cluster centres of VLAD vocabularies: encoding, decoding and validation.
 
-Centres that are zero, duplicate or not finite are rejected: they would spoil every descriptor
-without an error.
+Centres that are zero, too long, duplicate or not finite are rejected: they would spoil every
+descriptor without an error.
 """
 
 from __future__ import annotations
@@ -34,6 +34,11 @@ ARRAY_READ_ERRORS = (
     tokenize.TokenError,
     zipfile.BadZipFile,
 )
+
+# Of a centre's norm, which is at most 1 for a mean of unit vectors; a larger one is imported. A
+# photo has fewer than 1e7 patches, so that the sum of its residuals to a centre is shorter than
+# 1e13, and its square, below 1e26, is far from float32's overflow at 3.4e38.
+MAX_CENTRE_NORM = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +84,17 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
         )
     if not np.isfinite(array).all():
         raise unfit("it holds NaN or infinite numbers")
-    zero = np.flatnonzero(np.linalg.norm(array, axis=1) < 1e-6)
+    norms = np.linalg.norm(array.astype(np.float64), axis=1)
+    zero = np.flatnonzero(norms < 1e-6)
     if len(zero):
         raise unfit(f"centre {int(zero[0])} is zero")
+    longest = int(norms.argmax())
+    if norms[longest] > MAX_CENTRE_NORM:
+        raise unfit(
+            f"the norm of centre {longest} is {norms[longest]:.3g}, more than "
+            f"{MAX_CENTRE_NORM:.0e}, with which residuals may overflow; centres of unit vectors "
+            "have a norm of at most 1"
+        )
     distinct = len(np.unique(array, axis=0))
     if distinct != len(array):
         raise unfit(f"only {distinct} of its {len(array)} centres are distinct")

@@ -139,7 +139,7 @@ def evaluate_sequence(
         belief = track_filter.advance(belief, frame)
         states.append(track_filter.state(belief))
     seconds = (time.process_time() - started) / max(len(evidence), 1)
-    smoothed = [track_filter.state(each) for each in track_filter.smooth(evidence)]
+    smoothed = track_filter.smoothed_states(evidence)
     sequence_matches = _seqslam(map_, scores, motion)
     results = []
     for number, index in enumerate(members):

@@ -38,7 +38,12 @@ from services.cli.output import (
     print_table,
 )
 from services.cli.training.options import given_options, with_training_options
-from services.trainer.arguments import build_arguments, load_yaml
+from services.trainer.arguments import (
+    build_arguments,
+    combine_obstacles,
+    find_early_obstacles,
+    load_yaml,
+)
 from shared.errors import InvalidRequest
 
 LOG_INTERVAL_SECONDS = 60.0
@@ -176,18 +181,24 @@ def train(
 
 
 def _run_training(config: Path | None, resume: Path | None, overrides: dict[str, Any]) -> Any:
-    from services.trainer import run
-    from services.trainer.run_control import RunStopped, StopRequest
-
     if config is not None and resume is not None:
         raise InvalidRequest(
             "bad_argument", "--resume uses the run's own arguments. Remove --config."
         )
+    layers = [load_yaml(config)] if config is not None else []
+    if resume is None:
+        obstacles = find_early_obstacles(build_arguments(*layers, overrides))
+        if obstacles:
+            raise combine_obstacles(obstacles)
+
+    # PyTorch and Lightning take half a minute to import from a cold disk.
+    from services.trainer import run
+    from services.trainer.run_control import RunStopped, StopRequest
+
     with _TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
             if resume is not None:
                 return run.resume(resume, overrides, display, stop)
-            layers = [load_yaml(config)] if config is not None else []
             return run.run(build_arguments(*layers, overrides), display, stop)
         except RunStopped as stopped:
             print_note(str(stopped))
@@ -214,8 +225,7 @@ def grid(
     """Train every run of a grid: aggregators x losses x miners, or any other arguments.
 
     Finished runs are skipped and interrupted runs are resumed. A failed run is reported, and the
-    grid continues, unless no other run can start for the same reason. Options of `placewise train`
-    override those of every run.
+    grid continues. Options of `placewise train` override those of every run.
     """
     require_packages(*TRAINING_PACKAGES)
     failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
@@ -278,7 +288,11 @@ def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
     columns = list(dict.fromkeys(column for row in rows for column in row))
     # Leave out columns whose value is the same for all runs.
     if len(rows) > 1:
-        columns = [c for c in columns if len({row.get(c, "") for row in rows}) > 1 or c == "run"]
+        columns = [
+            column
+            for column in columns
+            if column in ("run", "state") or len({row.get(column, "") for row in rows}) > 1
+        ]
     table = Table(*columns)
     for row in rows:
         table.add_row(*(row.get(column, "") for column in columns))

@@ -1,6 +1,6 @@
 """Command-line options of `placewise train`, generated from `TrainingArguments`.
 
-Underscores and hyphens are both accepted; the help shows underscores, as in GSV-Cities scripts. A
+Hyphens and underscores, as in GSV-Cities scripts, are both accepted; the help shows hyphens. A
 boolean option is written alone (`--pretrained`), negated (`--no-pretrained`) or with a value
 (`--pretrained False`), for compatibility with those scripts.
 """
@@ -38,7 +38,7 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
     decorated.__annotations__ = {p.name: p.annotation for p in parameters}
     decorated.command_settings = {
         "cls": _TrainingCommand,
-        "context_settings": {"token_normalize_func": normalise_name},
+        "context_settings": {"token_normalize_func": _option_name},
     }
     return command
 
@@ -54,7 +54,7 @@ def _make_option(name: str) -> inspect.Parameter:
     if field.default not in (None, ()) and name != "cities":
         default = f" (default: {_format_default(field.default)})"
     option = typer.Option(
-        f"--{name}",
+        f"--{_option_name(name)}",
         help=f"{field.description}{default}",
         rich_help_panel=argument_group(name),
         metavar="BOOL" if name in BOOLEANS else "VALUE",
@@ -66,6 +66,10 @@ def _make_option(name: str) -> inspect.Parameter:
         default=None,
         annotation=Annotated[str | None, option],
     )
+
+
+def _option_name(name: str) -> str:
+    return normalise_name(name).replace("_", "-")
 
 
 def _format_default(value: Any) -> str:

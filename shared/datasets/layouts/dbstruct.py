@@ -53,8 +53,8 @@ def _struct(path: Path) -> dict[str, Any]:
     except ImportError as error:
         raise Misconfigured(
             "trainer_missing",
-            f"Reading {path} requires SciPy, which is not installed. Run "
-            "uv pip install '.[trainer]' in the repository.",
+            f"Reading {path} requires SciPy, which is not installed. "
+            "Run `make setup`, or in the repository: uv pip install '.[trainer]'.",
         ) from error
     try:
         struct = loadmat(path, simplify_cells=True).get("dbStruct")

@@ -45,7 +45,6 @@ from shared.descriptors.vpr_models.published_checkpoints import (
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     check_declared_size,
-    first_error_line,
     load_tensors,
 )
 from shared.errors import NotFound, PlacewiseError, Unavailable, Unprocessable
@@ -144,18 +143,19 @@ def _read(path: Path) -> dict[str, Any]:
     except TENSOR_READ_ERRORS as error:
         raise Unprocessable(
             "checkpoint_unreadable",
-            f"The checkpoint {path.name} can't be read; it may contain only tensors and plain "
-            f"values: {_short_reason(error)}",
+            f"The checkpoint {path.name} can't be read: it was not written by torch.save, is "
+            f"truncated, or has other objects than tensors and plain values{_known_reason(error)}.",
         ) from error
     if not isinstance(stored, dict):
         raise _checkpoint_unfit_error(path, f"it holds a {type(stored).__name__}")
     return stored
 
 
-def _short_reason(error: Exception) -> str:
-    """Return torch's error without its advice to load the file with code execution."""
-    refused = re.search(r"Unsupported [^\n]*?(?= was not|[\n]|$)", str(error))
-    return refused[0] if refused else first_error_line(error)
+def _known_reason(error: Exception) -> str:
+    """Return, in parentheses, the object that torch refuses, or what `load_tensors` found."""
+    refused = re.search(r"Unsupported (?:global|class|type)[^\n]*?(?= was not|[\n]|$)", str(error))
+    reason = refused[0] if refused else str(error) if type(error) is ValueError else ""
+    return reason and f" ({reason})"
 
 
 def _load_tensors_into(model: VprModel, tensors: dict[str, Any], path: Path) -> None:

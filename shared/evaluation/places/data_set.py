@@ -85,14 +85,16 @@ def measure_places(
     size = min(SAMPLED_PHOTOS, len(known))
     sample = np.sort(np.random.default_rng(SEED).choice(known, size, replace=False)).tolist()
     captured_at = [photo.captured_at for photo in evaluation_set.database]
+    best = [
+        next((index for index in indices if locations[index].is_known), indices[0])
+        for indices in ranked.indices[:, :EVIDENCE_DEPTH].tolist()
+    ]
     ranker = _RowRanker(database)
     while True:
         own_photos = OwnPhotoSampler(locations, captured_at, scheme, position_radius_m, ranker)
         spread = own_photos.spread(sample)
         samples = list(own_photos.samples(sample, spread))
-        neighbours = {
-            best: own_photos.neighbours(best) for best in np.unique(ranked.indices[:, 0]).tolist()
-        }
+        neighbours = {photo: own_photos.neighbours(photo) for photo in set(best)}
         if not ranker.search_requested():
             break
     model = fit_place_model(samples, (), scheme, spread).model
@@ -105,9 +107,10 @@ def measure_places(
         ranking = [
             RankedPhoto(score, locations[index], index)
             for index, score in zip(indices, scores, strict=True)
+            if locations[index].is_known
         ]
-        unit = model.unit(ranking)
-        levels = candidate_levels(ranking, neighbours[indices[0]], scheme, unit, position_radius_m)
+        unit, around = model.unit(ranking), neighbours[best[number]]
+        levels = candidate_levels(ranking, around, scheme, unit, position_radius_m)
         if not levels or not truth.is_known:
             continue
         right = [level.is_right(truth) for level in levels]

@@ -46,7 +46,7 @@ class OwnPhotoSampler:
     """Draws samples for a place model from photos of a map.
 
     Args:
-        locations: The locations of all photos of the map that have one.
+        locations: The locations of the map's photos; those without a place are left out.
         captured_at: Their capture times.
         scheme: The levels of the map.
         position_radius_m: Radius of a place in metres.
@@ -66,6 +66,7 @@ class OwnPhotoSampler:
         self._radius_m = position_radius_m
         self._rank = rank
         self._rankings: dict[int, IndexRanking | None] = {}
+        self._known = np.array([spot.is_known for spot in locations], dtype=bool)
         self._latitudes = np.array([_or_nan(spot.latitude) for spot in locations])
         self._longitudes = np.array([_or_nan(spot.longitude) for spot in locations])
         self._seconds = np.array(
@@ -114,8 +115,7 @@ class OwnPhotoSampler:
         ranking = self.ranking(photo)
         if ranking is None:
             return []
-        everything = np.ones(len(self._locations), dtype=bool)
-        return self._ranked(ranking, everything if visible is None else visible)
+        return self._ranked(ranking, self._known if visible is None else visible)
 
     def _levels(
         self, photo: int, visible: NDArray[np.bool_], spread: float
@@ -142,7 +142,7 @@ class OwnPhotoSampler:
 
     def _visible(self, photo: int) -> NDArray[np.bool_]:
         """Return the (n,) mask of the photos that a sample may find."""
-        visible = np.ones(len(self._locations), dtype=bool)
+        visible = self._known.copy()
         visible[photo] = False
         apart = np.abs(self._seconds - self._seconds[photo])
         same_session = apart < SAME_SESSION_PERIOD.total_seconds()

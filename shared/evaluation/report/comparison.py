@@ -86,7 +86,7 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         "",
         *(f"R@{k}" for k in ks),
         "R@1, 95 % interval",
-        "ms per photo",
+        "CPU ms per photo",
         "bytes per photo",
         "R@1 minus the first extractor's",
     ]
@@ -96,7 +96,7 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
             "Recall and size", "bytes per photo", compared, [c.bytes_a_photo for c in compared]
         ),
         _cost_chart(
-            "Recall and time", "ms per photo", compared, [c.milliseconds for c in compared]
+            "Recall and time", "CPU ms per photo", compared, [c.milliseconds for c in compared]
         ),
     ]
     figures = "".join(f"<figure>{chart}</figure>" for chart in charts if chart)
@@ -113,8 +113,8 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         f"<code>{evaluation_set.fingerprint}</code>.</p>"
         f"<div class='wide'><table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{rows}</table>"
         f'</div><p class="note">Intervals: bootstrap over {clusters.count} {clusters.kind}; '
-        "differences are paired by query. Time: network and aggregation, measured when the "
-        "descriptors were computed. Size: float32.</p>"
+        "differences are paired by query. Time: CPU time of network and aggregation (on a GPU, "
+        "its time), measured when the descriptors were computed. Size: as a map stores it.</p>"
         f'<div class="charts">{figures}</div></body></html>\n'
     )
 

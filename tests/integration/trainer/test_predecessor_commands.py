@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -62,15 +63,22 @@ def test_the_published_command_trains_with_one_warning_about_faiss(data: list[st
 
 def test_all_obstacles_of_a_machine_are_in_one_message(data: list[str], tmp_path: Path) -> None:
     (tmp_path / "torch/hub/checkpoints/resnet18-f37072fd.pth").unlink()
-    tokens = [*shlex.split(PUBLISHED_COMMAND), *data, "--weights", "nowhere.pth"]
+    tokens = [
+        *shlex.split(PUBLISHED_COMMAND),
+        *data,
+        "--weights",
+        "nowhere.pth",
+        "--accelerator",
+        "mps",
+    ]
     answer = command("train", *tokens, "--val_set_names", "sfxs_vla", code=1)
     for obstacle in ("no_gpu: ", "set_missing: ", "weights_missing: "):
         assert f"- {obstacle}" in answer.stderr
     assert answer.stderr.lstrip().startswith("several_obstacles: ")
 
 
-def test_a_dry_run_of_the_published_grid_finds_obstacles_and_the_grid_stops_at_them(
-    data: list[str], tmp_path: Path
+def test_the_published_grid_without_weights_ends_with_a_leaderboard_of_28_failed_runs(
+    data: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(REPOSITORY / "configs" / "predecessor-grid.yaml")
     small = [file, *data, *HERE, "--image_size", "64", "--out", str(tmp_path / "grid")]
@@ -78,11 +86,19 @@ def test_a_dry_run_of_the_published_grid_finds_obstacles_and_the_grid_stops_at_t
     without_gpu = [*small, "--accelerator", "gpu"]
     found = command("grid", *without_gpu, "--dry-run", code=1)
     assert "every run can't start: no_gpu" in found.stderr
-    stopped = command("grid", *without_gpu, code=1)
-    assert "the other 27 runs can't start either" in stopped.stderr.replace("\n", " ")
-    assert [folder.name for folder in (tmp_path / "grid").iterdir() if folder.is_dir()] == [
-        "01-avg-ms-ms-30ep"
-    ]
+    (tmp_path / "torch/hub/checkpoints/resnet18-f37072fd.pth").unlink()
+    tried: list[str] = []
+
+    def download(url: str, *_: object, **_options: object) -> None:
+        tried.append(url)
+        raise httpx2.ConnectError("no network")
+
+    monkeypatch.setattr("shared.descriptors.vpr_models.backbones.download_file", download)
+    ended = command("grid", *small, code=1)
+    assert len(tried) == 1, "each attempt takes minutes"
+    assert ended.stdout.count("failed: weights_missing") == 28
+    assert ended.stderr.count("no network") == 1
+    assert (tmp_path / "grid/leaderboard.md").read_text().count("failed: weights_missing") == 28
 
 
 def test_a_run_of_the_published_grid_is_trained_and_tested(data: list[str], tmp_path: Path) -> None:

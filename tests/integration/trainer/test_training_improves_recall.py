@@ -4,60 +4,56 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.descriptors.train import measure_gain
-from services.trainer import run
 from services.trainer.arguments import build_arguments
 from services.trainer.checkpointing import seed_everything
 from services.trainer.model_factory import make_model
 from services.trainer.resolve import resolve_device
-from services.trainer.run_control import NullDisplay, StopRequest
+from services.trainer.run_control import NullDisplay
 from shared.datasets.open_dataset import open_evaluation_set
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
-from shared.synthetic_city.plan import CityOptions, make_plan
-from shared.synthetic_city.write import write_city
+from tests.support.training_runs import run_arguments, train, write_tiny_places
 
-SIDE = 64
-EPOCHS = 8
+pytestmark = pytest.mark.numerics
+
+SIDE = 32
+PLACES = 160
+EPOCHS = 5
+LIGHT = 0.7
+"""The colour of the light dominates a random network's descriptors and says nothing of the place:
+R@1 rises from a third to 85 % or more, at least 13 standard errors, whatever kernels compute it."""
+MIN_GAIN = 0.2
+"""BatchNorm's statistics alone, without a step of the optimizer, gain up to 0.1."""
 
 
 def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
     tmp_path: Path,
 ) -> None:
-    city = tmp_path / "city"
-    write_city(make_plan(CityOptions(150, 2, 250, 0, 0, 0.0, 96, 72)), city)
-    arguments = build_arguments(
-        {
-            "data_root": city,
-            "default_root_dir": str(tmp_path),
-            "run_name": "run",
-            "accelerator": "cpu",
-            "faiss_gpu": False,
-            "backbone_arch": "resnet18",
-            "pretrained": False,
-            "layers_to_freeze": -1,
-            "layers_to_crop": (3,),
-            "agg_arch": "GeM",
-            "loss_name": "MultiSimilarityLoss",
-            "augmentation": "none",
-            "image_size": SIDE,
-            "batch_size": 16,
-            "img_per_place": 4,
-            "min_img_per_place": 4,
-            "lr": 1e-3,
-            "warmpup_steps": 20,
-            "milestones": (),
-            "max_epochs": EPOCHS,
-            "check_val_every_n_epoch": EPOCHS,
-            "num_workers": 0,
-            "logger": "none",
-        }
+    places = write_tiny_places(tmp_path / "places", places=PLACES, light=LIGHT)
+    fields = run_arguments(
+        places,
+        tmp_path,
+        layers_to_crop=[3],
+        loss_name="MultiSimilarityLoss",
+        augmentation="none",
+        image_size=SIDE,
+        batch_size=16,
+        img_per_place=4,
+        min_img_per_place=4,
+        lr=3e-3,
+        milestones=(),
+        max_epochs=EPOCHS,
+        check_val_every_n_epoch=EPOCHS,
     )
-    report = run.run(arguments, NullDisplay(), StopRequest())
+    report = train(fields)
+    arguments = build_arguments(fields)
     seed_everything(arguments.seed)
     untrained = make_model(arguments, NullDisplay(), resuming=False)
     trained = load_checkpoint(Path(report["best"]["path"])).model
-    device, evaluation_set = resolve_device(arguments), open_evaluation_set(city)
-    gain = measure_gain(untrained, trained, evaluation_set, SIDE, device, k=5)
-    assert gain.queries == 250
-    # The whole 95 % interval lies above nothing gained.
-    assert gain.low > 0, gain
+    device, evaluation_set = resolve_device(arguments), open_evaluation_set(places)
+    gain = measure_gain(untrained, trained, evaluation_set, SIDE, device)
+    assert gain.queries == PLACES
+    # The whole 95 % interval lies above what no learning could gain.
+    assert gain.low > MIN_GAIN, gain

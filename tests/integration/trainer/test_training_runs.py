@@ -259,7 +259,7 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("others", "code", "expected"),
     [
-        ({"data_root": None}, "data_root_missing", "--data_root DIR"),
+        ({"data_root": None}, "data_root_missing", "--data-root DIR"),
         ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
         ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
         ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),

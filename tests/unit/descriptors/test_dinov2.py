@@ -26,6 +26,8 @@ from tests.support.vit import (
 )
 from tests.unit.descriptors.dinov2_reference import bicubic_weights, plain_forward
 
+pytestmark = pytest.mark.numerics
+
 CPU = torch.device("cpu")
 NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU, "registers": WITH_REGISTERS}
 SIZES = [(224, 224), (126, 70), (322, 476), (518, 518)]

@@ -23,6 +23,8 @@ from shared.descriptors.explanation import (
 from shared.descriptors.vocabulary import ClusterCentres, parse_centres
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig
 
+pytestmark = pytest.mark.numerics
+
 WIDTH, PATCHES, CLUSTERS = 24, 60, 7
 VLAD = EXTRACTOR_CONFIGS["test-tiny-vlad"]
 SOFT = replace(VLAD, aggregator="soft-vlad", temperature=3.0)

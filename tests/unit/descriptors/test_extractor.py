@@ -26,6 +26,8 @@ from shared.descriptors.vocabulary import decode_centres, parse_centres
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
 
+pytestmark = pytest.mark.numerics
+
 CPU = torch.device("cpu")
 DAISY = 985  # of ImageNet's classes
 

@@ -24,6 +24,8 @@ from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_con
 from shared.storage import FolderStore
 from tests.support.checkpoints import none_added
 
+pytestmark = pytest.mark.numerics
+
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 SIDE = 224  # pixels: as large as what passes are counted by
 

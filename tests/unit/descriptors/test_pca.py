@@ -35,6 +35,8 @@ from shared.descriptors.pca_whitening import (
 from shared.errors import Unprocessable
 from shared.storage import FolderStore
 
+pytestmark = pytest.mark.numerics
+
 CPU = torch.device("cpu")
 
 

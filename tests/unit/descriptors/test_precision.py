@@ -21,6 +21,8 @@ from tests.support.hub import COMMIT
 from tests.support.photos import photo_image
 from tests.support.vit import PLAIN, SWIGLU, random_weights, save
 
+pytestmark = pytest.mark.numerics
+
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU}
 LEAST_PATCH_COSINE = 0.999  # in the mean, of bfloat16 to float32

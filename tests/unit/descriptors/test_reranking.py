@@ -16,6 +16,8 @@ from shared.descriptors.reranking import (
     spatial_vote,
 )
 
+pytestmark = pytest.mark.numerics
+
 CPU = torch.device("cpu")
 WIDTH, SIDE = 32, 12
 

@@ -19,6 +19,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from shared.descriptors.aggregation import assign_clusters, soft_vlad, vlad
 from shared.descriptors.vocabulary_file import read_vocabulary
 
+pytestmark = pytest.mark.numerics
+
 Matrix = NDArray[np.float64]
 
 

@@ -11,6 +11,8 @@ import pytest
 from shared.errors import Misconfigured
 from shared.evaluation.exact_knn import exact_knn
 
+pytestmark = pytest.mark.numerics
+
 Rows = np.ndarray[Any, np.dtype[np.float32]]
 
 

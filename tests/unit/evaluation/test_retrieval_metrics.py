@@ -30,6 +30,8 @@ from shared.evaluation.retrieval_metrics import (
     precision_recall,
 )
 
+pytestmark = pytest.mark.numerics
+
 
 def indices(*rows: list[int]) -> list[np.ndarray[Any, np.dtype[np.int64]]]:
     return [np.array(row, np.int64) for row in rows]

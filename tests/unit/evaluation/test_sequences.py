@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import utm
 from PIL import Image
 
@@ -26,6 +27,8 @@ from shared.synthetic_city.plan import CityOptions, make_plan
 from shared.tracks.belief import TrackStatus
 from shared.tracks.motion import MOTION_MODELS
 from tests.unit.data_sets import write_csv, write_photos
+
+pytestmark = pytest.mark.numerics
 
 
 def season_folders(root: Path, count: int) -> Path:

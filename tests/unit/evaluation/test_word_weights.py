@@ -28,6 +28,8 @@ from shared.word_weights.weights import (
     word_products,
 )
 
+pytestmark = pytest.mark.numerics
+
 WORDS, WIDTH = 4, 3
 DEGREES_PER_M = math.degrees(1 / 6_371_008.8)
 Rows = NDArray[np.float32]

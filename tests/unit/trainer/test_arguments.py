@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from services.trainer.arguments import (
     CITIES,
     TrainingArguments,
     build_arguments,
+    find_early_obstacles,
     load_yaml,
     save_yaml,
     to_plain_dict,
 )
-from services.trainer.resolve import list_changed_meanings
+from services.trainer.resolve import list_changed_meanings, resolve_device
 from shared.errors import InvalidRequest, NotFound
 from tests.support.training_runs import PUBLISHED_COMMAND
 
@@ -116,6 +118,9 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("services.trainer.arguments.GPU_DEVICE_FILES", ())
+    # Importing them would take longer than all that is checked here.
+    monkeypatch.setitem(sys.modules, "services.trainer.run", None)
     command = ["train", *shlex.split(PUBLISHED_COMMAND), "--pretrained", "False"]
     answer = CliRunner().invoke(build_app(["train"]), command)
     assert answer.exit_code == 1
@@ -123,6 +128,16 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     assert "no_gpu" in shown
     assert "--accelerator cpu" in shown
     assert "data_root_missing" in shown, "every obstacle is listed at once"
+
+
+def test_the_accelerator_auto_trains_on_the_cpu_where_there_is_no_gpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    arguments = read(["--accelerator", "auto", "--data-root", "."])
+    assert find_early_obstacles(arguments) == []
+    assert resolve_device(arguments).accelerator == "cpu"
 
 
 def test_compatible_arguments_have_the_effect_that_they_had_in_the_predecessor() -> None:
@@ -226,7 +241,7 @@ def test_a_word_after_a_boolean_option_is_its_value() -> None:
 def test_an_option_that_there_is_not_names_the_nearest() -> None:
     answer = CliRunner().invoke(build_app(["train"]), ["train", "--batchsize", "3"])
     assert answer.exit_code == 2
-    assert "--batch_size" in answer.output
+    assert "--batch-size" in answer.output
 
 
 def test_options_override_the_file(tmp_path: Path) -> None:
@@ -271,7 +286,7 @@ def test_the_help_shows_every_argument_in_its_group(
     answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"])
     assert answer.exit_code == 0
     for name in TrainingArguments.model_fields:
-        assert f"--{name} " in answer.output
+        assert f"--{name.replace('_', '-')} " in answer.output
     assert "Loss and miner" in answer.output
 
 

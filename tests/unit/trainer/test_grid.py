@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,7 @@ class Runs:
 
     def __init__(self, out: Path, **endings: Exception | float) -> None:
         self.out, self.endings, self.calls = out, endings, list[str]()
-        self.obstacles: list[PlacewiseError] = []
+        self.display, self.stop = NullDisplay(), StopRequest()
 
     def begin(self, arguments: Any, display: Display, stop: StopRequest) -> dict[str, Any]:
         return self._end("begin", self.out / arguments.run_name, arguments)
@@ -138,12 +139,16 @@ class Runs:
         (folder / "metrics.json").write_text(json.dumps(report))
         return report
 
-    def go(self, plan: GridPlan) -> list[Any]:
+    def request_stop(self, _outcomes: list[Any]) -> None:
+        self.stop.is_requested = True
+
+    def go(
+        self, plan: GridPlan, after_each: Callable[[list[Any]], None] = lambda _outcomes: None
+    ) -> list[Any]:
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(run, "run", self.begin)
             patched.setattr(run, "resume", self.resume)
-            patched.setattr(run, "find_obstacles", lambda arguments: self.obstacles)
-            return run_grid(plan, self.out, NullDisplay(), StopRequest(), lambda outcomes: None)
+            return run_grid(plan, self.out, self.display, self.stop, after_each)
 
 
 def report_of(score: float, arguments: Any) -> dict[str, Any]:
@@ -177,11 +182,25 @@ def test_a_failed_run_is_named_and_the_others_are_made(tmp_path: Path) -> None:
     assert "out of memory" in (tmp_path / "b" / "failed.json").read_text()
 
 
-def test_a_grid_stops_when_no_run_can_start_for_the_same_reason(tmp_path: Path) -> None:
-    runs = Runs(tmp_path, a=Misconfigured("no_gpu", "x"), b=0.5)
-    runs.obstacles = [Misconfigured("no_gpu", "x")]
-    outcomes = runs.go(plain_plan("a", "b"))
-    assert [outcome.state for outcome in outcomes] == [RunState.FAILED, RunState.WAITING]
+def test_a_reason_that_several_runs_fail_for_is_printed_in_full_once(tmp_path: Path) -> None:
+    error = Misconfigured("weights_missing", "a long sentence")
+    runs = Runs(tmp_path, a=error, b=0.5, c=error)
+    outcomes = runs.go(plain_plan("a", "b", "c"))
+    assert [outcome.error and outcome.error["detail"] for outcome in outcomes] == [
+        "a long sentence",
+        None,
+        "a long sentence",
+    ]
+    assert [message for message in runs.display.messages if "failed" in message] == [
+        "a failed: weights_missing: a long sentence",
+        "c failed: weights_missing: as a",
+    ]
+
+
+def test_a_stop_is_obeyed_while_no_run_can_start(tmp_path: Path) -> None:
+    runs = Runs(tmp_path, a=Misconfigured("weights_missing", "x"), b=0.5)
+    with pytest.raises(RunStopped):
+        runs.go(plain_plan("a", "b"), runs.request_stop)
     assert runs.calls == ["begin a"]
 
 

@@ -14,6 +14,8 @@ from pytorch_metric_learning import losses
 from services.trainer.losses import LOSSES, MINERS, AngularLoss, NTXentLoss, make_loss, make_miner
 from shared.errors import Unprocessable
 
+pytestmark = pytest.mark.numerics
+
 Rows = NDArray[np.float64]
 Pairs = list[tuple[int, int]]
 Triplets = list[tuple[int, int, int]]

@@ -27,6 +27,8 @@ from tests.unit.trainer.test_losses import (
     Y,
 )
 
+pytestmark = pytest.mark.numerics
+
 
 def mine(name: str, margin: float = 0.1) -> list[Any]:
     miner = make_miner(name, margin)

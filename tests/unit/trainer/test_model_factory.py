@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 import torch
+from torchvision.models import resnet18
 
 from services.trainer.arguments import build_arguments
 from services.trainer.model_factory import build_model_config, make_model
@@ -27,6 +29,28 @@ NETWORK = {
 def make(**arguments: Any) -> VprModel:
     torch.manual_seed(1)
     return make_model(build_arguments(NETWORK | arguments), NullDisplay(), resuming=False)
+
+
+def test_weights_that_can_not_be_downloaded_are_tried_once_in_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[str] = []
+
+    def download(url: str, *_: object, **_options: object) -> None:
+        tried.append(url)
+        raise httpx2.ConnectError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr("shared.descriptors.vpr_models.backbones.download_file", download)
+    for aggregator in ("ConvAP", "AVG"):
+        with pytest.raises(Misconfigured, match="no network") as caught:
+            make(agg_arch=aggregator, agg_config={})
+        assert caught.value.code == "weights_missing"
+    assert len(tried) == 1
+    make(pretrained=False)
+    given = tmp_path / "given.pth"
+    torch.save(resnet18().state_dict(), given)
+    make(weights=str(given))
 
 
 @pytest.fixture

@@ -11,6 +11,8 @@ from shared.descriptors.aggregation import assign_clusters
 from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 from tests.unit.descriptors.vocabularies.points import unit_points
 
+pytestmark = pytest.mark.numerics
+
 
 def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
     seeding = KMeansPlusPlus(points, seed)

@@ -75,6 +75,15 @@ def test_numbers_that_float32_cannot_hold_are_refused() -> None:
     assert "NaN or infinite" in refusal(array)
 
 
+@pytest.mark.parametrize("factor", [3e38, 1e7])
+def test_centres_whose_residuals_may_overflow_are_refused(factor: float) -> None:
+    array = good_centres()
+    array[2] = factor
+    assert "the norm of centre 2 is" in refusal(array)
+    array[2] = 1e4
+    assert parse_centres(array).clusters == len(array)
+
+
 def test_zero_centre_is_refused_by_its_number() -> None:
     array = good_centres()
     array[2] = 0

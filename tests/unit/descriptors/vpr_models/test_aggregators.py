@@ -16,6 +16,8 @@ from shared.descriptors.vpr_models.aggregators.clustering import SALAD, NetVLAD,
 from shared.descriptors.vpr_models.aggregators.mixing import BoQ, MixVPR
 from shared.descriptors.vpr_models.aggregators.pooling import AveragePooling, ConvAP, CosPlace, GeM
 
+pytestmark = pytest.mark.numerics
+
 Array = NDArray[np.float64]
 Weights = dict[str, Array]
 

@@ -24,6 +24,8 @@ from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from tests.support.vit import PLAIN, random_weights, save
 from tests.unit.descriptors.dinov2_reference import plain_forward
 
+pytestmark = pytest.mark.numerics
+
 CPU = torch.device("cpu")
 
 

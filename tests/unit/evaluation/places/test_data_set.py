@@ -13,6 +13,8 @@ from shared.evaluation.exact_knn import Rows, exact_knn
 from shared.evaluation.places.data_set import measure_places
 from shared.evaluation.places.levels import LevelScheme
 
+pytestmark = pytest.mark.numerics
+
 FLOORS, ROOMS, VIEWS = 4, 6, 5
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 PATHS = LevelScheme(labels_are_paths=True, radii_m=(25.0,))

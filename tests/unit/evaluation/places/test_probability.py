@@ -24,7 +24,9 @@ from shared.evaluation.places.thresholds import (
     Thresholds,
     choose_thresholds,
 )
-from shared.place_paths import is_within_level, label_levels
+from shared.place_paths import is_within_level, label_levels, look_like_paths
+
+pytestmark = pytest.mark.numerics
 
 PATHS = LevelScheme(labels_are_paths=True, radii_m=(25.0, 100.0))
 PLAIN = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0))
@@ -66,6 +68,25 @@ def test_levels_of_a_path_are_its_prefixes_that_end_in_a_name(
     text: str | None, levels: tuple[str, ...]
 ) -> None:
     assert label_levels(text, is_path=True) == levels
+
+
+@pytest.mark.parametrize(
+    ("labels", "are_paths"),
+    [
+        (["tower/7/lift", "tower/7/hall", "tower/8/lift"], True),
+        (["tower/7/lift", "tower/8/lift", "garage"], True),
+        (["tower/7", "station/1", "harbour/2"], False),
+        (["room 1", "room 2", "tower/7/lift", "tower/7/hall"], False),
+        (["24/7", "cafe / bar", "hall"], False),
+        (["/tower", "/station"], False),
+        (["tower/7"], False),
+        ([], False),
+    ],
+)
+def test_labels_look_like_paths_if_most_have_levels_and_two_share_the_first(
+    labels: list[str], are_paths: bool
+) -> None:
+    assert look_like_paths(labels) is are_paths
 
 
 def test_a_label_that_is_no_path_is_its_only_level() -> None:
