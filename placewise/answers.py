@@ -134,6 +134,7 @@ class Estimate(Answer):
     longitude: float | None = None
     radius_m: float | None = None
     place: str | None = None
+    has_place: bool = False
     confidence: float | None = None
     calibration: str = "uncalibrated"
     reason: str
@@ -156,6 +157,7 @@ class Similar(Answer):
     processing_time_ms: float
     total_similar: int
     similar_images: list[SimilarPhoto]
+    matches_without_place: int = 0
     estimate: Estimate
     vocabulary: str
     word_weights: str
@@ -275,6 +277,7 @@ class Job(Answer):
 
     job_id: UUID
     kind: str
+    label: str = ""
     state: str
     stage: str | None
     waiting_for: str | None
@@ -403,6 +406,7 @@ class Search(Answer):
     in_map: bool | None
     answer_level: int | None = None
     not_in_map_probability: float | None = None
+    has_place: bool = False
     processing_time_ms: float
     searched_at: datetime
 
@@ -415,14 +419,20 @@ class Map(Answer):
     version: int
     photos: int
     searchable: int
+    failed_photos: int = 0
     labelled_queries: int
+    located: int = 0
+    measurement: str = "not_measured"
     counted_at: datetime
     generation_id: UUID | None
     vocabulary: str | None
     dimension: int | None
     pca_from: int | None
     place_labels_are_paths: bool = False
+    place_labels_are_automatic: bool = False
     rows: str = "float32"
+    auto_fit: bool = True
+    next_fit_photos: int | None = None
     created_at: datetime
 
 
@@ -441,6 +451,7 @@ class Stats(Answer):
     map_version: int
     total_images: int
     searchable_images: int
+    failed_images: int = 0
     labelled_queries: int
     total_chunks: int
     total_storage_bytes: int
@@ -449,6 +460,7 @@ class Stats(Answer):
     extractor: str
     device: str | None
     vocabulary: str | None
+    next_fit_photos: int | None = None
     total_searches: int
     recent_uploads_24h: int
     recent_searches_24h: int

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 from urllib.parse import quote
 from uuid import UUID
 
@@ -156,7 +156,8 @@ class Client(Transport):
                 `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
                 (comma-separated);
                 `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
-                share of answers that must be right.
+                share of answers that must be right; `history=False` leaves the search out of the
+                search history.
         """
         options: Json = {
             "params": drop_none(
@@ -481,26 +482,43 @@ class Client(Transport):
         name: str,
         extractor: str | None = None,
         *,
-        place_labels_are_paths: bool = False,
+        place_labels_are_paths: bool | None = None,
         rows: str | None = None,
+        auto_fit: bool = True,
     ) -> answers.Map:
-        """Create a map; `extractor` and `rows` (float32 or float16) default to the settings."""
+        """Create a map; `extractor` and `rows` (float32 or float16) default to the settings.
+
+        With `place_labels_are_paths`, `/` separates the levels of place labels, or not; by default,
+        evaluations decide that by the labels.
+        """
         body = drop_none(
             name=name,
             extractor=extractor,
-            place_labels_are_paths=place_labels_are_paths or None,
+            place_labels_are_paths=place_labels_are_paths,
             rows=rows,
+            auto_fit=None if auto_fit else False,
         )
         return answers.Map(**self._call("POST", "/maps", json=body))
 
     def update_map(
-        self, name: str, *, place_labels_are_paths: bool | None = None, rows: str | None = None
+        self,
+        name: str,
+        *,
+        place_labels_are_paths: bool | Literal["auto"] | None = None,
+        rows: str | None = None,
+        auto_fit: bool | None = None,
     ) -> answers.Map:
-        """Change whether `/` separates the levels of place labels, and the rows' type.
+        """Change settings of a map; None leaves one unchanged.
 
-        `rows` (float32 or float16) applies to generations that are created from then on.
+        Args:
+            place_labels_are_paths: Whether `/` separates the levels of place labels. With `auto`,
+                the labels decide, now and at each evaluation.
+            rows: float32 or float16, for generations that are created from then on.
+            auto_fit: Whether vocabularies are fitted automatically.
         """
-        body = drop_none(place_labels_are_paths=place_labels_are_paths, rows=rows)
+        body = drop_none(
+            place_labels_are_paths=place_labels_are_paths, rows=rows, auto_fit=auto_fit
+        )
         return answers.Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 
     def delete_map(self, name: str) -> answers.DeletedMap:

@@ -107,6 +107,8 @@ def response_error(response: httpx2.Response) -> PlacewiseError:
 @contextlib.contextmanager
 def open_file(file: Path) -> Iterator[BinaryIO]:
     """Open a file for reading; InvalidRequest (`unreadable_file`) if that fails."""
+    if file.exists() and not (file.is_file() or file.is_dir()):  # a FIFO would block for ever
+        raise InvalidRequest("unreadable_file", f"Can't read {file}: it is not a regular file")
     try:
         with file.open("rb") as stream:
             yield stream

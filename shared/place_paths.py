@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Collection
+
 PATH_SEPARATOR = "/"
 
 
@@ -23,6 +26,16 @@ def label_levels(label: str | None, is_path: bool) -> tuple[str, ...]:
         for depth in range(len(parts), 0, -1)
         if parts[depth - 1].strip()
     )
+
+
+def look_like_paths(labels: Collection[str]) -> bool:
+    """Return whether distinct labels are paths by their look.
+
+    They are if most of them have two or more levels, and two of these begin with the same name.
+    """
+    paths = [levels for label in labels if len(levels := label_levels(label, is_path=True)) > 1]
+    first_names = Counter(levels[-1] for levels in paths)
+    return 2 * len(paths) > len(labels) and max(first_names.values()) > 1
 
 
 def is_within_level(label: str | None, level: str) -> bool:

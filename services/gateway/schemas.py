@@ -129,7 +129,7 @@ class SimilarPhotoResponse(PhotoResponse):
     match_probability: float | None = Field(
         None,
         description="probability that the photo shows the query's place, at the finest of the "
-        "estimate's `levels`; null without levels",
+        "estimate's `levels`; null without levels, and for photos without a place",
     )
     explanation: ExplanationResponse | None = Field(
         None, description="with `explain=true`: contributions of clusters and patches"
@@ -157,6 +157,11 @@ class EstimateResponse(ResponseModel):
         description="tolerance in metres: the estimate is right if the true position is within it",
     )
     place: str | None = None
+    has_place: bool = Field(
+        False,
+        description="whether there is a place to name: an answer or a guess; false if "
+        "`in_map` is false and the finest level is less probable than 10 %",
+    )
     confidence: float | None = Field(
         None,
         description="probability of being right, calibrated on labelled queries; null while "
@@ -201,6 +206,11 @@ class SimilarityResponse(ResponseModel):
     processing_time_ms: float
     total_similar: int
     similar_images: list[SimilarPhotoResponse]
+    matches_without_place: int = Field(
+        0,
+        description="how many of `similar_images` have neither coordinates nor a label; the "
+        "estimate is that of the photos that have",
+    )
     estimate: EstimateResponse
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
@@ -245,7 +255,14 @@ class SimilarityResponse(ResponseModel):
     def with_photos(self, photos: Iterable[SimilarPhotoResponse]) -> SimilarityResponse:
         """Return a copy of the response with these photos."""
         images = list(photos)
-        return self.model_copy(update={"similar_images": images, "total_similar": len(images)})
+        without_place = sum(image.latitude is None and image.place is None for image in images)
+        return self.model_copy(
+            update={
+                "similar_images": images,
+                "total_similar": len(images),
+                "matches_without_place": without_place,
+            }
+        )
 
 
 class MetadataSearchResponse(ResponseModel):
@@ -264,9 +281,26 @@ class JobProgress(ResponseModel):
     failed: int
 
 
+JOB_LABELS = {
+    JobKind.INDEX: "Photo",
+    JobKind.REINDEX: "Photo for a new model",
+    JobKind.DESCRIBE: "Query photo",
+    JobKind.COMPARE: "Comparison",
+    JobKind.FIT: "Improving the map",
+    JobKind.IMPORT: "Vocabulary import",
+    JobKind.SWITCH: "Switch",
+    JobKind.PCA: "PCA",
+    JobKind.ADD_MODEL: "New model",
+    JobKind.EVALUATE: "Evaluation",
+    JobKind.WORD_WEIGHTS: "Word weights",
+    JobKind.BATCH: "Batch",
+}
+
+
 class JobResponse(ResponseModel):
     job_id: UUID
     kind: JobKind
+    label: str = Field(description="the kind in plain words, such as `Improving the map`")
     state: JobState
     stage: str | None = Field(
         description="model changes: `sample`, `cluster`, `describe`, `load`; batches: `list`, "
@@ -299,6 +333,7 @@ class JobResponse(ResponseModel):
         return cls(
             job_id=job.id,
             kind=JobKind(job.kind),
+            label=JOB_LABELS[JobKind(job.kind)],
             state=JobState(job.state),
             stage=job.stage,
             waiting_for=job.waiting_for,

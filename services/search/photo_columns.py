@@ -82,6 +82,12 @@ class PhotoColumns:
             (place, row) for row, place in enumerate(self.place) if place is not None
         )
 
+    @cached_property
+    def has_place(self) -> NDArray[np.bool_]:
+        """Which rows have coordinates or a place label."""
+        labelled = np.fromiter((place is not None for place in self.place), bool, len(self.place))
+        return labelled | ~np.isnan(self.latitude)
+
     def with_changes(self, changes: Mapping[UUID, PhotoFilterValues]) -> PhotoColumns:
         """Return the columns with changes applied; itself if none of the photos is in the chunk."""
         rows = _find_rows(self, changes)
@@ -135,6 +141,10 @@ class JoinedColumns:
     @cached_property
     def id_low_bits(self) -> NDArray[np.uint64]:
         return self._joined([part.id_low_bits for part in self.parts], np.uint64)
+
+    @cached_property
+    def has_place(self) -> NDArray[np.bool_]:
+        return self._joined([part.has_place for part in self.parts], np.bool_)
 
     @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
@@ -227,6 +237,8 @@ def build_row_mask(
     mask = photos.findable.copy()
     if photo_filter.ids is not None:
         mask &= _mask_of_rows(_find_rows(photos, photo_filter.ids), len(mask))
+    if photo_filter.has_place:
+        mask &= photos.has_place
     if photo_filter.place is not None:
         mask &= _mask_of_rows(photos.rows_by_place.get(photo_filter.place, NO_ROWS), len(mask))
     if photo_filter.place_under is not None:

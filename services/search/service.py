@@ -25,13 +25,12 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.request_log import RequestLogMiddleware
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from services.service_process import Announce, service_process, start_service_thread
+from services.service_process import Announce, service_process, start_service_threads
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import delete_search_worker, upsert_search_worker
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
 from shared.http.problem_details import PROBLEM_RESPONSES, install_exception_handlers
 from shared.ids import new_id
 from shared.search_api.protocol import ReplicationLag, SearchRequest, SearchResponse, SearchStatus
@@ -181,9 +180,9 @@ def serve_search(settings: Settings, announce: Announce) -> None:
     """Serve searches in the shard SEARCH_SHARD on HOST and PORT until SIGTERM.
 
     Raises:
-        Misconfigured: `address_in_use`; `thread_crashed` if a thread has crashed.
+        Misconfigured: `address_in_use`; also as `service_process` raises it.
     """
-    stop, failed = threading.Event(), threading.Event()
+    stop = threading.Event()
     with service_process(settings, "search") as catalog:
         store = open_installation_store(catalog, settings, exclusive=False)
         with listen(settings.host, settings.port) as listener:
@@ -195,19 +194,14 @@ def serve_search(settings: Settings, announce: Announce) -> None:
             # Its clients are a few gateways, with one connection for each concurrent query.
             limits = replace(ConnectionLimits.of(settings), per_address=0)
             server = http_server(create_search_app(worker, registry), Connections(limits))
-
-            def on_crash() -> None:
-                failed.set()
-                server.should_exit = True
-
-            threads = [
-                start_service_thread(name, run, stop, on_crash)
-                for name, run in (
-                    ("search sync", worker.run),
-                    ("search sync of building generations", worker.run_building),
-                    ("search heartbeat", heartbeat.run),
-                )
-            ]
+            threads = start_service_threads(
+                {
+                    "search sync": worker.run,
+                    "search sync of building generations": worker.run_building,
+                    "search heartbeat": heartbeat.run,
+                },
+                stop,
+            )
             try:
                 with serve_metrics(settings, registry), stop_on_signals(server):
                     announce(
@@ -219,8 +213,3 @@ def serve_search(settings: Settings, announce: Announce) -> None:
                 stop.set()
                 for thread in threads:
                     thread.join()
-    if failed.is_set():
-        raise Misconfigured(
-            "thread_crashed",
-            "A thread of the search service crashed. See the log above.",
-        )

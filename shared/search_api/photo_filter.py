@@ -75,6 +75,8 @@ class PhotoFilter(_FilterModel):
     """Each must be a part of one of the photo's tags; ASCII letters match in either case."""
     ids: tuple[UUID, ...] | None = None
     """The photo must be one of these; an empty tuple matches no photo."""
+    has_place: bool = False
+    """Whether the photo must have coordinates or a place label."""
 
     @property
     def is_empty(self) -> bool:

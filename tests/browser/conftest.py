@@ -51,9 +51,7 @@ def browser(chromium: str) -> Iterator[Browser]:
 def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
     """A server with the default extractor and a described, measured town in the map `riverside`."""
     folder = tmp_path_factory.mktemp("town")
-    with ServerProcess(
-        folder / "home", extractor="efficientnet-lite0-vlad", auto_fit_photos=1_000_000
-    ) as server:
+    with ServerProcess(folder / "home", extractor="efficientnet-lite0-vlad") as server:
         queries = build_town(server, folder / "city", MAP)
         yield Town(server, queries)
 

@@ -56,6 +56,12 @@ def test_each_photo_is_watched_until_it_can_be_found(page: Page, town: Town) -> 
     expect(page.get_by_text("the map had it already")).to_be_visible()
 
 
+def test_hidden_files_are_skipped(page: Page, town: Town) -> None:
+    add(page, {**photo(1), "name": "._1.jpg"}, photo(1))
+    expect(page.locator(".queue-row.done .queue-name")).to_have_text(["1.jpg"])
+    expect(page.locator(".queue-row")).to_have_count(1)
+
+
 def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
     page: Page, town: Town
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,15 @@ def percent(probability: float) -> str:
     return f"{100 * probability:.1f} %"
 
 
+BANDS = [
+    "Within 25 m",
+    "25 m to 100 m away",
+    "100 m to 500 m away",
+    "500 m to 2 km away",
+    "Farther away, or not in this map",
+]
+
+
 @pytest.mark.parametrize("number", range(4))
 def test_each_level_and_each_match_has_its_probability(
     visitor: Visitor, town: Town, number: int
@@ -42,15 +52,19 @@ def test_each_level_and_each_match_has_its_probability(
     page = ask(visitor, photo)
     estimate, matches = found["estimate"], by_probability(found)
     probabilities = [level["probability"] for level in estimate["levels"]]
-    rows = page.locator(".levels li")
-    expect(rows.locator(".level")).to_have_text(
-        ["Within 25 m", "Within 100 m", "Within 500 m", "Within 2 km", "Not in this map"]
-    )
-    shown = [*probabilities, estimate["not_in_map_probability"]]
-    expect(rows.locator(".figure")).to_have_text([percent(each) for each in shown])
-    values = rows.locator("meter").evaluate_all("meters => meters.map(meter => meter.value)")
-    assert values == pytest.approx(shown)
-    expect(page.get_by_role("meter", name="Probability: Within 25 m")).to_be_visible()
+    if page.locator(".verdict.unknown").count():
+        expect(page.locator(".levels, .rings")).to_have_count(0)
+    else:
+        rows = page.locator(".levels li")
+        expect(rows.locator(".level")).to_have_text(BANDS)
+        bounds = [round(100 * probability) for probability in [0, *probabilities, 1]]
+        shares = [after - before for before, after in itertools.pairwise(bounds)]
+        expect(rows.locator(".figure")).to_have_text([f"{share} %" for share in shares])
+        values = rows.locator("meter").evaluate_all("meters => meters.map(meter => meter.value)")
+        assert values == shares
+        assert sum(values) == 100
+        name = "Probability: Within 25 m"
+        expect(page.get_by_role("meter", name=name)).to_be_visible()
     expect(page.locator(".match")).to_have_count(len(matches))
     expect(page.locator(".match .figure")).to_have_text(
         [percent(match["match_probability"]) for match in matches]
@@ -64,6 +78,7 @@ def test_each_level_and_each_match_has_its_probability(
     expect(page.locator(".number-pin")).to_have_count(len(matches))
     for share in (68, 95):
         ring = estimate[f"radius_{share}_m"]
+        ring = None if page.locator(".verdict.unknown").count() else ring
         expect(page.locator(f"path.ring-{share}")).to_have_count(0 if ring is None else 1)
         expect(page.locator(f".rings .ring-{share}")).to_have_count(0 if ring is None else 1)
 
@@ -81,64 +96,97 @@ PATHS = [
 SURE_PATHS = [PATHS[0] | {"probability": 0.96}, PATHS[1]]
 
 
-FINEST = "At a certainty of 95 %, the finest answer is"
-NONE_CERTAIN = "No level is certain enough at a certainty of 95 %; the most probable is"
-STRONGER = "stronger evidence that the place is in the map"
-FINER = f"Finer levels require {STRONGER}."
+UNCLEAR = "it is not clear whether the place is in this map"
+ELSEWHERE = (
+    "The matches point to one place no more clearly than those of a photo from elsewhere do."
+)
+FINER = "A finer answer needs clearer signs that the place is in this map."
 
 
 @pytest.mark.parametrize(
-    ("levels", "answer", "outside", "title", "place", "reason"),
+    ("levels", "answer", "outside", "has_place", "title", "place", "reason"),
     [
         (
             CIRCLES,
             1,
             0.02,
+            True,
             "In this map",
             "45.07000, 7.68000 ± 42 m (68 %)",
-            f"{FINEST} a radius of 100 m, with a probability of 97.0 %.",
+            "97 % sure it is within 100 m.",
         ),
         (
             PATHS,
             1,
             0.02,
+            True,
             "In this map",
             "tower/floor 7",
-            f"{FINEST} “tower/floor 7”, with a probability of 97.0 %.",
+            "97 % sure it is in “tower/floor 7”.",
+        ),
+        (
+            [PATHS[0], PATHS[1] | {"probability": 0.9}],
+            None,
+            0.2,
+            True,
+            "Best guess",
+            "tower/floor 7/elevator",
+            "90 % sure it is in “tower/floor 7”: an answer needs 95 %.",
         ),
         (
             PATHS,
             None,
             0.2,
+            True,
             "Best guess",
             "tower/floor 7/elevator",
-            f"{NONE_CERTAIN} “tower/floor 7”, with 97.0 %, but it requires {STRONGER}.",
+            f"97 % sure it is in “tower/floor 7”, but {UNCLEAR}.",
         ),
         (
             SURE_PATHS,
             1,
             0.02,
+            True,
             "In this map",
             "tower/floor 7",
-            f"{FINEST} “tower/floor 7”, with a probability of 97.0 %. {FINER}",
+            f"97 % sure it is in “tower/floor 7”. {FINER}",
         ),
         (
             CIRCLES,
             None,
             0.62,
+            False,
             "Not in this map",
             None,
-            "The map probably has no photo of this place (62.0 %).",
+            "62 % sure that this map has no photo of the place.",
+        ),
+        (
+            CIRCLES,
+            None,
+            0.2,
+            False,
+            "Probably not in this map",
+            None,
+            ELSEWHERE,
         ),
     ],
-    ids=["circle", "path", "no certain level", "probable finer level", "not in the map"],
+    ids=[
+        "circle",
+        "path",
+        "no certain level",
+        "no clear level",
+        "probable finer level",
+        "not in the map",
+        "too little support",
+    ],
 )
-def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
+def test_the_card_answers_at_the_finest_certain_level_and_says_how_sure_it_is(
     visitor: Visitor,
     town: Town,
     levels: list[dict[str, Any]],
     answer: int | None,
     outside: float,
+    has_place: bool,
     title: str,
     place: str | None,
     reason: str,
@@ -146,9 +194,11 @@ def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
     found = town.ask(town.queries[0])
     found["estimate"] |= {
         "in_map": False,
+        "has_place": has_place,
         "latitude": None,
         "levels": levels,
         "answer_level": answer,
+        "certainty": 0.95,
         "not_in_map_probability": outside,
         "radius_68_m": 42.4 if levels is CIRCLES else None,
         "radius_95_m": None,
@@ -158,13 +208,83 @@ def test_the_card_answers_at_the_finest_certain_level_and_gives_the_reason(
     expect(page.locator(".badge")).to_have_text(title)
     expect(page.locator(".verdict .place")).to_have_text([place] if place else [])
     expect(page.locator(".reason")).to_have_text(reason)
-    names = [level["place"] or f"Within {level['radius_m']} m" for level in levels]
-    chosen = [] if answer is None else [names[answer]]
-    expect(page.locator(".levels .chosen .level")).to_have_text(chosen)
-    rings = ["68 %: within 42 m"] if levels is CIRCLES else []
+    shown = [] if place is None else [f"{round(100 * levels[0]['probability'])} %"]
+    expect(page.locator(".levels .figure").first).to_have_count(len(shown))
+    expect(page.locator(".levels .chosen")).to_have_count(0 if answer is None else answer + 1)
+    rings = ["68 %: within 42 m"] if levels is CIRCLES and place else []
     expect(page.locator(".rings li")).to_have_text(rings)
     expect(page.locator("path.ring-68")).to_have_count(len(rings))
     expect(page.locator("path.ring-95, path.estimate")).to_have_count(0)
+
+
+NO_LEVELS: dict[str, Any] = {
+    "in_map": None,
+    "levels": [],
+    "answer_level": None,
+    "not_in_map_probability": None,
+    "radius_68_m": None,
+    "radius_95_m": None,
+    "calibration_source": None,
+}
+
+
+def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_again(
+    visitor: Visitor, town: Town
+) -> None:
+    found = town.ask(town.queries[0])
+    guess = found["estimate"] | NO_LEVELS | {**CENTER, "radius_m": 25.0, "has_place": True}
+    measured = found["estimate"] | {"levels": CIRCLES, "answer_level": 1, "certainty": 0.95}
+    described = town.get("/maps/riverside")
+    states = ["too_few_photos", "not_measured", "running", "measured"]
+    reached = 0
+
+    def answer(route: Route) -> None:
+        estimate = measured if states[reached] == "measured" else guess
+        route.fulfill(json=found | {"estimate": estimate})
+
+    def measure(route: Route) -> None:
+        nonlocal reached
+        reached = 2
+        route.fulfill(status=202, json={})
+
+    page = visitor.page
+    page.route("**/api/v1/similarity?*", answer)
+    page.route("**/api/v1/evaluations?*", measure)
+    page.route(
+        "**/api/v1/maps/riverside*",
+        lambda route: route.fulfill(
+            json=described | {"measurement": states[reached], "located": 7}
+        ),
+    )
+    ask(visitor, town.queries[0])
+    expect(page.locator(".badge")).to_have_text("Best guess")
+    expect(page.locator(".verdict .place")).to_have_text("45.07000, 7.68000")
+    expect(page.locator(".verdict .radius, .levels, path.ring-68")).to_have_count(0)
+    expect(page.locator(".reason")).to_contain_text("that takes 20 photos with coordinates")
+    expect(page.locator(".reason")).to_contain_text("this map has 7")
+    reached = 1
+    page.get_by_role("button", name="Measure now").click()
+    expect(page.locator(".reason")).to_have_text("The certainty of answers is being measured now.")
+    assert "POST" not in page.locator(".verdict").inner_text()
+    reached = 3
+    expect(page.locator(".reason")).to_contain_text("97 % sure it is within 100 m.")
+
+
+def test_photos_without_a_place_keep_their_rank_and_are_counted(
+    visitor: Visitor, town: Town
+) -> None:
+    found = town.ask(town.queries[0])
+    first, *others = found["similar_images"]
+    first |= {"latitude": None, "longitude": None, "place": None, "match_probability": None}
+    first["original_filename"] = "without.jpg"
+    found |= {"matches_without_place": 1}
+    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
+    page = ask(visitor, town.queries[0])
+    expect(page.locator(".verdict")).to_contain_text(
+        "1 of these 12 photos has neither coordinates nor a label."
+    )
+    expect(page.locator(".match").first).to_contain_text("no coordinates or label")
+    expect(page.locator(".match .strength")).to_have_count(len(others))
 
 
 def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
@@ -181,32 +301,24 @@ def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
 
 def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> None:
     found = town.ask(town.queries[0])
-    nowhere: dict[str, Any] = {
-        "in_map": None,
-        "levels": [],
-        "answer_level": None,
-        "not_in_map_probability": None,
-        "latitude": None,
-        "longitude": None,
+    found["estimate"] |= {
+        **NO_LEVELS,
+        **UNPLACED,
         "place": None,
+        "has_place": False,
+        "reason": "None has a place.",
     }
-    found["estimate"] |= {**nowhere, "reason": "The most similar photo has no place."}
-    found["estimate"] |= {"radius_m": None, "radius_68_m": None, "radius_95_m": None}
     for photo in found["similar_images"]:
         photo |= {"latitude": None, "place": None, "match_probability": None}
+    found["matches_without_place"] = len(found["similar_images"])
     visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
     page = ask(visitor, town.queries[0])
     expect(page.locator(".badge")).to_have_text("No estimate")
-    expect(page.locator(".reason")).to_have_text("The most similar photo has no place.")
+    expect(page.locator(".reason")).to_have_text("None has a place.")
     page.locator(".figures summary").click()
     expect(page.locator(".figures p")).to_contain_text("in the order of their similarity")
     expect(page.locator(".figures thead")).to_contain_text("Similarity")
     expect(page.locator(".figures thead")).not_to_contain_text("Same place")
-
-    page.unroute("**/api/v1/similarity?*")
-    with page.expect_request("**/api/v1/similarity?*box=*"):
-        page.get_by_role("button", name="Search only photos with coordinates").click()
-    expect(page.locator(".badge")).not_to_have_text("No estimate")
 
 
 def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, town: Town) -> None:

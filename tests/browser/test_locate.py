@@ -57,7 +57,7 @@ def test_a_folder_is_located_accepted_by_probability_and_downloaded(
     soon = page.locator("tr", has_text="soon.jpg")
     expect(soon).to_contain_text("accepted")
     expect(soon).to_contain_text("taken 5 s after known.jpg")
-    expect(page.locator("tr", has_text="broken.jpg")).to_contain_text("damaged")
+    expect(page.locator("tr", has_text="broken.jpg")).to_contain_text("cut off")
     expect(page.locator("tr", has_text="empty.jpg")).to_contain_text("The file is empty.")
     expect(page.locator(".chip.failed")).to_have_count(2)
     expect(page.locator("path.point.behind")).to_have_count(1)

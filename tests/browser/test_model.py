@@ -17,7 +17,7 @@ def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
     page.get_by_role("button", name="Fit a vocabulary…").click()
     page.get_by_label("Photos to fit on, at most").fill("60")
     page.get_by_role("button", name="Fit it", exact=True).click()
-    expect(page.get_by_role("progressbar", name="Fitting a vocabulary")).to_be_visible()
+    expect(page.get_by_role("progressbar", name="Improving the map")).to_be_visible()
     expect(page.locator(".standing .chip")).to_have_text("Its own")
     assert town.get(f"/maps/{MAP}")["vocabulary"] == "own"
 
@@ -33,6 +33,36 @@ def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
     with page.expect_download() as download:
         page.get_by_role("button", name="Download").first.click()
     assert download.value.suggested_filename == f"{vocabularies[0]['vocabulary_id']}.npz"
+
+
+def test_every_view_says_that_the_map_is_being_improved(visitor: Visitor, town: Town) -> None:
+    finished = town.get("/jobs", kind="evaluate", limit=1)["jobs"][0]
+    fit = {**finished, "kind": "fit", "label": "Improving the map", "state": "running"}
+    fit |= {"stage": "describe", "progress": {"done": 40, "total": 100, "failed": 0}}
+    visitor.page.route(
+        re.compile(r"/api/v1/jobs\?.*kind=fit&state="),
+        lambda route: route.fulfill(json={"jobs": [fit], "next_cursor": None}),
+    )
+    line = visitor.visit("photos").locator("#improving")
+    expect(line).to_have_text("Improving the map: describing, 40.0 %")
+    line.click()
+    expect(visitor.page.get_by_role("heading", name="Model in use")).to_be_visible()
+
+
+def test_automatic_fits_are_switched_on_and_off(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("model")
+    switch = page.get_by_role("checkbox", name="Improve this map automatically")
+    expect(switch).not_to_be_checked()
+    page.locator("#map-choice").select_option("default")
+    expect(switch).to_be_checked()
+    next_fit = page.get_by_text("next time at 50 photos")
+    expect(next_fit).to_be_visible()
+    switch.uncheck()
+    expect(next_fit).to_have_count(0)
+    assert town.get("/maps/default")["auto_fit"] is False
+    switch.check()
+    expect(next_fit).to_be_visible()
+    assert town.get("/maps/default")["auto_fit"] is True
 
 
 def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
@@ -71,12 +101,26 @@ def test_a_comparison_stays_on_a_narrow_phone(visitor: Visitor) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
+def test_labels_are_told_to_be_names_and_automatic_again(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("model")
+    labels = page.get_by_label("Labels")
+    expect(labels).to_have_value("auto")
+    for value, automatic in (("false", False), ("auto", True)):
+        labels.select_option(value)
+        expect(page.locator(".note").first).to_contain_text("Saved.")
+        page.locator(".note button").first.click()
+        described = town.get(f"/maps/{MAP}")
+        assert described["place_labels_are_automatic"] is automatic
+        assert described["place_labels_are_paths"] is False
+
+
 def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("status")
     expect(page.locator(".parts li")).to_have_count(5)
     expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
     photos = town.get("/database/stats")["total_images"]
     expect(page.locator(".tile").first).to_contain_text(str(photos))
+    expect(page.get_by_text("The certainty of answers is measured.")).to_be_visible()
     expect(page.get_by_role("heading", name="Newest jobs")).to_be_visible()
     expect(page.locator("time").first).to_contain_text(re.compile("just now|ago"))
 
@@ -87,14 +131,16 @@ def test_a_question_in_the_history_has_the_title_of_its_answer(
     town.ask(town.queries[0])
     entry = town.get("/searches?limit=1")["searches"][0]
     titles = {
-        (True, None, None): "In this map",
-        (False, None, None): "Not in this map",
-        (None, None, None): "No estimate",
-        (False, 1, 0.02): "In this map",
-        (True, None, 0.7): "Not in this map",
-        (True, None, 0.3): "Best guess",
+        (True, None, None, True): "In this map",
+        (False, None, None, False): "Probably not in this map",
+        (None, None, None, True): "Best guess",
+        (None, None, None, False): "No estimate",
+        (False, 1, 0.02, False): "In this map",
+        (True, None, 0.7, True): "Not in this map",
+        (True, None, 0.3, True): "Best guess",
+        (False, None, 0.3, False): "Probably not in this map",
     }
-    fields = ("in_map", "answer_level", "not_in_map_probability")
+    fields = ("in_map", "answer_level", "not_in_map_probability", "has_place")
     searches = [entry | dict(zip(fields, values, strict=True)) for values in titles]
     visitor.page.route(
         "**/api/v1/searches?*",

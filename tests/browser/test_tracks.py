@@ -10,14 +10,15 @@ from tests.browser.conftest import Town, Visitor
 def test_a_track_is_listed_drawn_and_deleted(visitor: Visitor, town: Town) -> None:
     track_id = town.ride()
     page = visitor.visit("tracks")
-    page.locator(f"a[href='#/tracks/{track_id}']").click()
+    with page.expect_response(lambda response: "smoothed=true" in response.url):
+        page.locator(f"a[href='#/tracks/{track_id}']").click()
     expect(page.get_by_text("3 frames, ")).to_be_visible()
     expect(page.locator("tbody tr")).to_have_count(3)
     expect(page.locator("path.point:not(.behind)")).to_have_count(3)
     expect(page.locator("path.point.behind").first).to_be_attached()
     expect(page.locator("path.uncertainty").first).to_be_attached()
-    with page.expect_response(lambda response: "smoothed=true" in response.url):
-        page.get_by_label("Use later frames, too").check()
+    with page.expect_response(lambda response: "smoothed=false" in response.url):
+        page.get_by_label("Use later frames, too").uncheck()
     expect(page.locator("path.point:not(.behind)")).to_have_count(3)
     page.get_by_role("button", name="Delete…").click()
     page.get_by_role("button", name="Delete", exact=True).click()

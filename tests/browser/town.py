@@ -32,7 +32,7 @@ def build_town(server: ServerProcess, folder: Path, map_name: str) -> list[Path]
         train=False,
     )
     write_city(make_plan(options), folder)
-    made = server.client.post("/api/v1/maps", json={"name": map_name})
+    made = server.client.post("/api/v1/maps", json={"name": map_name, "auto_fit": False})
     assert made.status_code == 201, made.text
     queries = sorted((folder / "queries").glob("*.jpg"))
     searched, labelled = queries[::2], queries[1::2]

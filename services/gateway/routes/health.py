@@ -16,7 +16,12 @@ from services.gateway.dependencies import ALL_MAPS, NO_PARAMETERS, GatewayContex
 from services.gateway.schemas import ResponseModel
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import is_job_overdue
-from shared.catalog.maps import Map, list_extractors_in_use, list_maps_without_vocabulary
+from shared.catalog.maps import (
+    Map,
+    count_failed_photos,
+    list_extractors_in_use,
+    list_maps_without_vocabulary,
+)
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
@@ -71,6 +76,10 @@ class ExtractorsStatus(ComponentStatus):
     processes: list[ExtractorProcess] = Field(description="extractors with a recent heartbeat")
     waiting_for_vocabulary: list[str] = Field(
         description="maps whose photos wait until a vocabulary is fitted or imported"
+    )
+    failed_photos: dict[str, int] = Field(
+        description="map -> number of stored photos that can't be searched for, because their "
+        "description failed; GET /search?failed=true lists them"
     )
 
 
@@ -251,6 +260,7 @@ def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
         used = list_extractors_in_use(session)
         overdue = is_job_overdue(session, PROCESS_TIMEOUT_SECONDS)
         waiting = list_maps_without_vocabulary(session)
+        failed = count_failed_photos(session)
     live = [
         ExtractorProcess(
             name=process.name,
@@ -273,9 +283,14 @@ def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
     # Extractors that are scaled to zero while no job is queued unregister when they stop.
     if not live and (extractors or overdue):
         problems.append("no extractor is running: photos are stored, but not described")
+    status = "degraded" if problems else "healthy"
+    if failed:  # not degraded: a file that can't be decoded stays until somebody deletes it
+        named = ", ".join(f"{number} in the map {name}" for name, number in failed.items())
+        problems.append(f"stored photos that can't be searched for: {named}")
     return ExtractorsStatus(
-        status="degraded" if problems else "healthy",
-        detail="; ".join(problems) or f"{len(live)} running",
+        status=status,
+        detail="; ".join([f"{len(live)} running"] * (status == "healthy") + problems),
         processes=live,
         waiting_for_vocabulary=waiting,
+        failed_photos=failed,
     )

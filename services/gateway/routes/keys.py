@@ -13,6 +13,7 @@ from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
 from services.gateway.schemas import RequestModel, ResponseModel
 from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
+from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.security.api_keys import Scope
 
 router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
@@ -20,7 +21,7 @@ router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
 DAY_SECONDS = 86_400
 MAX_KEY_DAYS = 36_500
 
-MapName = Annotated[str, Field(min_length=1, max_length=100, pattern=NO_NUL_PATTERN)]
+MapName = Annotated[str, Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})]
 KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 

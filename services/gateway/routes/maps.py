@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Literal
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Path, Request
@@ -15,12 +15,14 @@ from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import RequestModel, ResponseModel
-from shared.catalog.generations import RowType, active_generation
+from shared.catalog.generations import Generation, RowType, active_generation
+from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
 from shared.catalog.maps import (
     DEFAULT_MAP,
     MAP_NAME_PATTERN,
     Map,
     create_map,
+    decide_label_paths,
     get_map,
     get_map_statistics,
     get_or_create_default_map,
@@ -29,13 +31,19 @@ from shared.catalog.maps import (
     mark_map_deleted,
 )
 from shared.catalog.models import check_model_registered
-from shared.catalog.vocabularies import vocabulary_standing
+from shared.catalog.vocabularies import next_fit_photos, vocabulary_standing
+from shared.config.settings import Settings
 from shared.errors import Misconfigured, invalid_field_error
-from shared.jobs import Job
+from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.fit import MIN_OWN_PHOTOS
+from shared.evaluation.places.levels import LevelScheme
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import cancel_jobs
 
 router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
 
+Measurement = Literal["measured", "running", "due", "not_measured", "too_few_photos"]
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
@@ -48,6 +56,12 @@ async def _check_map(request: Request, name: MapNamePath) -> None:
 CHECK_MAP = Depends(_check_map)
 
 
+AUTO_FIT = (
+    f"whether a vocabulary is fitted automatically: at {MIN_PHOTOS_TO_FIT} photos, and whenever "
+    "the map has doubled since the last fit. Importing or choosing a vocabulary sets it to false"
+)
+
+
 class CreateMapRequest(RequestModel):
     name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
     extractor: str | None = Field(
@@ -56,16 +70,17 @@ class CreateMapRequest(RequestModel):
         pattern=NO_NUL_PATTERN,
         description="omitted: the default of the server",
     )
-    place_labels_are_paths: bool = Field(
-        False,
+    place_labels_are_paths: bool | None = Field(
+        None,
         description="whether `/` separates the levels of place labels, as in "
-        "`tower/floor 7/elevator`",
+        "`tower/floor 7/elevator`; omitted: evaluations decide that by the labels",
     )
     rows: RowType | None = Field(
         None,
         description="type of the stored descriptors: float16, or float32 in twice the space; "
         "omitted: the default of the server",
     )
+    auto_fit: bool = Field(True, description=AUTO_FIT)
 
     @field_validator("name")
     @classmethod
@@ -79,12 +94,16 @@ class CreateMapRequest(RequestModel):
 
 
 class UpdateMapRequest(RequestModel):
-    place_labels_are_paths: bool | None = Field(None, description="omitted: unchanged")
+    place_labels_are_paths: bool | Literal["auto"] | None = Field(
+        None,
+        description="`auto`: by the labels, now and at each evaluation; omitted: unchanged",
+    )
     rows: RowType | None = Field(
         None,
         description="type of the stored descriptors of generations that are created from now on; "
         "omitted: unchanged",
     )
+    auto_fit: bool | None = Field(None, description=f"{AUTO_FIT}; omitted: unchanged")
 
 
 class MapResponse(ResponseModel):
@@ -93,8 +112,19 @@ class MapResponse(ResponseModel):
     version: int = Field(description="incremented by every change of the searchable photos")
     photos: int
     searchable: int
+    failed_photos: int = Field(
+        description="stored photos that can't be searched for, because their description failed: "
+        "GET /search?failed=true lists them, and the next model change describes them again"
+    )
     labelled_queries: int
-    counted_at: datetime = Field(description="when the three counts above were computed")
+    located: int = Field(description="searchable photos with coordinates or a label")
+    measurement: Measurement = Field(
+        description="whether it is known how certain the map's estimates are: `measured` by an "
+        "evaluation; `running`: it is being evaluated; `due`: an evaluation will start by itself; "
+        "`not_measured`: start one (POST /evaluations); `too_few_photos`: it takes 20 with "
+        "coordinates or a label"
+    )
+    counted_at: datetime = Field(description="when the four counts above were computed")
     generation_id: UUID | None
     vocabulary: str | None = Field(
         description="`own`, `provisional`, `foreign`, `pending` or `none`; null before the first "
@@ -107,9 +137,17 @@ class MapResponse(ResponseModel):
     place_labels_are_paths: bool = Field(
         description="whether `/` separates the levels of place labels"
     )
+    place_labels_are_automatic: bool = Field(
+        description="whether evaluations decide that by the labels"
+    )
     rows: RowType = Field(
         description="type of the stored descriptors, `float32` or `float16`, of new generations; "
         "GET /generations has the one of each generation"
+    )
+    auto_fit: bool = Field(description=AUTO_FIT)
+    next_fit_photos: int | None = Field(
+        description="number of photos from which the next vocabulary is fitted automatically; null "
+        "if none is"
     )
     created_at: datetime
 
@@ -126,7 +164,7 @@ def read_maps(request: Request, gateway: GatewayDep) -> list[MapResponse]:
     allowed = get_caller(request).maps
     with gateway.catalog.read() as session:
         return [
-            _map_response(session, map_)
+            _map_response(session, gateway.settings, map_)
             for map_ in list_maps(session)
             if allowed is None or map_.name in allowed
         ]
@@ -150,8 +188,9 @@ def create_new_map(
             config.name,
             place_labels_are_paths=body.place_labels_are_paths,
             row_type=body.rows or RowType(settings.descriptor_rows),
+            auto_fit=body.auto_fit,
         )
-        response = _map_response(session, map_)
+        response = _map_response(session, settings, map_)
         idempotent.store_response(session, 201, response)
     return response
 
@@ -160,26 +199,32 @@ def create_new_map(
 def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     """Get one map."""
     with gateway.catalog.read() as session:
-        return _map_response(session, get_map(session, name))
+        return _map_response(session, gateway.settings, get_map(session, name))
 
 
 @router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
-    """Change whether the map's place labels are paths, and the type of its stored descriptors.
+    """Change settings of the map: labels that are paths, stored descriptors, automatic fits.
 
-    After a change of the labels, the probabilities of its estimates are those of the prior until
-    the next evaluation. A change of `rows` applies to generations that are created from now on:
-    POST /generations creates one.
+    After a change of the labels, its estimates have no levels until the next evaluation, which
+    starts by itself if automatic evaluations are on. A change of `rows` applies to generations that
+    are created from now on: POST /generations creates one.
     """
 
     def update(session: Session) -> MapResponse:
         map_ = lock_map(session, get_map(session, name).id)
-        if body.place_labels_are_paths is not None:
+        if body.place_labels_are_paths == "auto":
+            map_.place_labels_are_automatic = True
+            map_.place_labels_are_paths = decide_label_paths(session, map_)
+        elif body.place_labels_are_paths is not None:
+            map_.place_labels_are_automatic = False
             map_.place_labels_are_paths = body.place_labels_are_paths
         if body.rows is not None:
             map_.row_type = body.rows
+        if body.auto_fit is not None:
+            map_.auto_fit = body.auto_fit
         session.flush()
-        return _map_response(session, map_)
+        return _map_response(session, gateway.settings, map_)
 
     return gateway.catalog.run(update)
 
@@ -205,7 +250,7 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
     return DeletedMapResponse(success=True, message=f"The map {name} is deleted.", deleted_map=name)
 
 
-def _map_response(session: Session, map_: Map) -> MapResponse:
+def _map_response(session: Session, settings: Settings, map_: Map) -> MapResponse:
     generation = active_generation(session, map_.id)
     statistics, counted_at = get_map_statistics(session, map_.id)
     return MapResponse(
@@ -214,13 +259,48 @@ def _map_response(session: Session, map_: Map) -> MapResponse:
         version=map_.version,
         photos=statistics.photos,
         searchable=statistics.searchable,
+        failed_photos=statistics.failed_photos,
         labelled_queries=statistics.labelled_queries,
+        located=statistics.located,
+        measurement=_measurement(session, settings, map_, generation, statistics.located),
         counted_at=counted_at,
         generation_id=generation.id if generation else None,
         vocabulary=vocabulary_standing(session, generation) if generation else None,
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
         place_labels_are_paths=map_.place_labels_are_paths,
+        place_labels_are_automatic=map_.place_labels_are_automatic,
         rows=RowType(map_.row_type),
+        auto_fit=map_.auto_fit,
+        next_fit_photos=next_fit_photos(session, map_),
         created_at=map_.created_at,
     )
+
+
+def _measurement(
+    session: Session, settings: Settings, map_: Map, generation: Generation | None, located: int
+) -> Measurement:
+    """Return whether estimates have probabilities, or what it takes."""
+    if generation is None:
+        return "too_few_photos"
+    stored = generation.calibration and Calibration.model_validate(generation.calibration).places
+    scheme = LevelScheme(
+        labels_are_paths=map_.place_labels_are_paths, radii_m=settings.level_radii_m
+    )
+    if stored and stored.for_scheme(scheme).is_fitted:
+        return "measured"
+    newest = list_jobs(session, map_.id, (), (JobKind.EVALUATE,), 1, None)
+    if any(job.state in UNFINISHED_STATES for job in newest):
+        return "running"
+    if located < MIN_OWN_PHOTOS:
+        return "too_few_photos"
+    has_failed = any(job.state != JobState.SUCCEEDED for job in newest)
+    has_new_levels = bool(
+        stored and stored.scheme and stored.scheme.labels_are_paths != scheme.labels_are_paths
+    )
+    is_due = (
+        0 < settings.auto_evaluate_photos <= located
+        and not has_failed
+        and (generation.calibration is None or has_new_levels)
+    )
+    return "due" if is_due else "not_measured"

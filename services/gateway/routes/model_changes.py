@@ -249,9 +249,10 @@ def _validate_new_extractor(
 def _queue_switch(
     session: Session, map_id: UUID, config: ExtractorConfig | None, vocabulary_id: UUID | None
 ) -> Job:
-    params: dict[str, Any] = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
+    params: dict[str, Any] = {"vocabulary_id": None}
     if vocabulary_id is not None:
         get_vocabulary(session, map_id, vocabulary_id)
+        params = {"vocabulary_id": str(vocabulary_id), "vocabulary_chosen": True}
     if config is not None:
         check_model_registered(session, config)
         params["extractor"] = config.name

@@ -39,7 +39,6 @@ from services.gateway.schemas import (
 )
 from services.gateway.similarity.search_params import (
     FilterParams,
-    check_place_filter,
     parse_optional_time,
 )
 from shared.catalog.chunks import find_descriptor
@@ -285,13 +284,18 @@ def _queue_preview(
 
 class MetadataSearchParams(FilterParams, PageParams):
     filename: str | None = Field(
-        None, max_length=255, description="part of the file name, case-insensitive"
+        None,
+        max_length=1000,
+        description="part of the file name or of `relative_path`, case-insensitive",
     )
     upload_after: str | None = Field(None, description="ISO 8601; no offset means UTC")
     upload_before: str | None = Field(None, description="ISO 8601; no offset means UTC")
     min_file_size: int | None = Field(None, ge=0, le=2**62)
     max_file_size: int | None = Field(None, ge=0, le=2**62)
     role: PhotoRole | None = Field(None, description="photos with this role; omitted: all")
+    failed: bool = Field(
+        False, description="photos that can't be searched for, because their description failed"
+    )
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
@@ -306,6 +310,7 @@ class MetadataSearchParams(FilterParams, PageParams):
             max_file_size=self.max_file_size,
             photos=self.photo_filter(),
             role=self.role,
+            failed=self.failed,
         )
 
 
@@ -318,9 +323,7 @@ def search_photos_by_metadata(
     metadata_filter = query.metadata_filter()
     after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
-        map_ = get_map(session, query.map)
-        check_place_filter(metadata_filter.photos, map_)
-        map_id = map_.id
+        map_id = get_map(session, query.map).id
         matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
     page = matches[: query.limit]
     return MetadataSearchResponse(

@@ -40,7 +40,6 @@ from services.gateway.similarity.rerank import (
 from services.gateway.similarity.search_params import (
     SearchParams,
     SimilarityParams,
-    check_place_filter,
 )
 from services.gateway.uploads.multipart import multipart_schema
 from services.gateway.uploads.query_photo import (
@@ -95,7 +94,6 @@ async def search_by_stored_photo(
     search_params = query.search_params()
 
     def search() -> SimilarityResponse | Job:
-        _check_filter(gateway, query.map, search_params)
         if not search_params.needs_comparison:
             return find_similar(
                 gateway, query_from_photo(gateway, query.map, file_id), search_params
@@ -139,7 +137,6 @@ async def search_by_uploaded_photo(
     """
     search_params = query.search_params()
     await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
-    await run_in_threadpool(_check_filter, gateway, query.map, search_params)
     job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
     job = await run_in_threadpool(
         _queue_query, gateway, query.map, job_id, received, search_params, idempotent
@@ -226,12 +223,6 @@ async def _wait_for_result(
         if isinstance(result, SimilarityResponse):
             return result
         job = result
-
-
-def _check_filter(gateway: GatewayContext, map_name: str, search_params: SearchParams) -> None:
-    if search_params.photos.place_under is not None:
-        with gateway.catalog.read() as session:
-            check_place_filter(search_params.photos, get_map(session, map_name))
 
 
 def _queue_query(

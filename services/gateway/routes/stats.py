@@ -16,7 +16,7 @@ from shared.catalog.chunks import Chunk
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_map_statistics, list_searches
 from shared.catalog.processes import list_processes
-from shared.catalog.vocabularies import vocabulary_standing
+from shared.catalog.vocabularies import next_fit_photos, vocabulary_standing
 
 router = APIRouter(tags=["operations"])
 
@@ -36,6 +36,7 @@ class SearchHistoryEntry(ResponseModel):
     not_in_map_probability: float | None = Field(
         description="`estimate.not_in_map_probability` of the response; null if it had no levels"
     )
+    has_place: bool = Field(description="`estimate.has_place` of the response")
     processing_time_ms: float = Field(validation_alias="processing_ms")
     searched_at: datetime
 
@@ -63,6 +64,9 @@ class StatsResponse(ResponseModel):
     map_version: int
     total_images: int
     searchable_images: int
+    failed_images: int = Field(
+        description="stored photos that can't be searched for, because their description failed"
+    )
     labelled_queries: int
     total_chunks: int
     total_storage_bytes: int
@@ -73,6 +77,10 @@ class StatsResponse(ResponseModel):
         description="where extractors compute, `cpu` or `cuda`; null while none is running"
     )
     vocabulary: str | None
+    next_fit_photos: int | None = Field(
+        description="number of photos from which the next vocabulary is fitted automatically; null "
+        "if none is"
+    )
     total_searches: int
     recent_uploads_24h: int
     recent_searches_24h: int
@@ -105,6 +113,7 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
             map_version=map_.version,
             total_images=statistics.photos,
             searchable_images=statistics.searchable,
+            failed_images=statistics.failed_photos,
             labelled_queries=statistics.labelled_queries,
             total_chunks=chunks,
             total_storage_bytes=int(chunk_bytes) + statistics.photo_bytes,
@@ -120,6 +129,7 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
                 None,
             ),
             vocabulary=vocabulary_standing(session, generation) if generation else None,
+            next_fit_photos=next_fit_photos(session, map_),
             total_searches=statistics.searches,
             recent_uploads_24h=statistics.uploads_24h,
             recent_searches_24h=statistics.searches_24h,

@@ -62,7 +62,10 @@ UPLOAD_FORM = multipart_schema(
 )
 
 UPLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"model": UploadResponse, "description": "The map already has these bytes."},
+    200: {
+        "model": UploadResponse,
+        "description": "The map already has these bytes, and the photo is searchable.",
+    },
     201: {"model": UploadResponse, "description": "Searchable (with `Prefer: wait=N`)."},
 }
 
@@ -87,7 +90,8 @@ async def upload_photo(
 
     Fields that the form leaves out are read from EXIF. The response is 202 with the job to poll;
     with `Prefer: wait=N`, 201 once the photo is searchable. If the map already has the same bytes,
-    the existing photo is returned (200), or queued again after a failed job (202).
+    the existing photo is returned: with 200 if it is searchable, otherwise as if it had been sent
+    for the first time (202 or 201). A failed or cancelled job is queued again.
     """
     key_id = get_caller(request).key_id
     quota = reserve_photo_quota(request, gateway.settings)
@@ -148,9 +152,9 @@ class UploadOutcome:
             already_there=stored.photo.object_key != key,
             message=_outcome_message(stored, job),
         )
-        if not stored.queued or job is None:
+        if stored.job is None or stored.job.state == JobState.SUCCEEDED:
             return cls(200, {"Location": status_url}, body)
-        if job.state == JobState.SUCCEEDED:
+        if body.status == JobState.SUCCEEDED:
             return cls(201, {"Location": status_url}, body)
         return cls(202, accepted_headers(status_url), body)
 
@@ -171,9 +175,9 @@ async def respond_to_upload(
     """
     job = stored.job
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
-    if wait and stored.queued and job is not None:
+    if wait and job is not None and job.state != JobState.SUCCEEDED:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
-        job = await wait_for_job(gateway, job.id, wait)
+        job = await wait_for_job(gateway, job.id, wait) or job
     outcome = UploadOutcome.of(stored, job, key, map_name)
     if outcome.status == 201:
         await run_in_threadpool(on_described, outcome)

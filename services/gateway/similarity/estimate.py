@@ -17,6 +17,9 @@ from shared.evaluation.places.evidence import (
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.search_api.protocol import SearchHit
 
+MIN_GUESS_PROBABILITY = 0.1
+"""of the finest level of a guess that is named although its support is below the threshold"""
+
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Join hits with the locations of their photos."""
@@ -31,25 +34,24 @@ def estimate_place(
     ranking: Sequence[RankedPhoto],
     unfiltered_ranking: Sequence[RankedPhoto],
     radius_m: float,
+    no_place_reason: str,
 ) -> EstimateResponse:
     """Estimate the place that a ranking points to.
 
-    The calibration is that of this kind of ranking (plain, or by word weights). The evidence is
-    computed from the hits without the filter, because the calibration was learnt without filters.
-    Photos within `radius_m` metres show the same place.
+    Args:
+        calibration: That of this kind of ranking (plain, or by word weights).
+        ranking: The photos that have a place and match the filter, best first.
+        unfiltered_ranking: The same without the filter. The evidence is computed from it, because
+            the calibration was learnt on photos with a place and without filters.
+        radius_m: Photos within this distance in metres show the same place.
+        no_place_reason: The reason if a ranking is empty.
     """
     state = calibration.state if calibration else "uncalibrated"
     evidence = (
         compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
     )
     if evidence is None:
-        if ranking:
-            reason = "The most similar photo has neither coordinates nor a place."
-        elif unfiltered_ranking:
-            reason = "No photo of the map matches the filter."
-        else:
-            reason = "The map has no searchable photos yet."
-        return EstimateResponse(calibration=state, reason=reason)
+        return EstimateResponse(calibration=state, reason=no_place_reason)
     accepted = calibration.accepts(evidence) if calibration else None
     confidence = (
         calibration.confidence.probability(evidence)
@@ -67,6 +69,7 @@ def estimate_place(
         longitude=spot.longitude,
         radius_m=None if spot.latitude is None else radius_m,
         place=spot.place,
+        has_place=accepted is not False,
         confidence=confidence,
         calibration=state,
         reason=_estimate_reason(accepted, evidence.support, calibration),
@@ -90,6 +93,9 @@ def add_levels(
                 for level, probability in zip(estimate.levels, estimate.probabilities, strict=True)
             ],
             "answer_level": estimate.answer,
+            "has_place": response.has_place
+            or estimate.answer is not None
+            or estimate.probabilities[0] >= MIN_GUESS_PROBABILITY,
             "certainty": certainty,
             "not_in_map_probability": estimate.not_in_map,
             "radius_68_m": estimate.radius_68_m,
@@ -102,9 +108,8 @@ def add_levels(
 def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
     if accepted is None or calibration is None or calibration.support_threshold is None:
         return (
-            "How certain this place is, and whether it is in the map, is not known yet: this needs "
-            "an evaluation with at least 20 photos with coordinates or places "
-            "(POST /api/v1/evaluations)."
+            "How certain this place is, and whether it is in the map, is not measured yet: the map "
+            "has not been evaluated with 20 or more photos that have coordinates or a label."
         )
     compared = (
         f"The support of the first ten photos for the place is {support:.4f}; 5 % of the queries "

@@ -50,6 +50,8 @@ from shared.word_weights.record import WordWeights, parse_word_weights
 
 log = logging.getLogger(__name__)
 
+WITH_PLACE = PhotoFilter(has_place=True)
+
 
 @dataclass(frozen=True, slots=True)
 class _RankingWeights:
@@ -113,11 +115,11 @@ class SimilarityResult:
     places: PlaceEstimate | None
     """The levels and their probabilities; None if no photo has a location."""
     match_probabilities: dict[UUID, float]
-    """Probability of each of the best photos that it shows the query's place."""
+    """Probability of each of the best photos with a place that it shows the query's."""
     word_weights: tuple[float, ...]
     """The weights that the hits are ranked by, one per word; () for the plain ranking."""
-    history_row: Search
-    """Row of the search history; the caller adds it to a session."""
+    history: tuple[Search, ...]
+    """Row of the search history, which the caller adds to a session; () if it is left out."""
 
 
 def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
@@ -185,7 +187,7 @@ def find_similar(
     result = run_similarity_search(gateway, query, search_params)
     try:
         with write_to_map(gateway, query.map) as session:
-            session.add(result.history_row)
+            session.add_all(result.history)
     except SQLAlchemyError as error:
         if not isinstance(to_unavailable(error), StorageFull):
             raise
@@ -228,14 +230,23 @@ def run_similarity_search(
     # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
     search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
     hits, photos, response = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
-    unfiltered_hits, unfiltered_photos = hits, photos
+    ranked_hits, ranking = hits, locate_hits(hits, photos)
+    if not all(ranked.location.is_known for ranked in ranking):
+        # Photos without a place would hide those that have one.
+        with_place = search_params.photos.model_copy(update={"has_place": True})
+        ranked_hits, ranked_photos, _ = search(with_place, len(hits))
+        ranking = locate_hits(ranked_hits, ranked_photos)
+    unfiltered_hits, unfiltered_ranking = ranked_hits, ranking
     if not search_params.photos.is_empty:
-        unfiltered_hits, unfiltered_photos, _ = search(NO_FILTER, EVIDENCE_DEPTH)
-    ranking = locate_hits(hits, photos)
-    unfiltered_ranking = locate_hits(unfiltered_hits, unfiltered_photos)
+        unfiltered_hits, unfiltered_photos, _ = search(WITH_PLACE, EVIDENCE_DEPTH)
+        unfiltered_ranking = locate_hits(unfiltered_hits, unfiltered_photos)
     calibration = weights.calibration(hits)
     estimate = estimate_place(
-        calibration, ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
+        calibration,
+        ranking,
+        unfiltered_ranking,
+        gateway.settings.estimate_radius_m,
+        _no_place_reason(hits, search_params.photos),
     )
     scheme = LevelScheme(
         labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
@@ -254,7 +265,7 @@ def run_similarity_search(
     if places is not None and model.is_fitted:
         estimate = add_levels(estimate, places, model, certainty)
         match_probabilities = dict(
-            zip((hit.photo_id for hit in hits), places.match_probabilities, strict=True)
+            zip((hit.photo_id for hit in ranked_hits), places.match_probabilities, strict=True)
         )
     similar = hits[:depth]
     if search_params.min_score is not None and weights.values:
@@ -298,6 +309,7 @@ def run_similarity_search(
         in_map=estimate.in_map,
         answer_level=estimate.answer_level,
         not_in_map_probability=estimate.not_in_map_probability,
+        has_place=estimate.has_place,
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
     return SimilarityResult(
@@ -307,8 +319,17 @@ def run_similarity_search(
         places,
         match_probabilities,
         weights.values if weighted else (),
-        history,
+        (history,) if search_params.history else (),
     )
+
+
+def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> str:
+    """Return why there is no estimate, if no photo with a place was found."""
+    if hits:
+        return "None of the photos that were found has coordinates or a place label."
+    if photo_filter.is_empty:
+        return "The map has no searchable photos yet."
+    return "No photo of the map matches the filter."
 
 
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
@@ -336,7 +357,7 @@ def _rank_neighbours(
         (query.generation.id, query.map.version, best, weights, *limits),
         partial(_search_neighbours, gateway, query, search_params, best, weights),
     )
-    return [ranked for photo_id, ranked in neighbours if photo_id != query.photo_id]
+    return [ranked for ranked in neighbours if ranked.photo != query.photo_id]
 
 
 def _search_neighbours(
@@ -355,12 +376,11 @@ def _search_neighbours(
     photo = replace(query, object_key=chunk.object_key, row=descriptor.row, photo_id=photo_id)
     try:
         hits, photos, response = _search_live_photos(
-            gateway, photo, search_params, NO_FILTER, EVIDENCE_DEPTH + 1, weights=weights
+            gateway, photo, search_params, WITH_PLACE, EVIDENCE_DEPTH + 1, weights=weights
         )
     except Gone:  # its chunk was merged into another one between the two reads
         return (), False
-    ranking = zip((hit.photo_id for hit in hits), locate_hits(hits, photos), strict=True)
-    return tuple(ranking), not response.missing
+    return tuple(locate_hits(hits, photos)), not response.missing
 
 
 def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable
-from uuid import UUID
 
 from cachetools import LRUCache
 
@@ -16,7 +15,7 @@ from shared.evaluation.places.evidence import RankedPhoto
 
 CACHED_RANKINGS = 1000  # of about 50 photos: 20 MB
 
-Neighbours = tuple[tuple[UUID, RankedPhoto], ...]
+Neighbours = tuple[RankedPhoto, ...]
 """The photos of the map that are most similar to one of them, best first."""
 
 

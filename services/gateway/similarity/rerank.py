@@ -88,7 +88,7 @@ def start_comparison_of_stored_photo(
     """Search with a stored photo and queue a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
     with write_to_map(gateway, query.map) as session:
-        session.add(history)
+        session.add_all(history)
         idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job
@@ -111,7 +111,7 @@ def start_comparison_of_query_photo(
         if existing is not None:  # created by a concurrent request
             return existing
         current.params = {**current.params, COMPARE_JOB_PARAM: str(job.id)}
-        session.add_all([job, history])
+        session.add_all([job, *history])
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
@@ -160,7 +160,7 @@ def _build_compare_job(
     query: SimilarityQuery,
     search_params: SearchParams,
     describe_job_id: UUID | None,
-) -> tuple[Job, Search]:
+) -> tuple[Job, tuple[Search, ...]]:
     """Search, and build the compare job and the history row; neither is added to a session."""
     result = run_similarity_search(gateway, query, search_params)
     params = CompareJobParams(
@@ -184,4 +184,4 @@ def _build_compare_job(
         generation_id=query.generation.id,
         params=params.model_dump(mode="json"),
     )
-    return job, result.history_row
+    return job, result.history

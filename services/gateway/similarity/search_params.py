@@ -13,7 +13,6 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
-from shared.catalog.maps import Map
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.comparison import MAX_RERANK_CANDIDATES
@@ -43,8 +42,7 @@ class FilterParams(MapParams):
     place_under: str | None = Field(
         None,
         max_length=MAX_TEXT_CHARACTERS,
-        description="photos whose label is this level or lies below it; only for maps with "
-        "`place_labels_are_paths`",
+        description="photos whose label is this level of a path, or lies below it",
     )
     tags: str | None = Field(
         None, max_length=5000, description="separated by commas; photos must have all"
@@ -80,20 +78,6 @@ class FilterParams(MapParams):
             tags=tuple(parse_tags(self.tags.split(","))) if self.tags else (),
             tags_like=tuple(parse_tags(self.tags_like.split(","))) if self.tags_like else (),
             ids=_parse_ids(self.ids) if self.ids is not None else None,
-        )
-
-
-def check_place_filter(photo_filter: PhotoFilter, map_: Map) -> None:
-    """Checks that the map has the levels that the filter names.
-
-    Raises:
-        Unprocessable: `invalid_field`, for `place_under` in a map whose labels are no paths.
-    """
-    if photo_filter.place_under is not None and not map_.place_labels_are_paths:
-        raise invalid_field_error(
-            "place_under",
-            f"needs place labels that are paths: PATCH /api/v1/maps/{map_.name} with "
-            "`place_labels_are_paths`",
         )
 
 
@@ -178,6 +162,11 @@ class RankingParams(BaseModel):
         le=1,
         description="Share of the answers that must be right: the estimate answers at the finest "
         "level that is certain enough. Default: CERTAINTY.",
+    )
+    history: bool = Field(
+        True,
+        description="Add the search to the search history. `false` for programs that search with "
+        "many photos.",
     )
     mode: Mode = Field(
         Mode.AUTO,

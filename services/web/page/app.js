@@ -1,7 +1,8 @@
 // The frame: which view is shown, of which map.
 
-import { UNREACHABLE, chooseMap, currentMap, get, post } from "./api.js";
+import { UNREACHABLE, ask, chooseMap, currentMap, get, post } from "./api.js";
 import { field, fill, h, noteError, openDialog } from "./dom.js";
+import { percent } from "./format.js";
 import { showAsk } from "./views/ask.js";
 
 /** The page's own files can't be loaded. A browser does not import a module again that has failed: the page must be. */
@@ -30,7 +31,10 @@ const TAB_OF = { locate: "add", photo: "photos", tracks: "model" };
 const LIST_OF = { photo: ["#/photos", "All photos"], tracks: ["#/tracks", "All tracks"], ask: ["#/ask", "Ask with a photo"] };
 const NEW_MAP = "\n"; // no map's name
 
+const IMPROVING_SECONDS = 5;
+
 const main = document.getElementById("main");
+const improving = document.getElementById("improving");
 const choice = document.getElementById("map-choice");
 let leave = new AbortController();
 let first = true;
@@ -83,6 +87,20 @@ async function makeMap() {
   chooseMap(name.value);
 }
 
+/** The line below the header while the server fits a vocabulary, which people who add photos do not ask for. */
+async function showImprovement() {
+  if (document.hidden) return;
+  // Without a key, the view asks for one, and not this line every few seconds.
+  const response = await ask("/jobs", { query: { kind: "fit", state: ["queued", "running"], limit: 1 }, also: [401] });
+  const [job] = response.ok ? (await response.json()).jobs : [];
+  if (job) {
+    const { stateInWords } = await import("./jobs.js");
+    const { done, total } = job.progress;
+    fill(improving, h("strong", {}, job.label), `: ${stateInWords(job)}, ${percent(total ? done / total : 0)}`);
+  }
+  improving.hidden = !job;
+}
+
 choice.addEventListener("change", async () => {
   try {
     if (choice.value === NEW_MAP) await makeMap();
@@ -104,6 +122,7 @@ document.querySelector(".skip").addEventListener("click", (event) => {
 // What is dropped beside the field would be opened in the page's place.
 for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
 window.addEventListener("hashchange", route);
+setInterval(() => showImprovement().catch(() => (improving.hidden = true)), IMPROVING_SECONDS * 1000);
 listMaps().then(route, (error) => {
   noteError(error);
   route();

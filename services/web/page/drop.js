@@ -13,7 +13,7 @@ async function walk(entry, folder, found) {
   const path = folder + entry.name;
   if (entry.isFile) {
     const file = await new Promise((resolve, reject) => entry.file(resolve, reject));
-    if (!entry.name.startsWith(".")) found.push({ file, path });
+    found.push({ file, path });
     return;
   }
   const reader = entry.createReader();
@@ -24,6 +24,9 @@ async function walk(entry, folder, found) {
     for (const one of some) await walk(one, `${path}/`, found);
   }
 }
+
+/** Files of the system, such as macOS's `._a.jpg`, are no photos: `files` without them, as [{file, path}]. */
+export const withoutHidden = (files) => files.filter(({ path }) => !path.split("/").some((part) => part.startsWith(".") || part === "__MACOSX"));
 
 /** Let files be dropped on the element; `onfiles` gets them as [{file, path}]. */
 export function takesDrops(element, onfiles) {

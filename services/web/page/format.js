@@ -50,5 +50,5 @@ export function duration(seconds) {
 export function whereabouts(photo) {
   const place = photo.place ? [photo.place] : [];
   if (photo.latitude !== null) place.push(degrees(photo.latitude, photo.longitude));
-  return place.join(" · ") || "no place";
+  return place.join(" · ") || "no coordinates or label";
 }

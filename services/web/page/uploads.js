@@ -1,6 +1,7 @@
 // What is being added: a few uploads at a time, each with its job, many photos as batches.
 
 import { Problem, currentMap, get, idempotencyKey, maySucceed, post, send } from "./api.js";
+import { withoutHidden } from "./drop.js";
 import { count, plural } from "./format.js";
 import { stateInWords, watchJob } from "./jobs.js";
 
@@ -185,8 +186,9 @@ export class UploadQueue {
   }
 
   /** `files` as [{file, path}]; `fields` are those of POST /upload, and hold for all of them. How many
-   * were left out, because they are neither photos nor archives. */
-  add(files, fields) {
+   * were left out, because they are neither photos nor archives; hidden files are not counted. */
+  add(chosen, fields) {
+    const files = withoutHidden(chosen);
     const archives = files.filter(({ path }) => ARCHIVE.test(path));
     const photos = files.filter(({ file, path }) => !ARCHIVE.test(path) && (file.type.startsWith("image/") || PHOTO.test(path) || files.length === 1));
     this.entries.push(...archives.map((one) => new ArchiveEntry(this, one)));

@@ -248,6 +248,7 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
 ) -> None:
     service = make_service(min_free_bytes=GIGABYTE)
     (photo,) = service.indexed(1)
+    track_id = service.json("POST", "/tracks", 201, json={})["track_id"]
     before = {info.key for info in store.list("")}
     free = SimpleNamespace(free=GIGABYTE - 1)
     monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
@@ -257,6 +258,9 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
         assert "MIN_FREE_BYTES" in body["detail"]
         assert int(answer.headers["retry-after"]) > 0
     problem(service("POST", "/vocabularies"), 507, "disk_full")
+    problem(service("POST", "/tracks", json={}), 507, "disk_full")
+    frame = {"files": {"file": photo_bytes(2)}, "data": {"captured_at": "2026-05-01T12:00:00Z"}}
+    problem(service("POST", f"/tracks/{track_id}/frames", **frame), 507, "disk_full")
     assert {info.key for info in store.list("")} == before
     health = service("GET", "/health").json()
     assert health["status"] == health["parts"]["object_store"]["status"] == "degraded"

@@ -128,6 +128,7 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
         {"name": "x", "scopes": ["read"], "maps": ["a\0"]},
         {"name": "x", "scopes": ["read"], "maps": [""]},
         {"name": "x", "scopes": ["read"], "maps": ["a" * 101]},
+        {"name": "x", "scopes": ["read"], "maps": ["*"]},
         {"name": "x", "scopes": ["read"], "key": "chosen"},
     ],
 )

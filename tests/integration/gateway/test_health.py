@@ -77,6 +77,27 @@ def test_health_ignores_load_errors_of_extractors_that_no_map_uses(service: Serv
     assert part["detail"].startswith(f"{ANYLOC} can't be loaded (weights_missing)")
 
 
+def test_photos_whose_description_failed_are_counted_and_listed(service: Service) -> None:
+    register(service, device="cpu", models=["test-tiny-avg"], errors={})
+    good = service.indexed(1)
+    broken = service.upload(photo_bytes(2)[:-60])["file_id"]
+    assert extractors(service, 200)["failed_photos"] == {}, "it is not described yet"
+    service.drain()
+    part = extractors(service, 200)
+    assert part["failed_photos"] == {"default": 1}
+    assert (
+        part["detail"]
+        == "1 running; stored photos that can't be searched for: 1 in the map default"
+    )
+    listed = service.json("GET", "/search", params={"failed": "true"})["images"]
+    assert [photo["image_id"] for photo in listed] == [broken]
+    map_ = service.json("GET", "/maps/default")
+    assert (map_["photos"], map_["searchable"], map_["failed_photos"]) == (2, len(good), 1)
+    assert service.json("GET", "/database/stats")["failed_images"] == 1
+    service.json("DELETE", f"/uploads/{broken}")
+    assert extractors(service, 200)["failed_photos"] == {}
+
+
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The path of DINO_WEIGHTS, where no file exists yet; before the settings are read."""
@@ -103,6 +124,7 @@ def test_a_worker_reports_missing_weights_until_the_model_is_loaded(
     waited = service.json(
         "POST",
         "/upload",
+        202,
         files={"file": ("photo.jpg", photo_bytes(1))},
         headers={"Prefer": "wait=0.1"},
     )
@@ -124,5 +146,5 @@ def test_a_worker_reports_missing_weights_until_the_model_is_loaded(
     )
     assert waited["message"].endswith("described in the background.")
     service.drain()
-    again = service.json("POST", "/upload", files={"file": ("photo.jpg", photo_bytes(2))})
+    again = service.json("POST", "/upload", 202, files={"file": ("photo.jpg", photo_bytes(2))})
     assert again["message"].endswith("Its job is waiting for vocabulary.")

@@ -6,11 +6,9 @@ import json
 from uuid import UUID
 
 import pytest
-from sqlalchemy import select
 
 from services.extractor.model_changes import VocabularyFitJob
 from services.steward.tasks.compaction import merge_small_chunks
-from services.steward.tasks.model_changes import auto_fit_vocabularies
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.descriptors.extractor import Extractor
@@ -74,22 +72,17 @@ def test_a_vocabulary_is_learnt_from_database_photos_alone(
     assert set(vlads.rows()) == set(photo_ids)
 
 
+@pytest.mark.usefixtures("fit_at_four_photos")
 def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Workplace) -> None:
     """The fit would find nothing to learn from, and after a failure none begins by itself."""
     queries = vlads.upload(0, 1, 2)
     become(vlads, PhotoRole.QUERY, *queries)
-    vlads.upload(3, 4)
+    vlads.upload(3, 4, 5)
     vlads.drain()
-
-    def fits() -> list[str]:
-        auto_fit_vocabularies(vlads.catalog, vlads.wakeups, auto_fit_photos=3)
-        with vlads.catalog.read() as session:
-            return list(session.scalars(select(Job.state).where(Job.kind == JobKind.FIT)))
-
-    assert fits() == []
-    vlads.upload(5)
+    assert vlads.fit_if_due() == []
+    vlads.upload(6)
     vlads.drain()
-    assert fits() == [JobState.QUEUED]
+    assert len(vlads.fit_if_due()) == 1
 
 
 def test_a_fit_of_queries_alone_says_that_there_is_nothing_to_learn_from(

@@ -28,6 +28,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import cache_map_statistics
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.config.settings import Settings
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import InProcessWakeups, Job, JobKind
 from shared.storage import FolderStore
 from tests.integration.gateway.deleted_maps import ROUNDS, id_of, objects, remove_all, rows
@@ -48,7 +49,7 @@ class Away(Exception):
 def live_in(service: Service, name: str) -> None:
     """Everything that can belong to a map: photos, found and failed and asking ones, a vocabulary
     and an import under way, generations, a whitening, searches, queries, tracks, evaluations."""
-    settings = Settings().model_copy(update={"auto_fit_photos": 10_000})
+    settings = Settings()
     service.json("POST", "/maps", 201, json={"name": name, "extractor": "test-tiny-vlad"})
     params = {"map": name}
     for number in (1, 2, 3):
@@ -102,6 +103,28 @@ def finish_changes(service: Service) -> None:
     for _ in range(8):
         service.drain()
         advance_model_changes(service.catalog, InProcessWakeups())
+
+
+def test_choosing_a_vocabulary_switches_automatic_fits_off(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "quay", "extractor": "test-tiny-vlad"})
+    made = service.json("GET", "/maps/quay")
+    assert (made["auto_fit"], made["next_fit_photos"]) == (True, MIN_PHOTOS_TO_FIT)
+    service.indexed(1, 2, map_name="quay")
+    params = {"map": "quay"}
+    for seed in (0, 1):
+        service.json("POST", "/vocabularies", 202, params=params, json={"seed": seed})
+        finish_changes(service)
+    _, oldest = service.json("GET", "/vocabularies", params=params)
+    assert service.json("GET", "/maps/quay")["auto_fit"] is True
+    body = {"vocabulary_id": oldest["vocabulary_id"]}
+    service.json("POST", "/generations", 202, params=params, json=body)
+    finish_changes(service)
+    chosen = service.json("GET", "/maps/quay")
+    assert (chosen["auto_fit"], chosen["next_fit_photos"]) == (False, None)
+    again = service.json("PATCH", "/maps/quay", json={"auto_fit": True})
+    assert (again["auto_fit"], again["next_fit_photos"]) == (True, MIN_PHOTOS_TO_FIT)
+    average = service.json("GET", "/maps/default")
+    assert average["next_fit_photos"] is None, "its extractor uses no vocabulary"
 
 
 # --- what people see -------------------------------------------------------------------------

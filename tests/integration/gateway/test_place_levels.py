@@ -107,19 +107,18 @@ def test_a_level_filters_photos_below_it_and_an_exact_label_only_its_own(tower: 
         problem(answer, 422, "invalid_field")
 
 
-def test_labels_are_no_paths_unless_the_map_says_so(service: Service) -> None:
+def test_labels_become_paths_and_names_again_as_the_map_is_told(service: Service) -> None:
     for number, place in enumerate(PATHS):
         service.upload(photo_bytes(number), place=place)
     service.drain()
     fit(service)
-    assert [e["place"] for e in ask(service, 0)["estimate"]["levels"]] == ["tower/7/lift"]
-    for method, path in (("GET", "/search"), ("POST", "/similarity")):
-        files = {"file": ("query.jpg", photo_bytes(0))} if method == "POST" else None
-        answer = service(method, path, params={"place_under": "tower"}, files=files)
-        problem(answer, 422, "invalid_field")
-    body = {"place_labels_are_paths": True}
-    assert service.json("PATCH", "/maps/default", json=body)["place_labels_are_paths"] is True
-    assert len(ask(service, 0)["estimate"]["levels"]) == 3
+    for setting, are_paths in ((None, False), ("auto", True), (False, False), (True, True)):
+        if setting is not None:
+            body = {"place_labels_are_paths": setting}
+            changed = service.json("PATCH", "/maps/default", json=body)
+            assert changed["place_labels_are_paths"] is are_paths
+            assert changed["place_labels_are_automatic"] is (setting == "auto")
+        assert len(ask(service, 0)["estimate"]["levels"]) == (3 if are_paths else 1)
 
 
 def test_circles_are_the_levels_of_coordinates(service: Service) -> None:
@@ -170,6 +169,27 @@ def test_a_photo_without_a_location_has_no_levels(service: Service) -> None:
     assert answer["estimate"]["levels"] == []
     assert answer["estimate"]["calibration_source"] is None
     assert answer["similar_images"][0]["match_probability"] is None
+
+
+def test_a_map_says_whether_its_estimates_are_measured(service: Service) -> None:
+    def measurement() -> str:
+        described = service.json("GET", "/maps/default")
+        assert described["located"] == located
+        return str(described["measurement"])
+
+    located = 0
+    assert measurement() == "too_few_photos"
+    located = len(service.indexed(*range(19), place="hall"))
+    service.indexed(30)  # nobody knows where
+    assert measurement() == "too_few_photos"
+    located += len(service.indexed(19, place="hall"))
+    assert measurement() == "due"
+    started = service.json("POST", "/evaluations", 202, json={})
+    assert measurement() == "running"
+    service.json("POST", f"/jobs/{started['job_id']}/cancel")
+    assert measurement() == "not_measured"
+    fit(service)
+    assert measurement() == "measured"
 
 
 @pytest.mark.parametrize("certainty", ["0", "1.01", "-1", "nan", "sure"])

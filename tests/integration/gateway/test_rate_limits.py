@@ -11,6 +11,7 @@ from threading import Barrier, Event
 from types import SimpleNamespace
 from typing import Any
 
+import httpx2
 import pytest
 from pydantic import SecretStr
 from sqlalchemy import func, select
@@ -154,6 +155,32 @@ def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
     assert door.put(ADMIN, 4).status_code == 202
     assert door(key, "DELETE", f"/uploads/{stored[0]}").status_code == 200
     assert door.put(key, 3).status_code == 202
+
+
+def test_tracks_and_their_frames_count_in_the_limits_of_their_key(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(photo_quota, "FULL_RECOUNT_SECONDS", 0.0)
+
+    def send(key: str, track_id: str, number: int) -> httpx2.Response:
+        data = {"captured_at": f"2026-05-01T12:00:0{number}Z"}
+        files = {"file": ("frame.jpg", photo_bytes(number))}
+        return door(key, "POST", f"/tracks/{track_id}/frames", data=data, files=files)
+
+    key = door.key("read", max_photos=3, upload_bytes_per_day=1_000_000)["key"]
+    begun = door(key, "POST", "/tracks", json={})
+    track_id = begun.json()["track_id"]
+    assert [send(key, track_id, number).status_code for number in (1, 2)] == [202, 202]
+    problem(send(key, track_id, 3), 429, "photo_quota_reached")
+    problem(door(key, "POST", "/tracks", json={}), 429, "photo_quota_reached")
+    assert send(ADMIN, track_id, 4).status_code == 202, "each frame counts for its own key"
+    assert door(ADMIN, "DELETE", f"/tracks/{track_id}").status_code == 200
+    assert door(key, "POST", "/tracks", json={}).status_code == 201
+
+    calls = door.key("read", requests_per_minute=1)["key"]
+    assert [door(calls, "POST", "/tracks", json={}).status_code for _ in "ab"] == [201, 429]
+    few_bytes = door.key("read", upload_bytes_per_day=10)["key"]
+    problem(send(few_bytes, track_id, 5), 429, "upload_quota_reached")
 
 
 def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(

@@ -7,14 +7,12 @@ import { nameOf, percent, plural, score, strength, whereabouts } from "../format
 import { stateInWords, watchJob } from "../jobs.js";
 import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
-import { drawRings, verdict } from "./verdict.js";
+import { drawRings, judge, measurementInWords, verdict } from "./verdict.js";
 
 const TOP_K = 12;
 const NEWEST = 14;
 const WAIT_SECONDS = 10;
-
-/** A box that contains all photos with coordinates. */
-export const WITH_COORDINATES = "-90,-180,90,180";
+const LOOK_MS = 4000; // between two looks at a measurement
 
 export async function showAsk(view, { signal, id }) {
   const answer = h("div", { class: "answer" });
@@ -29,7 +27,7 @@ export async function showAsk(view, { signal, id }) {
     await showAnswer(answer, queryPhoto, signal);
     return;
   }
-  const map = await get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
+  const map = await readMap(signal);
   const entry = askEntry(map, (file) => {
     const small = shrinkPhoto(file, map.extractor);
     const described = Promise.withResolvers();
@@ -116,14 +114,14 @@ export async function findSimilar(path, query, file, onjob, signal, ondescribed 
 
 let questions = 0;
 
-async function showAnswer(answer, queryPhoto, signal, filter = {}) {
+async function showAnswer(answer, queryPhoto, signal) {
   const mine = ++questions; // of two that overlap, the later one is shown
   const progress = h("p", { class: "soft" }, "Looking…");
   fill(answer, h("section", { class: "card asking" }, h("figure", {}, queryPhoto.picture()), h("div", {}, h("h2", {}, "Looking for the place"), bar("Looking for the place", 0, 0), progress)));
   answer.scrollIntoView({ block: "start" });
   let found;
   try {
-    found = await queryPhoto.find({ top_k: TOP_K, ...filter }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
+    found = await queryPhoto.find({ top_k: TOP_K }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
     if (mine !== questions) return;
@@ -137,24 +135,52 @@ async function showAnswer(answer, queryPhoto, signal, filter = {}) {
   const open = (index) => compare(queryPhoto, photos, index, signal);
   const located = photos.some((photo) => photo.latitude !== null);
   const ground = h("div", { class: "ground" });
-  const [first] = photos;
-  const unlocated = first && first.latitude === null && first.place === null;
+  // Without levels, an estimate has no probabilities.
+  const map = !found.estimate.levels.length && judge(found.estimate)[1] !== "No estimate" ? await readMap(signal) : null;
+  const measurement = map && map.measurement !== "measured" ? h("p", { class: "reason" }) : null;
   fill(answer,
     h("section", { class: "result" },
       h("figure", { class: "query-photo" }, queryPhoto.picture(), h("figcaption", {}, queryPhoto.name)),
-      h("div", { class: "verdict-column" }, verdict(found),
-        unlocated && button("Search only photos with coordinates", () => showAnswer(answer, queryPhoto, signal, { box: WITH_COORDINATES }))),
+      h("div", { class: "verdict-column" }, verdict(found, measurement)),
       located ? ground : null),
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
       photos.length > 0 && figures(photos, found.word_weights === "applied")));
+  if (measurement) {
+    const askAgain = () => showAnswer(answer, queryPhoto, signal);
+    followMeasurement(measurement, map, askAgain, () => mine === questions && answer.isConnected, signal);
+  }
   announce(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
   if (located) await drawAnswer(openMap, ground, found.estimate, photos, open, signal);
 }
 
-/** The photos in the order of the number that they are shown with; those of equal probability as they are ranked. */
-const byProbability = (photos) => [...photos].sort((one, other) => other.match_probability - one.match_probability);
+const readMap = (signal) => get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
+
+/** Say in the element whether the map is measured, and ask again once it is. */
+function followMeasurement(element, map, askAgain, isShown, signal) {
+  const look = async () => {
+    const { measurement, located } = map;
+    map = await readMap(signal);
+    if (!isShown()) return;
+    if (map.measurement === "measured") askAgain().catch((error) => !signal.aborted && noteError(error));
+    else if (map.measurement !== measurement || map.located !== located) draw();
+  };
+  const draw = () => fill(element, measurementInWords(map, look));
+  draw();
+  const timer = setInterval(() => {
+    if (signal.aborted || !isShown() || map.measurement === "measured") clearInterval(timer);
+    else if (!document.hidden) look().catch(() => {}); // until the server can be reached again
+  }, LOOK_MS);
+}
+
+/** The photos in the order of the number that they are shown with; those of equal probability as they are ranked, and those without a place where they are ranked. */
+function byProbability(photos) {
+  const likely = photos.filter(hasProbability).sort((one, other) => other.match_probability - one.match_probability);
+  return photos.map((photo) => (hasProbability(photo) ? likely.shift() : photo));
+}
+
+const hasProbability = (photo) => photo.match_probability !== null;
 
 async function drawAnswer(openMap, ground, estimate, photos, open, signal) {
   const map = await openMap(ground, "Where the matches were taken", { signal });
@@ -183,9 +209,9 @@ function matchCard(photo, index, onclick) {
 
 /** The numbers behind the ranking. */
 function figures(photos, weighted) {
-  const likely = photos.some((photo) => photo.match_probability !== null);
+  const likely = photos.some(hasProbability);
   const order = likely
-    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below.`
+    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
     : "Photos are in the order of their similarity.";
   const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), "Similarity"];
   const numbers = (photo) => [

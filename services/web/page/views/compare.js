@@ -37,7 +37,7 @@ export function compare(queryPhoto, photos, index, signal) {
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
           h("button", { type: "button", onclick: () => show(index + 1) }, "Next →"))));
     try {
-      const found = await queryPhoto.find({ top_k: 1, ids: photo.image_id, explain: true }, () => {});
+      const found = await queryPhoto.find({ top_k: 1, ids: photo.image_id, explain: true, history: false }, () => {});
       const explanation = found.similar_images[0]?.explanation;
       if (mine !== shown || !explanation) return;
       overlay.src = explanation.overlay;

@@ -2,13 +2,14 @@
 
 import { ask, currentMap, get } from "../api.js";
 import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
-import { takesDrops } from "../drop.js";
+import { takesDrops, withoutHidden } from "../drop.js";
 import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
-import { WITH_COORDINATES, findSimilar } from "./ask.js";
+import { findSimilar } from "./ask.js";
 
 const HEADER_BYTES = 256 * 1024;
 const SIMILAR = 50;
+const WITH_COORDINATES = "-90,-180,90,180"; // a box around all photos with coordinates
 const AT_ONCE = 3;
 const PER_CALL = 100; // photos without coordinates, as the server allows
 const TRACK_POINTS = 5000;
@@ -35,7 +36,8 @@ export async function showLocate(view, { signal }) {
     await draw();
   };
   const fail = (error) => !signal.aborted && noteError(error);
-  const take = async (files) => {
+  const take = async (chosenFiles) => {
+    const files = withoutHidden(chosenFiles);
     const tracks = files.filter(({ path }) => /\.gpx$/i.test(path));
     if (tracks.length) track = [];
     for (const { file } of tracks) track.push(...readTrack(await file.text(), file.name));
@@ -143,12 +145,11 @@ function toUtc(shown, zone) {
 
 async function search(photo, map, signal) {
   const file = await shrinkPhoto(photo.file, map.extractor);
-  const find = (query) => findSimilar("/similarity", { top_k: SIMILAR, ...query }, file, () => {}, signal);
-  let found = await find({});
-  const [first] = found.similar_images;
+  const find = (query) => findSimilar("/similarity", { top_k: SIMILAR, history: false, ...query }, file, () => {}, signal);
+  const found = await find({});
   // Photos of the map without coordinates, such as this one, hide those that have some.
-  if (first && first.latitude === null && first.place === null) found = await find({ box: WITH_COORDINATES });
-  const { estimate, similar_images: similar } = found;
+  const { similar_images: similar } = found.matches_without_place ? await find({ box: WITH_COORDINATES }) : found;
+  const { estimate } = found;
   photo.search = {
     similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.weighted_score ?? match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),

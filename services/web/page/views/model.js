@@ -5,7 +5,7 @@ import { advancedTabs, bar, button, field, fill, h, note, noteError, openDialog,
 import { count, percent, plural } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 
-const CHANGES = { fit: "Fitting a vocabulary", import_vocabulary: "Importing a vocabulary", switch: "Switching the vocabulary", pca: "Fitting a PCA" };
+const CHANGES = { fit: "Improving the map", import_vocabulary: "Importing a vocabulary", switch: "Switching the vocabulary", pca: "Fitting a PCA" };
 const RECALLS = ["R@1", "R@5", "R@10"];
 
 const STANDING = {
@@ -36,15 +36,34 @@ export async function showModel(view, { signal }) {
           h("dt", {}, "Extractor"), h("dd", {}, map.extractor),
           h("dt", {}, "Dimension"), h("dd", {}, map.dimension ? count(map.dimension) : "–"),
           h("dt", {}, "Photos"), h("dd", {}, `${count(map.searchable)} of ${count(map.photos)} searchable`),
-          h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)))),
+          h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)),
+          h("dt", {}, "Labels"), h("dd", {}, labelsField(map, path)))),
       h("div", { class: "standing-words" },
         h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to fit a vocabulary on."),
-        map.photos ? fits && button(["own", "provisional"].includes(map.vocabulary) ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos")),
+        map.photos ? fits && button(["own", "provisional"].includes(map.vocabulary) ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos"),
+        fits && automatic(map, path, again)),
       work),
     comparison(evaluations, generations, vocabularies, () => measure(follow)),
     generationsTable(generations, vocabularies),
     vocabulariesTable(vocabularies, generations, follow));
   for (const job of jobs.slice(0, 1)) follow(job, CHANGES[job.kind]);
+}
+
+/** Whether the map gets vocabularies of its own photos without being asked. */
+function automatic(map, path, again) {
+  const box = h("input", { type: "checkbox", checked: map.auto_fit });
+  box.addEventListener("change", () => ask(path, { method: "PATCH", json: { auto_fit: box.checked } }).then(again, noteError));
+  return h("label", { class: "check" }, box, h("span", {}, "Improve this map automatically", map.next_fit_photos ? ` (next time at ${plural(map.next_fit_photos, "photo")})` : ""));
+}
+
+const LABELS = { auto: "as they look", true: "paths, such as tower/floor 7", false: "names" };
+
+/** Whether labels are paths: by their look, or as it is chosen here. */
+function labelsField(map, path) {
+  const input = h("select", { "aria-label": "Labels" }, Object.entries(LABELS).map(([value, words]) => h("option", { value }, value === "auto" && map.place_labels_are_automatic ? `${words} (${map.place_labels_are_paths ? "paths" : "names"})` : words)));
+  input.value = map.place_labels_are_automatic ? "auto" : String(map.place_labels_are_paths);
+  input.addEventListener("change", () => ask(path, { method: "PATCH", json: { place_labels_are_paths: JSON.parse(input.value === "auto" ? '"auto"' : input.value) } }).then(() => note("Saved."), noteError));
+  return input;
 }
 
 /** The bar of a job that changes the model; `again` draws the view anew when it has ended. */

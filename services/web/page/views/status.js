@@ -1,24 +1,25 @@
 // The health and the figures of the server, its jobs, the newest searches, and the way in for a phone.
 
-import { forgetKey, get, hasKey, maySucceed, post } from "../api.js";
+import { currentMap, forgetKey, get, hasKey, maySucceed, post } from "../api.js";
 import { button, fill, h, time } from "../dom.js";
 import { bytes, count, duration, score } from "../format.js";
 import { stateInWords } from "../jobs.js";
 import { serverSettings } from "../settings.js";
-import { judge } from "./verdict.js";
+import { judge, measurementInWords } from "./verdict.js";
 
 const LOOK_SECONDS = 5;
 
 export async function showStatus(view, { signal }) {
   const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
   const look = async () => {
-    const [health, stats, { jobs }, { searches }] = await Promise.all([
+    const [health, stats, map, { jobs }, { searches }] = await Promise.all([
       // 503 with the same answer, where a part is away.
-      get("/health", { signal, also: [503] }), get("/database/stats", { signal }),
-      get("/jobs", { query: { limit: 12, kind: Object.keys(KINDS) }, signal }), get("/searches", { query: { limit: 12 }, signal }),
+      get("/health", { signal, also: [503] }), get("/database/stats", { signal }), get(`/maps/${encodeURIComponent(currentMap())}`, { signal }),
+      get("/jobs", { query: { limit: 12, kind: KINDS }, signal }), get("/searches", { query: { limit: 12 }, signal }),
     ]);
     drawHealth(drawn.health, health);
-    drawFigures(drawn.figures, stats);
+    const failed = stats.failed_images ? (await get("/search", { query: { failed: true, limit: 12 }, signal })).images : [];
+    drawFigures(drawn.figures, stats, map, failed, look);
     drawJobs(drawn.jobs, jobs, look);
     drawSearches(drawn.searches, searches);
   };
@@ -26,7 +27,7 @@ export async function showStatus(view, { signal }) {
   fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(await serverSettings())));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
-    if (!document.hidden && !drawn.jobs.contains(document.activeElement)) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
+    if (!document.hidden && ![drawn.jobs, drawn.figures].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
   }, LOOK_SECONDS * 1000);
   signal.addEventListener("abort", () => clearInterval(timer));
 }
@@ -54,17 +55,21 @@ function drawHealth(card, health) {
     h("p", { class: "soft small" }, `Placewise ${health.version}, up for ${duration(health.uptime_seconds)}`));
 }
 
-function drawFigures(card, stats) {
+function drawFigures(card, stats, map, failed, look) {
   const tile = (figure, name) => h("div", { class: "tile" }, h("span", { class: "figure" }, figure), h("span", { class: "soft" }, name));
   fill(card, h("h2", {}, `The map “${stats.map}”`),
     h("div", { class: "tiles" },
       tile(count(stats.total_images), "photos"), tile(count(stats.searchable_images), "searchable"),
+      tile(count(map.located), "with coordinates or a label"),
+      stats.failed_images > 0 && tile(count(stats.failed_images), "could not be described"),
       tile(count(stats.labelled_queries), "test photos"), tile(bytes(stats.total_storage_bytes), "stored"),
-      tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")));
+      tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")),
+    h("p", {}, measurementInWords(map, look)),
+    failed.length > 0 && h("p", {}, "Photos that could not be described, and are not found: ", failed.flatMap((photo, index) => [index > 0 && ", ", h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename)]), stats.failed_images > failed.length && ` and ${count(stats.failed_images - failed.length)} more`, "."));
 }
 
 // Those that a search starts are listed as questions.
-const KINDS = { index: "Photo", batch: "Batch", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", add_model: "New model", evaluate: "Evaluation", word_weights: "Word weights" };
+const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "evaluate", "word_weights"];
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {
@@ -74,7 +79,7 @@ function drawJobs(card, jobs, look) {
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
-      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, KINDS[job.kind]) : KINDS[job.kind]),
+      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, job.label) : job.label),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
       h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
       h("td", {}, time(job.created_at)),

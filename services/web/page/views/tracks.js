@@ -33,7 +33,7 @@ async function showList(view, signal) {
 }
 
 async function showTrack(view, id, signal) {
-  const smoothed = h("input", { type: "checkbox" });
+  const smoothed = h("input", { type: "checkbox", checked: true });
   const drawn = h("div", { class: "view" });
   const draw = async () => {
     const track = await get(`/tracks/${id}`, { query: { smoothed: smoothed.checked }, signal });
@@ -48,9 +48,13 @@ async function showTrack(view, id, signal) {
     await ask(`/tracks/${id}`, { method: "DELETE" });
     location.hash = "#/tracks";
   }, "danger");
-  const choice = h("label", { class: "check" }, smoothed, h("span", {}, "Use later frames, too", h("small", {}, "The place given the whole track, not only the frames before it. The status stays that of the moment.")));
+  const choice = h("label", { class: "check" }, smoothed, h("span", {}, "Use later frames, too", h("small", {}, "The place given the whole track, not only the frames before it.")));
   fill(view, h("header", { class: "head" }, h("h1", {}, "Track"), h("div", { class: "row" }, h("a", { class: "button", href: "#/tracks" }, "All tracks"), remove)), choice, drawn);
-  await draw();
+  await draw().catch(async (error) => {
+    if (error.code !== "track_too_long") throw error;
+    smoothed.checked = false;
+    await draw();
+  });
 }
 
 async function drawTrack(element, track, again, signal) {

@@ -1,30 +1,30 @@
 // The place estimate in words, bars and rings.
 
-import { h } from "../dom.js";
-import { count, degrees, metres, percent } from "../format.js";
+import { post } from "../api.js";
+import { button, h } from "../dom.js";
+import { count, degrees, metres, percent, plural } from "../format.js";
 import { coordinateTools } from "../places.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
+const MOST_SURE = 99;
 
-/** A share without the zero of a whole percentage. */
-const short = (share) => `${Number((100 * share).toFixed(1))} %`;
-
-/** The card with the estimate of a similarity search. */
-export function verdict(found) {
-  const { estimate } = found;
-  const { levels } = estimate;
+/** The card with the estimate of a similarity search; `measurement` is an element with `measurementInWords`, null for an estimate with probabilities. */
+export function verdict(found, measurement) {
+  const { estimate, matches_without_place: without } = found;
   const [kind, title] = judge(estimate);
   const anyFound = found.similar_images.length > 0;
+  const bars = estimate.levels.length > 0 && shares(estimate);
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
     kind === "unknown" ? null : whereabouts(estimate),
-    h("p", { class: "reason" }, reason(estimate)),
-    levels.length > 0 && levelBars(estimate),
-    ringsInWords(estimate),
+    measurement ?? h("p", { class: "reason" }, bars ? reason(estimate, kind, bars) : estimate.reason),
+    without > 0 && without < found.total_similar && h("p", { class: "soft" }, `${count(without)} of these ${plural(found.total_similar, "photo")} ${without === 1 ? "has" : "have"} neither coordinates nor a label. The estimate is that of the photos that have.`),
+    bars && kind !== "unknown" && [drawBars(bars), ringsInWords(estimate)],
     source(estimate),
     h("details", {}, h("summary", {}, "Details"),
       h("dl", { class: "facts" },
         estimate.confidence !== null && [h("dt", {}, "Confidence"), h("dd", {}, percent(estimate.confidence))],
+        bars && kind !== "unknown" && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
         h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
@@ -34,60 +34,77 @@ export function verdict(found) {
     found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
 }
 
-/** Draw the circles that contain the true position with 95 % and 68 %; where the levels are labels, the estimated position. */
+/** Draw the circles that contain the true position with 95 % and 68 %; without them, the estimated position. */
 export function drawRings(map, estimate) {
-  const { levels: [finest], latitude, longitude, radius_m: radiusM } = estimate;
-  if (!finest?.radius_m && latitude !== null) map.circle(latitude, longitude, radiusM, "estimate");
+  const { levels: [finest], latitude, longitude } = estimate;
+  if (judge(estimate)[0] === "unknown") return;
+  if (!finest?.radius_m && latitude !== null) map.point(latitude, longitude, { kind: "estimate", radius: 10 });
   for (const [, radius, kind] of RINGS) {
     if (estimate[radius] !== null) map.circle(finest.latitude, finest.longitude, estimate[radius], kind);
   }
 }
 
 /** The style and the title of an estimate, or of an entry of the search history. Without levels there is no probability of “not in this map”. */
-export function judge({ answer_level: answer, not_in_map_probability: outside, in_map: accepted, latitude = null, place = null }) {
+export function judge({ answer_level: answer, not_in_map_probability: outside, in_map: accepted, has_place: hasPlace }) {
   const hasLevels = outside !== null;
   if (hasLevels ? answer !== null : accepted) return ["known", "In this map"];
-  return (hasLevels ? outside > 0.5 : accepted === false) ? ["unknown", "Not in this map"] : ["open", hasLevels || latitude !== null || place ? "Best guess" : "No estimate"];
+  if (outside > 0.5) return ["unknown", "Not in this map"];
+  if (hasPlace) return ["open", "Best guess"];
+  return accepted === false ? ["unknown", "Probably not in this map"] : ["open", "No estimate"];
+}
+
+/** Whether it is known how certain the map's answers are; `onchange` is called when that may have changed. */
+export function measurementInWords({ measurement, located }, onchange) {
+  switch (measurement) {
+    case "measured": return ["The certainty of answers is measured."];
+    case "running": return ["The certainty of answers is being measured now."];
+    case "due": return ["The certainty of answers is not measured yet. That starts by itself once all photos are described."];
+    case "not_measured": return ["The certainty of answers is not measured yet. ", button("Measure now", () => post("/evaluations", { json: {} }).then(onchange))];
+    default: return [`The certainty of answers is not measured yet: that takes 20 photos with coordinates or a label, and this map has ${count(located)}. `, h("a", { href: "#/add" }, "Add photos")];
+  }
 }
 
 /** The estimated place. Its error is the widest ring of the map that is known, so that both agree. */
 function whereabouts(estimate) {
   const [share, ring] = RINGS.find(([, radius]) => estimate[radius] !== null) ?? [];
-  const level = estimate.levels[ring ? 0 : estimate.answer_level ?? 0] ?? estimate;
-  const { place, latitude, longitude } = level;
-  const [radius, probability] = ring ? [estimate[ring], share] : [level.radius_m, level.probability];
+  const { place, latitude, longitude } = estimate.levels[ring ? 0 : estimate.answer_level ?? 0] ?? estimate;
   return [
     place && h("p", { class: "place" }, place),
-    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), h("span", { class: "radius" }, ` ± ${metres(radius)}`, probability !== undefined && ` (${short(probability)})`)),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), ring && h("span", { class: "radius" }, ` ± ${metres(estimate[ring])} (${100 * share} %)`)),
     latitude !== null && coordinateTools(latitude, longitude),
   ];
 }
 
-/** Why the estimate answers at its level, or does not answer: one sentence. */
-function reason({ levels, answer_level: answer, certainty, not_in_map_probability: outside, reason: withoutLevels }) {
-  if (!levels.length) return withoutLevels;
-  const required = short(certainty);
+/** How sure the answer is, or why there is none: one sentence. `bars` are those of the estimate. */
+function reason({ levels, answer_level: answer, certainty, not_in_map_probability: outside }, kind, bars) {
+  if (answer === null && outside > 0.5) return `${Math.round(100 * outside)} % sure that this map has no photo of the place.`;
+  if (kind === "unknown") return "The matches point to one place no more clearly than those of a photo from elsewhere do.";
+  const shown = answer ?? levels.length - 1;
+  const sure = bars.slice(0, shown + 1).reduce((sum, { share }) => sum + share, 0);
+  const { place, radius_m: radius } = levels[shown];
+  const words = `${sure > MOST_SURE ? `More than ${MOST_SURE}` : sure} % sure it is ${place ? `in “${place}”` : `within ${metres(radius)}`}`;
   // An answer that is finer than the coarsest level also requires odds against “not in this map”.
-  const unsure = levels.slice(0, answer ?? levels.length).some(({ probability }) => probability >= certainty);
-  if (answer !== null) return `At a certainty of ${required}, the finest answer is ${quoted(levels[answer])}, with a probability of ${percent(levels[answer].probability)}.${unsure ? " Finer levels require stronger evidence that the place is in the map." : ""}`;
-  if (outside > 0.5) return `The map probably has no photo of this place (${percent(outside)}).`;
-  const coarsest = levels.at(-1);
-  return `No level is certain enough at a certainty of ${required}; the most probable is ${quoted(coarsest)}, with ${percent(coarsest.probability)}${unsure ? ", but it requires stronger evidence that the place is in the map" : ""}.`;
+  const unclear = levels.slice(0, answer ?? levels.length).some(({ probability }) => probability >= certainty);
+  if (answer !== null) return `${words}.${unclear ? " A finer answer needs clearer signs that the place is in this map." : ""}`;
+  return `${words}${unclear ? ", but it is not clear whether the place is in this map" : `: an answer needs ${Number((100 * certainty).toFixed(1))} %`}.`;
 }
 
-const named = (level) => level.place ?? `Within ${metres(level.radius_m)}`;
-const quoted = (level) => (level.place ? `“${level.place}”` : `a radius of ${metres(level.radius_m)}`);
-
-/** A bar for each level, and one for "not in this map". */
-function levelBars({ levels, answer_level: answer, not_in_map_probability: outside }) {
-  const row = (name, probability, kind) => h("li", { class: kind },
-    h("span", { class: "level" }, name),
-    h("span", { class: "figure" }, percent(probability)),
-    h("meter", { min: 0, max: 1, value: probability, "aria-label": `Probability: ${name}` }));
-  return h("ul", { class: "levels", "aria-label": "Levels, finest first" },
-    levels.map((level, index) => row(named(level), level.probability, index === answer ? "chosen" : null)),
-    row("Not in this map", outside, "outside"));
+/** What the place may be, with shares in whole percent that add up to 100: `{name, share, kind}`. */
+function shares({ levels, answer_level: answer }) {
+  const [finest, ...coarser] = levels;
+  const names = coarser.map(({ place, radius_m: radius }, index) => (place ? `Elsewhere in ${place}` : `${metres(levels[index].radius_m)} to ${metres(radius)} away`));
+  const bounds = [...levels.map(({ probability }) => Math.round(100 * probability)), 100];
+  return [finest.place ?? `Within ${metres(finest.radius_m)}`, ...names, finest.place ? "Elsewhere, or not in this map" : "Farther away, or not in this map"].map((name, index) => ({
+    name,
+    share: bounds[index] - (bounds[index - 1] ?? 0),
+    kind: index === levels.length ? "outside" : index <= answer && answer !== null ? "chosen" : null,
+  }));
 }
+
+const drawBars = (bars) => h("ul", { class: "levels", "aria-label": "Where it may be" }, bars.map(({ name, share, kind }) => h("li", { class: kind },
+  h("span", { class: "level" }, name),
+  h("span", { class: "figure" }, `${share} %`),
+  h("meter", { min: 0, max: 100, value: share, "aria-label": `Probability: ${name}` }))));
 
 function ringsInWords(estimate) {
   const rings = RINGS.filter(([, radius]) => estimate[radius] !== null)
