@@ -14,6 +14,7 @@ from placewise.client import Client, Work
 from services.cli.environment import read_settings
 from services.cli.imports import collection_paused
 from services.cli.output import print_note
+from shared.config.command_line import command_line
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Misconfigured, Unavailable
 
@@ -87,6 +88,14 @@ def describe_target(client: Client, server: str | None, map_name: str | None) ->
     """Name the map and the server that `connect` has selected for these options."""
     folder = "" if server else f", which serves {read_settings().placewise_home}"
     return f"map {map_name or 'default'} of {client.url}{folder}"
+
+
+def client_command(*arguments: str, server: str | None, map_name: str | None) -> str:
+    """Return a command line that works in any folder, for the server and the map of `connect`."""
+    options = ["--map", map_name] if map_name else []
+    if server:
+        return command_line(*arguments, *options, "--server", server)
+    return command_line(*arguments, *options, home=read_settings().placewise_home)
 
 
 POLL_SECONDS = 1.0  # short, so that the progress bar moves

@@ -138,7 +138,7 @@ def export_pairs(
     pairs = skipped = 0
     for photo in queries:
         try:
-            matches = client.similar(photo, top_k=top_k).similar_images
+            matches = client.similar(photo, top_k=top_k, history=False).similar_images
         except Conflict as error:
             if error.code != "not_searchable":
                 raise
@@ -162,10 +162,13 @@ def _check_unique_names(photos: list[Photo], names: PairNames) -> None:
     counts = Counter(_photo_name(photo, names) for photo in photos)
     bad = [name for name, count in counts.items() if count > 1 or name.split() != [name]]
     if bad:
+        # A path contains the name, and with it the white space.
+        by_path = names == PairNames.FILENAME and all(name.split() == [name] for name in bad)
         raise InvalidRequest(
             "ambiguous_names",
-            f"{len(bad)} names are shared by several photos or contain white space, for example "
-            f"{bad[0]!r}. Identify photos by their path or ID instead: --names path, --names id.",
+            f"{len(bad)} names are shared by several photos or contain white space, which the "
+            f"format can't represent, for example {bad[0]!r}. Identify photos by "
+            + ("their path or ID: --names path or --names id." if by_path else "ID: --names id."),
         )
 
 
@@ -211,7 +214,7 @@ def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Pr
     bar = progress.add_task("querying", total=len(queries), visible=estimates)
     for photo in queries:
         try:
-            estimate = client.similar(photo).estimate
+            estimate = client.similar(photo, history=False).estimate
         except Conflict as error:
             if error.code != "not_searchable":
                 raise

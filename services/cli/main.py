@@ -18,39 +18,52 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-# Command -> (module below services.cli, attribute). The order is that of the help.
+# Panel of the help -> command -> (module below services.cli, attribute), in the order of the help.
+PANELS = {
+    "Photos and maps": {
+        "index": ("ingest.index", "index"),
+        "import-anyloc": ("ingest.import_anyloc", "import_anyloc"),
+        "query": ("query", "query"),
+        "track": ("track.command", "track"),
+        "locate": ("locate.command", "locate"),
+        "export": ("export", "app"),
+        "maps": ("maps", "app"),
+    },
+    "Descriptors and accuracy": {
+        "vocabulary": ("descriptors.vocabulary", "app"),
+        "pca": ("descriptors.pca", "app"),
+        "models": ("descriptors.models", "app"),
+        "describe": ("descriptors.describe", "describe"),
+        "evaluate": ("evaluation.commands", "evaluate"),
+        "compare": ("evaluation.commands", "compare"),
+        "train": ("training.commands", "train"),
+        "grid": ("training.commands", "grid"),
+        "datasets": ("datasets.commands", "app"),
+        "bench": ("bench", "app"),
+    },
+    "Services": {
+        "serve": ("operations.servers", "serve"),
+        "gateway": ("operations.servers", "gateway"),
+        "extractor": ("operations.servers", "extractor"),
+        "search": ("operations.servers", "search"),
+        "steward": ("operations.servers", "steward"),
+        "migrate": ("operations.servers", "migrate"),
+        "config": ("environment", "config"),
+        "doctor": ("operations.doctor", "doctor"),
+    },
+    "Operation": {
+        "keys": ("operations.keys", "app"),
+        "storage": ("operations.storage", "app"),
+        "verify": ("operations.storage", "verify"),
+        "backup": ("operations.backup", "backup"),
+        "restore": ("operations.backup", "restore"),
+        "rebuild-catalog": ("operations.backup", "rebuild_catalog"),
+    },
+}
 COMMANDS = {
-    "serve": ("operations.servers", "serve"),
-    "search": ("operations.servers", "search"),
-    "gateway": ("operations.servers", "gateway"),
-    "extractor": ("operations.servers", "extractor"),
-    "steward": ("operations.servers", "steward"),
-    "migrate": ("operations.servers", "migrate"),
-    "index": ("ingest.index", "index"),
-    "import-anyloc": ("ingest.import_anyloc", "import_anyloc"),
-    "query": ("query", "query"),
-    "track": ("track.command", "track"),
-    "locate": ("locate.command", "locate"),
-    "export": ("export", "app"),
-    "describe": ("descriptors.describe", "describe"),
-    "evaluate": ("evaluation.commands", "evaluate"),
-    "compare": ("evaluation.commands", "compare"),
-    "config": ("environment", "config"),
-    "doctor": ("operations.doctor", "doctor"),
-    "keys": ("operations.keys", "app"),
-    "maps": ("maps", "app"),
-    "vocabulary": ("descriptors.vocabulary", "app"),
-    "pca": ("descriptors.pca", "app"),
-    "models": ("descriptors.models", "app"),
-    "datasets": ("datasets.commands", "app"),
-    "train": ("training.commands", "train"),
-    "grid": ("training.commands", "grid"),
-    "storage": ("operations.storage", "app"),
-    "backup": ("operations.backup", "backup"),
-    "restore": ("operations.backup", "restore"),
-    "verify": ("operations.storage", "verify"),
-    "rebuild-catalog": ("operations.backup", "rebuild_catalog"),
-    "bench": ("bench", "app"),
+    name: (panel, module, attribute)
+    for panel, commands in PANELS.items()
+    for name, (module, attribute) in commands.items()
 }
 
 
@@ -58,7 +71,7 @@ class _PlacewiseGroup(TyperGroup):
     """Reports the error of a command in one line, as JSON with `--json`, and exits with code 1."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if "--help" in args[1:]:
+        if not args or "--help" in args:
             from services.cli.help_layout import prepare_help  # only the help needs it
 
             prepare_help(self)
@@ -79,12 +92,14 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     """Build the application with the named commands, importing only their modules."""
     app = _new_app()
     for name in names:
-        module, attribute = COMMANDS[name]
+        panel, module, attribute = COMMANDS[name]
         command = getattr(importlib.import_module(f"services.cli.{module}"), attribute)
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name)
+            app.add_typer(command, name=name, rich_help_panel=panel)
         else:
-            app.command(name, **getattr(command, "command_settings", {}))(command)
+            app.command(name, rich_help_panel=panel, **getattr(command, "command_settings", {}))(
+                command
+            )
     return app
 
 
@@ -94,15 +109,17 @@ def _build_overview() -> typer.Typer:
     The help texts are read from the source, because importing all commands takes over a second.
     """
     app = _new_app()
-    for name, (module, attribute) in COMMANDS.items():
+    for name, (panel, module, attribute) in COMMANDS.items():
         path = Path(__file__).parent / f"{module.replace('.', '/')}.py"
         for node in ast.parse(path.read_bytes()).body:
             if isinstance(node, ast.FunctionDef) and node.name == attribute:
-                app.command(name, help=ast.get_docstring(node))(_root_callback)
+                text = ast.get_docstring(node)
+                app.command(name, help=text, rich_help_panel=panel)(_root_callback)
             elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == attribute:
                 assert isinstance(node.value, ast.Call)  # app = typer.Typer(help=...)
                 options = {option.arg: option.value for option in node.value.keywords}
-                app.add_typer(typer.Typer(), name=name, help=ast.literal_eval(options["help"]))
+                text = ast.literal_eval(options["help"])
+                app.add_typer(typer.Typer(), name=name, help=text, rich_help_panel=panel)
     return app
 
 
@@ -129,11 +146,17 @@ def _new_app() -> typer.Typer:
         cls=_PlacewiseGroup,
         help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
+        context_settings={"token_normalize_func": _use_hyphens},
         pretty_exceptions_enable=False,
         add_completion=False,
     )
     app.callback()(_root_callback)
     return app
+
+
+def _use_hyphens(name: str) -> str:
+    """Accept underscores in the names of commands and options."""
+    return name.replace("_", "-")
 
 
 def _print_version(requested: bool) -> None:

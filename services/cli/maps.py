@@ -21,6 +21,7 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Conflict
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 
 app = typer.Typer(
     help="Manage maps: named photo databases, each with its own extractor and vocabulary."
@@ -33,25 +34,25 @@ MapName = Annotated[str, typer.Argument(metavar="NAME")]
 def list_maps(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
-    """List all maps with their photo counts and extractors."""
+    """List all maps with their photo counts and extractors; `--json` has all their settings."""
     with connect(server, None, key) as client:
         maps = client.maps()
     if as_json:
         print_json(maps)
         return
     counts = ("photos", "searchable", "queries")
-    table = Table("map", *counts, "extractor", "vocabulary", "dimension", "rows", "labels")
+    table = Table("map", *counts, "extractor", "vocabulary", "dimension")
     for map_ in maps:
         table.add_row(
             map_.name,
             str(map_.photos),
-            str(map_.searchable),
+            f"{map_.searchable} ({map_.failed_photos} failed)"
+            if map_.failed_photos
+            else str(map_.searchable),
             str(map_.labelled_queries),
             map_.extractor,
             map_.vocabulary or "",
             _format_dimension(map_),
-            map_.rows,
-            "paths" if map_.place_labels_are_paths else "names",
         )
     print_table(table)
 
@@ -71,12 +72,13 @@ def create(
     ] = None,
     preprocessing: PreprocessingOption = None,
     place_labels_are_paths: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--place-labels-are-paths",
-            help="`/` separates the levels of place labels, as in `tower/floor 7/elevator`.",
+            "--place-labels-are-paths/--place-labels-are-names",
+            help="`/` separates the levels of place labels, as in `tower/floor 7/elevator`, or "
+            "not. Default: evaluations decide that by the labels.",
         ),
-    ] = False,
+    ] = None,
     rows: Annotated[
         str | None,
         typer.Option(
@@ -96,6 +98,35 @@ def create(
             name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
         )
     print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
+
+
+@app.command("update")
+def update(
+    name: MapName,
+    auto_fit: Annotated[
+        bool,
+        typer.Option(
+            "--auto-fit/--no-auto-fit",
+            help=f"Fit a vocabulary at {MIN_PHOTOS_TO_FIT} photos, and whenever the map has "
+            "doubled since the last fit.",
+        ),
+    ],
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Change whether vocabularies are fitted automatically for a map."""
+    with connect(server, None, key) as client:
+        updated = client.update_map(name, auto_fit=auto_fit)
+    print_result(updated, as_json, f"Map {name}: {_describe_auto_fit(updated)}.")
+
+
+def _describe_auto_fit(map_: Map) -> str:
+    if map_.next_fit_photos is not None:
+        return f"the next vocabulary is fitted at {map_.next_fit_photos} photos"
+    if map_.auto_fit:
+        return "its extractor uses no vocabulary, or its descriptors are reduced by PCA"
+    return "no vocabulary is fitted automatically"
 
 
 @app.command("switch")

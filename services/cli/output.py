@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shlex
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -31,14 +31,37 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.segment import Segment
 from rich.style import StyleType
 from rich.text import Text
 
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
+_REPLACED = dict.fromkeys((*range(0x20), *range(0x7F, 0xA0)), "\N{REPLACEMENT CHARACTER}")
+_REPLACED_IN_LINES = {code: text for code, text in _REPLACED.items() if chr(code) not in "\n\t"}
+
+
+def printable_text(text: str) -> str:
+    """Return a name on one line: control characters, such as escape sequences, are replaced."""
+    return text.translate(_REPLACED)
+
+
+class _PrintableConsole(Console):
+    """A console that replaces control characters in what it prints, but its own.
+
+    Names of files and answers of servers may contain escape sequences, which a terminal obeys.
+    """
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else text.translate(_REPLACED_IN_LINES), style, control)
+
+
 # Progress and messages go to stderr, so that the answer on stdout can be piped.
-err_console = Console(stderr=True, highlight=False)
-console = Console(highlight=False)
+err_console = _PrintableConsole(stderr=True, highlight=False)
+console = _PrintableConsole(highlight=False)
 
 Json = dict[str, Any]
 
@@ -77,9 +100,14 @@ KeyOption = Annotated[
 ]
 
 
-def printable_path(path: Path) -> str:
-    """Return the path as printable text; bytes that are not UTF-8 are replaced."""
+def utf8_path(path: Path) -> str:
+    """Return the path as it is stored and sent; bytes that are not UTF-8 are replaced."""
     return os.fsencode(path).decode("utf-8", "replace")
+
+
+def printable_path(path: Path) -> str:
+    """Return the path as printable text on one line."""
+    return printable_text(utf8_path(path))
 
 
 def format_percent(share: float | None) -> str:
@@ -89,18 +117,13 @@ def format_percent(share: float | None) -> str:
 
 def print_json(value: Any) -> None:
     """Print a value as JSON; answers of the server as the server sent them."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json")))
+    text = json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json"))
+    typer.echo(re.sub("[\x7f-\x9f]", lambda control: f"\\u{ord(control[0]):04x}", text))
 
 
 def print_message(message: str) -> None:
     """Print a part of the answer to stdout, as it is: the terminal wraps it."""
     console.print(message, soft_wrap=True, markup=False)
-
-
-def program() -> str:
-    """Return how to run this program from any shell: with the PLACEWISE_HOME of this one."""
-    home = os.environ.get("PLACEWISE_HOME")
-    return f"PLACEWISE_HOME={shlex.quote(home)} {sys.argv[0]}" if home else sys.argv[0]
 
 
 def print_note(message: str) -> None:
@@ -201,6 +224,7 @@ def _fit_columns(table: Table, width: int) -> None:
 
 def _shorten_name(cell: RenderableType | None) -> RenderableType | None:
     if isinstance(cell, str):
+        cell = cell.translate(_REPLACED_IN_LINES)  # before its width is measured
         text = Text.from_markup(cell)
         if text.cell_len > MIN_NAME_WIDTH and not any(map(str.isspace, text.plain)):
             return _Name(text)
@@ -209,9 +233,9 @@ def _shorten_name(cell: RenderableType | None) -> RenderableType | None:
 
 def _plain_text(cell: RenderableType) -> str:
     if isinstance(cell, _Name):
-        return cell.text.plain
+        return printable_text(cell.text.plain)
     text = Text.from_markup(cell) if isinstance(cell, str) else cell
-    return " ".join(text.plain.split()) if isinstance(text, Text) else ""
+    return printable_text(" ".join(text.plain.split())) if isinstance(text, Text) else ""
 
 
 def report_error(error: Exception, as_json: bool) -> bool:
@@ -268,7 +292,8 @@ def print_failures(report: dict[str, Any], *outcomes: str) -> None:
         for item in report[outcome]:
             name = f" ({item['filename']})" if "filename" in item else ""
             err_console.print(
-                f"[red]{outcome}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
+                f"[red]{outcome}[/red] {escape(printable_text(item['path'] + name))}: "
+                f"{escape(item['reason'])}",
                 soft_wrap=True,
             )
 

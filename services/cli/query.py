@@ -168,31 +168,25 @@ def _format_explanation(explanation: Explanation | None) -> str:
 
 
 def _summarize_levels(estimate: Estimate) -> str:
-    """Why the estimate answers at its level, or does not answer, in one sentence."""
+    """How sure the answer is, or why there is none, in one sentence."""
     certainty = estimate.certainty or 0
-    required = f"{100 * certainty:g} %"
     # An answer that is finer than the coarsest level also requires odds against "not in this map".
     is_unsure = any(
         level.probability >= certainty for level in estimate.levels[: estimate.answer_level]
     )
-    if estimate.answer_level is not None:
-        level = estimate.levels[estimate.answer_level]
-        stricter = " Finer levels require stronger evidence that the place is in the map."
-        return (
-            f"At a certainty of {required}, the finest answer is {_format_level(level)}, "
-            f"with a probability of {format_percent(level.probability)}."
-            f"{stricter if is_unsure else ''}"
-        )
     outside = estimate.not_in_map_probability or 0
-    if outside > 0.5:
-        return f"The map probably has no photo of this place ({format_percent(outside)})."
-    level = estimate.levels[-1]
-    stricter = ", but it requires stronger evidence that the place is in the map"
-    return (
-        f"No level is certain enough at a certainty of {required}; the most probable is "
-        f"{_format_level(level)}, with {format_percent(level.probability)}"
-        f"{stricter if is_unsure else ''}."
-    )
+    if estimate.answer_level is None and outside > 0.5:
+        return f"{format_percent(outside)} sure that the map has no photo of this place."
+    if estimate.answer_level is None and not estimate.has_place:
+        return estimate.reason
+    level = estimate.levels[-1 if estimate.answer_level is None else estimate.answer_level]
+    sure = f"{format_percent(level.probability)} sure it is {_format_level(level)}"
+    if estimate.answer_level is not None:
+        clearer = " A finer answer needs clearer signs that the place is in the map."
+        return f"{sure}.{clearer if is_unsure else ''}"
+    if is_unsure:
+        return f"{sure}, but it is not clear whether the place is in the map."
+    return f"{sure}: an answer needs {100 * certainty:g} %."
 
 
 def _levels_table(estimate: Estimate) -> Table:
@@ -230,7 +224,7 @@ def _probability_bar(probability: float) -> ProgressBar:
 
 def _format_level(level: EstimateLevel) -> str:
     if level.place is not None:
-        return level.place
+        return f"in {level.place}"
     position = f"{_format_degrees(level.latitude)}, {_format_degrees(level.longitude)}"
     return f"within {_format_m(level.radius_m or 0)} of {position}"
 
@@ -245,19 +239,11 @@ def _format_estimate(estimate: Estimate) -> str:
         return estimate.reason
     parts = [estimate.place] if estimate.place else []
     if estimate.latitude is not None:
-        parts.append(
-            f"{estimate.latitude:.6f}, {estimate.longitude:.6f} "
-            f"(positive-match radius {estimate.radius_m:g} m)"
-        )
+        parts.append(f"{estimate.latitude:.6f}, {estimate.longitude:.6f}")
     if not parts:
-        return f"No place estimate: {estimate.reason}"
-    confidence = (
-        f"confidence {estimate.confidence:.0%}"
-        if estimate.confidence is not None
-        else "confidence uncalibrated"
-    )
-    in_map_note = "" if estimate.in_map else "; can't tell yet whether the place is in the map"
-    return f"Estimate: {'; '.join(parts)}, {confidence}{in_map_note}"
+        return f"No estimate. {estimate.reason}"
+    confidence = "" if estimate.confidence is None else f", confidence {estimate.confidence:.0%}"
+    return f"Best guess: {'; '.join(parts)}{confidence}. {estimate.reason}"
 
 
 def _format_degrees(value: float | None) -> str:

@@ -90,11 +90,6 @@ class ExtractorSettings(BaseSettings):
         description="size of the descriptor cache of `evaluate` and `compare`, in "
         "PLACEWISE_HOME/descriptors",
     )
-    auto_fit_photos: int = Field(
-        200,
-        ge=1,
-        description="photos at which a vocabulary is fitted automatically for a map without one",
-    )
     pool_without_vocabulary: bool = Field(
         True,
         description="describe the photos of a map whose extractor is shipped without a vocabulary "
@@ -169,6 +164,10 @@ class ExtractorSettings(BaseSettings):
             vlad_clusters=self.vlad_clusters,
             vlad_desc_dim=self.vlad_desc_dim,
         )
+
+    def stored_bytes(self, dimension: int) -> int:
+        """Return the size in bytes of one stored descriptor of a new map."""
+        return dimension * {"float32": 4, "float16": 2}[self.descriptor_rows]
 
     def extractor_config(self, name: str) -> ExtractorConfig:
         """Return the configuration of an extractor that this installation may load.

@@ -176,8 +176,8 @@ class GatewaySettings(BaseSettings):
     min_free_bytes: Size = Field(
         500_000_000,
         ge=0,
-        description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads are "
-        "rejected and batches wait; query photos are rejected below a tenth of it",
+        description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads and "
+        "tracks are rejected and batches wait; query photos are rejected below a tenth of it",
     )
     idempotency_key_seconds: float = Field(
         86_400.0, gt=0, description="time for which an Idempotency-Key is remembered, seconds"

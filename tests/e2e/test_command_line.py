@@ -25,7 +25,7 @@ from tests.support.server import ServerProcess, environment, run_command
 
 PHOTOS = 50  # from as many on, `index` fits a vocabulary
 WIDTH = 16  # of the tiny extractor's local features
-SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+SETTINGS = {"extractor": "test-tiny-vlad"}
 
 # Turin's Mole in UTM: 396878 m east, 4991561 m north in zone 32T is 45.07 N, 7.69 E.
 UTM_SHORT = "@0396877.76@4991561.25@.jpg"
@@ -138,7 +138,14 @@ def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> 
     cut_off.write_bytes(truncated(99))
 
     command = CommandLine(folder.parent, server.home)
-    without_fit = command("index", folder, "--no-fit", "--json")
+    assert command("maps", "create", "waiting").code == 0
+    without_fit = command("index", folder, "--map", "waiting", "--no-fit", "--json")
+    listed = command("maps", "list", "--json").json()
+    assert {map_["name"]: map_["auto_fit"] for map_ in listed} == {
+        "default": True,
+        "waiting": False,
+    }
+    assert command("maps", "delete", "waiting", "--yes").code == 0
     with_fit = command("index", folder, "--json")
     broken.unlink()
     cut_off.unlink()
@@ -305,7 +312,9 @@ def test_the_printed_command_reaches_this_server_from_another_folder(
     server: ServerProcess, tmp_path: Path
 ) -> None:
     [line] = re.findall(r"(PLACEWISE_HOME=.+) query PHOTO", server.log_path.read_text())
-    home = shlex.split(line)[0].removeprefix("PLACEWISE_HOME=")
+    variable, program = shlex.split(line)
+    home = variable.removeprefix("PLACEWISE_HOME=")
+    assert Path(program).is_absolute()
     (tmp_path / "where.jpg").write_bytes(photo_bytes(2))
     shown = CommandLine(tmp_path, Path(home))("query", tmp_path / "where.jpg", "--map", "default")
     assert "No server runs" not in shown.stderr
@@ -347,7 +356,7 @@ def test_vocabularies_are_fitted_imported_and_listed(
     torch.save(torch.from_numpy(centres[:6]).clone(), tmp_path / "c_centers.pt")
     shown = placewise("vocabulary", "import", tmp_path / "c_centers.pt")
     assert shown.code == 0, shown.stderr
-    assert "6 clusters, 0 failed" in shown.stdout
+    assert "6 clusters, 1 failed" in shown.stdout, "cut-off.jpg is tried again"
 
     listed = placewise("vocabulary", "list", "--json").json()
     assert [(v["origin"], v["clusters"], v["active"]) for v in listed[:3]] == [
@@ -456,14 +465,16 @@ def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("indexed")
+@pytest.mark.usefixtures("indexed")
 def test_doctor_finds_the_running_server(server: ServerProcess, placewise: CommandLine) -> None:
-    findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
+    findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json(code=1)}
     assert set(findings) == {
         *("python", "settings", "folder", "permissions", "uploads", "collection"),
-        *("server", "vocabulary", "journal"),
+        *("server", "vocabulary", "journal", "photos"),
         *("device", "memory", "extractor"),
     }
-    assert all(finding["ok"] for finding in findings.values())
+    assert [part for part, finding in findings.items() if not finding["ok"]] == ["photos"]
+    assert "1 in the map default" in findings["photos"]["detail"], "cut-off.jpg"
     assert str(server.client.base_url).rstrip("/") in findings["server"]["detail"]
     assert "test-tiny-avg" in findings["extractor"]["detail"]
 

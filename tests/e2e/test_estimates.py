@@ -23,6 +23,7 @@ ESTIMATE_FIELDS = {
     "longitude",
     "radius_m",
     "place",
+    "has_place",
     "confidence",
     "calibration",
     "reason",
@@ -94,7 +95,8 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
 ) -> None:
     before = ask(server, "streets", re_encoded(streets[3]))["estimate"]
     assert before["in_map"] is None
-    assert "POST /api/v1/evaluations" in before["reason"]
+    assert "is not measured yet" in before["reason"]
+    assert got(server.client.get("/api/v1/maps/streets"))["measurement"] == "not_measured"
     assert (before["confidence"], before["calibration"]) == (None, "uncalibrated")
     assert (before["latitude"], before["longitude"]) == (pytest.approx(3), pytest.approx(7))
 
@@ -128,10 +130,41 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
     for estimate in refused:
         assert (estimate["latitude"], estimate["place"], estimate["radius_m"]) == (None,) * 3
         assert estimate["reason"].startswith("Probably not in this map")
+    assert got(server.client.get("/api/v1/maps/streets"))["measurement"] == "measured"
+    ask(server, "streets", re_encoded(streets[3]), history=False)
     history = got(server.client.get("/api/v1/searches", params={"map": "streets"}))["searches"]
-    assert [search["in_map"] for search in history][::-1] == [
-        estimate["in_map"] for estimate in [before, *copies, *strangers]
+    assert [(search["in_map"], search["has_place"]) for search in history][::-1] == [
+        (estimate["in_map"], estimate["has_place"]) for estimate in [before, *copies, *strangers]
     ]
+
+
+def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
+    server: ServerProcess,
+) -> None:
+    """Before each photo with coordinates lie three of the same view without any."""
+    numbers = [next(fresh) for _ in range(ENOUGH)]
+    fill(server, "mixed", numbers, *({"latitude": n, "longitude": 7} for n in range(ENOUGH)))
+    for number in numbers:
+        for quality in (51, 52, 53):
+            files = {"file": ("copy.jpg", photo_bytes(number, quality=quality))}
+            got(server.client.post("/api/v1/upload", params={"map": "mixed"}, files=files), 202)
+    while got(server.client.get("/api/v1/maps/mixed"))["searchable"] < 4 * ENOUGH:
+        time.sleep(0.02)
+    assert got(server.client.get("/api/v1/maps/mixed"))["located"] == ENOUGH
+    evaluate(server, "mixed")
+
+    answers = [ask(server, "mixed", re_encoded(number), top_k=4) for number in numbers]
+    accepted = [(n, answer) for n, answer in enumerate(answers) if answer["estimate"]["in_map"]]
+    assert accepted
+    for n, answer in accepted:
+        assert answer["similar_images"][0]["latitude"] is None
+        assert answer["matches_without_place"] == 3
+        assert answer["estimate"]["latitude"] == pytest.approx(n, abs=1e-6)
+        assert [m["match_probability"] is None for m in answer["similar_images"]] == [
+            m["latitude"] is None for m in answer["similar_images"]
+        ]
+    strangers = [ask(server, "mixed", photo_bytes(next(fresh)))["estimate"] for _ in range(20)]
+    assert sum(estimate["in_map"] is False for estimate in strangers) >= 14
 
 
 def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(
@@ -157,13 +190,14 @@ def test_rooms_have_a_label_and_no_coordinates(server: ServerProcess) -> None:
 
 def test_photos_of_nowhere_give_a_reason_instead_of_a_place(server: ServerProcess) -> None:
     numbers = [next(fresh) for _ in range(2)]
-    fill(server, "nowhere", numbers, {}, {"latitude": 1, "longitude": 2})
-    estimate = ask(server, "nowhere", re_encoded(numbers[0]))["estimate"]
+    fill(server, "nowhere", numbers, {}, {})
+    answer = ask(server, "nowhere", re_encoded(numbers[0]))
+    estimate = answer["estimate"]
     assert (estimate["in_map"], estimate["latitude"], estimate["place"]) == (None, None, None)
-    assert "neither coordinates nor a place" in estimate["reason"]
-    assert ask(server, "nowhere", re_encoded(numbers[1]))["estimate"]["latitude"] == pytest.approx(
-        1
-    )
+    assert estimate["reason"].startswith("None of the photos that were found has coordinates")
+    assert answer["matches_without_place"] == 2
+    described = got(server.client.get("/api/v1/maps/nowhere"))
+    assert (described["located"], described["measurement"]) == (0, "too_few_photos")
 
 
 def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProcess) -> None:
@@ -183,7 +217,7 @@ def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProces
         assert answer["total_similar"] == rank
     none = ask(server, "many", photo_bytes(next(fresh)), min_score=1)
     assert none["similar_images"] == []
-    assert "neither" in none["estimate"]["reason"], "it looks below the least score"
+    assert "None of the photos" in none["estimate"]["reason"], "it looks below the least score"
 
 
 def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:

@@ -16,6 +16,8 @@ from tests.e2e.hostile_files import (
     HostileFile,
     corpus,
 )
+from tests.support.archives import zip_of
+from tests.support.hostile_headers import MANY_PARTS, heic_of_endless_extents
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 
@@ -105,3 +107,35 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
     body = server.ask(photo_bytes(901)).json()
     assert body["similar_images"][0]["image_id"] == good
     assert "Traceback" not in server.log_path.read_text(errors="replace")
+
+
+def test_headers_of_too_many_parts_hold_up_no_call_no_batch_and_no_end(
+    server: ServerProcess,
+) -> None:
+    files = {kind: make(400_000) for kind, make in MANY_PARTS.items()}
+    files["HEIC: 780 bytes"] = heic_of_endless_extents(780)
+    octets = {"Content-Type": "application/octet-stream"}
+    for kind, data in files.items():
+        answers = [
+            server.client.post("/api/v1/photo-headers", content=data, headers=octets),
+            server.client.post("/api/v1/upload", files={"file": (kind, data)}),
+            server.client.post("/api/v1/similarity", files={"file": (kind, data)}),
+        ]
+        assert [answer.json()["code"] for answer in answers] == ["undecodable_photo"] * 3, kind
+
+    members = {f"{number}.jpg": data for number, data in enumerate(files.values())}
+    archive = zip_of({**members, "good.jpg": photo_bytes(902)})
+    with server.no_decoding():  # so that the good photo keeps the batch under way
+        answer = server.client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})
+        job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
+        deadline = time.monotonic() + SECONDS
+        while server.client.get(job_url).json()["progress"]["failed"] < len(files):
+            assert time.monotonic() < deadline, server.log()
+            time.sleep(0.1)
+        assert server.client.post(f"{job_url}/cancel").json()["state"] == "cancelled"
+    assert server.stop() == 0
+    server.start()
+    assert server.client.get(job_url).json()["state"] == "cancelled"
+    items = server.client.get(f"{job_url}/items").json()["items"]
+    states = {item["name"]: item["state"] for item in items}
+    assert states == {**dict.fromkeys(members, "failed"), "good.jpg": "cancelled"}

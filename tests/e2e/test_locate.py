@@ -60,7 +60,7 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     answer = json.loads(run.stdout)
     assert (answer["photos"], answer["with_coordinates"]) == (5, 1)
     proposals = {each["filename"]: each for each in answer["proposals"]}
-    assert "damaged" in proposals["broken.jpg"]["error"]
+    assert "its header is cut off" in proposals["broken.jpg"]["error"]
     assert proposals["broken.jpg"]["position"] is None
     assert proposals["empty.jpg"]["error"] == "The file is empty."
     by_both = proposals["of the map.jpg"]

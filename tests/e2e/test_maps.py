@@ -17,7 +17,7 @@ from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess, environment, run_command
 
-SETTINGS = {"auto_evaluate_photos": 0, "auto_fit_photos": 10_000}
+SETTINGS = {"auto_evaluate_photos": 0}
 MAPS = "/api/v1/maps"
 fresh = itertools.count(7000)
 names = (f"town-{number}" for number in itertools.count())

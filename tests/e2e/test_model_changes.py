@@ -19,8 +19,8 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 
-# An extractor without a vocabulary of its own, in a map that never fits one by itself.
-SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+# An extractor without a vocabulary of its own, in a map with too few photos to fit one by itself.
+SETTINGS = {"extractor": "test-tiny-vlad"}
 PHOTOS = 12
 WIDTH = 16  # of the tiny extractor's local features
 VOCABULARIES = "/api/v1/vocabularies"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -64,15 +65,21 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@dataclass(frozen=True, slots=True)
+class RunningShell:
+    process: subprocess.Popen[bytes]
+    port: int
+
+
 @pytest.fixture(scope="module")
-def port(place: Path) -> Iterator[int]:
-    """`make run`, from the repository, on a free port."""
+def shell(place: Path) -> Iterator[RunningShell]:
+    """A shell with `make run`, from the repository, on a free port."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         free: int = probe.getsockname()[1]
     environment = _environment(place)
     with (place / "run.log").open("wb") as log:
         process = subprocess.Popen(
-            ["make", "run", f"PORT={free}"],
+            ["bash", "-c", f"make run PORT={free}; exit"],
             cwd=REPOSITORY,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -85,15 +92,19 @@ def port(place: Path) -> Iterator[int]:
         while True:
             assert process.poll() is None, (place / "run.log").read_text()
             assert time.monotonic() < deadline, (place / "run.log").read_text()
-            try:
-                if httpx2.get(f"http://127.0.0.1:{free}/livez").is_success:
-                    break
-            except httpx2.TransportError:
-                time.sleep(0.1)
-        yield free
+            if _answers(free):
+                break
+            time.sleep(0.1)
+        yield RunningShell(process, free)
     finally:
-        os.killpg(process.pid, signal.SIGTERM)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
         process.wait(timeout=60)
+
+
+@pytest.fixture
+def port(shell: RunningShell) -> int:
+    return shell.port
 
 
 def _run(text: str, place: Path) -> subprocess.CompletedProcess[str]:
@@ -141,6 +152,29 @@ def test_the_readmes_python_prints_an_estimate(place: Path, port: int) -> None:
     assert "latitude=" in done.stdout
 
 
+def test_make_run_shows_the_address_last_and_ends_its_server_with_its_shell(
+    place: Path, shell: RunningShell
+) -> None:
+    """The last test with this server, which it ends."""
+    [shown] = re.findall(
+        r"^Placewise serves .+\n(?:  .+\n)+", (place / "run.log").read_text(), re.M
+    )
+    assert shown.endswith(f" http://127.0.0.1:{shell.port}\n")
+    shell.process.kill()
+    shell.process.wait(timeout=60)
+    deadline = time.monotonic() + 120
+    while _answers(shell.port):
+        assert time.monotonic() < deadline, (place / "run.log").read_text()
+        time.sleep(0.1)
+
+
+def _answers(port: int) -> bool:
+    try:
+        return httpx2.get(f"http://127.0.0.1:{port}/livez").is_success
+    except httpx2.TransportError:
+        return False
+
+
 @pytest.mark.parametrize(
     "target",
     [
@@ -148,6 +182,7 @@ def test_the_readmes_python_prints_an_estimate(place: Path, port: int) -> None:
         "setup",
         "run",
         "test",
+        "test-numerics",
         "test-deploy",
         "lint",
         "types",

@@ -20,6 +20,7 @@ from tests.support.server import SERVICES_KEY, environment, run_command
 from tests.support.servers import PostgresServer, RedisServer, S3Server, start_redis
 
 SECONDS = 90.0
+CRASHING = Path(__file__).with_name("crashing_placewise.py")
 
 
 class Deployment:
@@ -42,11 +43,13 @@ class Deployment:
         migrated = run_command("migrate", env=env, cwd=self.root)
         assert migrated.returncode == 0, migrated.stderr
 
-    def start(self, service: str, **settings: Any) -> Process:
+    def start(self, service: str, crashing: str | None = None, **settings: Any) -> Process:
+        """Start the service; SIGRTMIN crashes its thread `crashing`."""
         log = self.root / f"{service}-{len(self._processes)}.log"
+        program = [PLACEWISE] if crashing is None else [CRASHING, crashing]
         with log.open("wb") as out:
             env = environment(self.home, **{**self.settings, **settings})
-            process = start([PLACEWISE, service], env=env, cwd=self.root, stdout=out, stderr=out)
+            process = start([*program, service], env=env, cwd=self.root, stdout=out, stderr=out)
         self._processes.append(process)
         return process
 
@@ -57,10 +60,14 @@ class Deployment:
 
     def address(self, service: str, number: int) -> str:
         """Where the process started as the `number`th says that it serves."""
+        return self.announced(service, number, r"(?:serves|on) (http://127\.0\.0\.1:\d+)")
+
+    def announced(self, service: str, number: int, pattern: str) -> str:
+        """The group of `pattern` in what that process says once it is ready."""
         log = self.root / f"{service}-{number}.log"
         deadline = time.monotonic() + SECONDS
         while time.monotonic() < deadline:
-            found = re.search(r"(?:serves|on) (http://127\.0\.0\.1:\d+)", log.read_text())
+            found = re.search(pattern, log.read_text())
             if found:
                 return found[1]
             assert self._processes[number].poll() is None, log.read_text()
@@ -215,6 +222,39 @@ def test_an_extractor_that_has_never_seen_a_model_fetches_it(
         assert fetched.stat().st_size == model["size_bytes"]
     assert list((tmp_path / "first" / "model-cache").iterdir()) == [], "it only looked at a file"
     assert "Traceback" not in deployment.logs()
+
+
+@pytest.mark.parametrize(
+    ("service", "threads"),
+    [
+        ("gateway", ["heartbeat", "wakeups", "search-workers"]),
+        ("search", ["search sync", "search sync of building generations", "search heartbeat"]),
+        ("extractor", ["heartbeat", "wakeups"]),
+        (
+            "steward",
+            ["wakeups", "steward", "collect orphans", "evaluator", "batches", "webhooks"],
+        ),
+        ("serve", ["search", "extractor", "steward", "collect orphans"]),
+    ],
+)
+def test_a_thread_that_crashes_ends_its_process(
+    service: str, threads: list[str], deployment: Deployment
+) -> None:
+    deployment.settings |= {"search_urls": "http://127.0.0.1:9", "search_shard": "0/1"}
+    if service == "serve":
+        deployment.settings |= {"search_urls": "", "database_url": ""}
+    processes = [
+        deployment.start(service, crashing=name, placewise_home=deployment.root / name)
+        for name in threads
+    ]
+    for number, process in enumerate(processes):
+        deployment.announced(service, number, r"Placewise (.*(serves|is running))")
+        process.send_signal(signal.SIGRTMIN)
+    for number, (name, process) in enumerate(zip(threads, processes, strict=True)):
+        log = deployment.root / f"{service}-{number}.log"
+        assert process.wait(timeout=SECONDS) == 1, f"{name}: {log.read_text()[-3000:]}"
+        assert f"RuntimeError: {name} was asked to crash" in log.read_text()
+        assert log.read_text().splitlines()[-1].startswith("thread_crashed: ")
 
 
 @pytest.mark.parametrize(

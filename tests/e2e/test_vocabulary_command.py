@@ -15,7 +15,7 @@ from shared.descriptors.vocabulary_file import VocabularyFile, read_vocabulary
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 
-SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+SETTINGS = {"extractor": "test-tiny-vlad"}
 WIDTH = 16  # of the tiny extractor's local features
 PHOTOS = 9
 

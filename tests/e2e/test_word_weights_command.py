@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import subprocess
-import time
 from pathlib import Path
 
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 
-SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 6, "auto_evaluate_photos": 0}
+SETTINGS = {"extractor": "test-tiny-vlad", "auto_evaluate_photos": 0}
 
 
 def command(server: ServerProcess, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -27,8 +26,8 @@ def test_a_small_map_gets_no_weights_and_the_reason_in_numbers(
     assert early.stderr.strip().startswith("nothing_to_evaluate: ")
     for number in range(6):
         assert server.upload(photo_bytes(number), latitude=number, longitude=7).status_code == 202
-    while server.client.get("/api/v1/maps/default").json()["searchable"] < 6:
-        time.sleep(0.05)
+    fit = server.client.post("/api/v1/vocabularies", json={}).json()
+    assert server.finished(fit["job_id"])["state"] == "succeeded"
 
     shown = command(server, "evaluate", "--word-weights")
     assert shown.returncode == 0, shown.stderr

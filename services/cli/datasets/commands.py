@@ -1,6 +1,7 @@
 """`placewise datasets`: check data sets, compute ground truth and audit labels.
 
-`check` reports what a folder contains and what is wrong with it. `ground-truth` computes the
+`check` reports what a folder contains and what is wrong with it. `list` prints the photos of an
+evaluation set in order. `ground-truth` computes the
 positives of queries from positions. `audit` lists confident matches that the ground truth calls
 wrong although they may be right. `synth` is in its own module.
 """
@@ -51,15 +52,17 @@ from shared.datasets.open_dataset import open_evaluation_set
 from shared.datasets.photo_lists import read_photo_list
 from shared.errors import InvalidRequest
 
+ProtocolOption = Annotated[
+    str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
+]
+
 
 def check(
     folder: Annotated[Path, typer.Argument(help="A data set, or a folder of data sets.")],
     decode: Annotated[
         bool, typer.Option("--decode", help="Decode every photo completely.")
     ] = False,
-    protocol: Annotated[
-        str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
-    ] = None,
+    protocol: ProtocolOption = None,
     rule: Annotated[
         str | None,
         typer.Option(
@@ -193,6 +196,31 @@ PhotoListOption = Annotated[
 ]
 
 
+def list_photos(
+    folder: Annotated[Path, typer.Argument(help="Folder of the data set.")],
+    set_name: Annotated[
+        str | None, typer.Option("--set", help="Set of the folder. Required if there are several.")
+    ] = None,
+    protocol: ProtocolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the photos of an evaluation set in order: the database, then the queries.
+
+    `row` is the photo's row in the files of `placewise evaluate --rows` and its index in
+    predictions.
+    """
+    evaluation_set = open_evaluation_set(folder, set_name, protocol=protocol)
+    roles = {"database": evaluation_set.database, "query": evaluation_set.queries}
+    if as_json:
+        print_json({role: [str(photo.path) for photo in photos] for role, photos in roles.items()})
+        return
+    table = Table("role", Column("row", justify="right"), "file")
+    for role, photos in roles.items():
+        for row, photo in enumerate(photos):
+            table.add_row(role, str(row), escape(str(photo.path)))
+    print_table(table)
+
+
 def ground_truth(
     database: PhotoListOption,
     queries: PhotoListOption,
@@ -284,7 +312,7 @@ def audit(
         str | None,
         typer.Option("--set", help="Set of the data set. Required if there are several."),
     ] = None,
-    protocol: Annotated[str | None, typer.Option(help="Evaluation protocol.")] = None,
+    protocol: ProtocolOption = None,
     rule: Annotated[str | None, typer.Option(help="Positive-match criterion.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -358,6 +386,7 @@ def _load_array(path: Path, kinds: str) -> NDArray[Any]:
 
 app = typer.Typer(help="Check, complete and generate data sets.", no_args_is_help=True)
 app.command("check")(check)
+app.command("list")(list_photos)
 app.command("ground-truth")(ground_truth)
 app.command("audit")(audit)
 app.command("synth")(synth)

@@ -45,6 +45,15 @@ def describe(
         ),
     ] = None,
     backbone: BackboneOption = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            "--checkpoint",
+            exists=True,
+            dir_okay=False,
+            help="Checkpoint of `placewise train`, instead of --extractor.",
+        ),
+    ] = None,
     weights: Annotated[
         Path | None,
         typer.Option("--weights", help="DINOv2 weights: .pth, .pt or .safetensors."),
@@ -93,6 +102,12 @@ def describe(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     names = _hdf5_names(photos, out, root)
     settings = read_settings()
+    if checkpoint is not None:
+        if extractor is not None:
+            raise InvalidRequest(
+                "options_contradict", "--checkpoint and --extractor exclude each other."
+            )
+        extractor = f"gsv:{checkpoint.absolute()}"
     name = extractor_name(
         extractor or (settings.new_map_extractor if backbone is None else None),
         backbone,

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.cli.output import atomic_write, printable_path
+from placewise.protocol import open_file
+from services.cli.output import atomic_write, printable_path, utf8_path
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.decoder_pool import DecoderPool
 from shared.catalog.database.errors import explain_outage
@@ -29,7 +30,7 @@ from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, not_finite_error
-from shared.descriptors.inference import PhotoTooLargeForGpu, choose_precision
+from shared.descriptors.inference import PhotoTooLargeForGpu, choose_precision, inference_clock
 from shared.descriptors.pca_whitening import PcaProjection, Rows, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vocabulary_file import (
@@ -177,17 +178,18 @@ def describe_photos(
     Yields:
         (b, D) float32 rows in the order of the photos.
     """
+    clock = inference_clock(extractor.backbone.device)
     for batch in _decode_batches(photos, extractor.preprocessing, settings, seconds):
         pixels = _split_outcomes(batch, refused)
         if refused or not pixels:
             continue
-        started = time.perf_counter()
+        started = clock()
         try:
             rows = extractor.describe(pixels, centres, projection)
         except PhotoTooLargeForGpu as error:
             refused.append((batch[error.place][0], error))
             continue
-        seconds["describe"] += time.perf_counter() - started
+        seconds["describe"] += clock() - started
         for (photo, _), row in zip(batch, rows, strict=True):
             if not np.isfinite(row).all():
                 refused.append((photo, not_finite_error()))
@@ -197,9 +199,10 @@ def describe_photos(
 
 def _read_photo(photo: Path) -> bytes | PlacewiseError:
     try:
-        return photo.read_bytes()
-    except OSError as error:
-        return InvalidRequest("photo_unreadable", f"Can't read the file: {error.strerror}.")
+        with open_file(photo) as file:
+            return file.read()
+    except InvalidRequest as error:
+        return InvalidRequest("photo_unreadable", error.detail)
 
 
 HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
@@ -358,7 +361,7 @@ def _refused_photos_error(refused: list[tuple[Path, PlacewiseError]], photos: in
         "photos_refused",
         f"{len(refused)} of {photos} photos can't be described. No file was written.\n{listing}",
         refused=[
-            {"photo": printable_path(photo), "code": error.code, "detail": error.detail}
+            {"photo": utf8_path(photo), "code": error.code, "detail": error.detail}
             for photo, error in refused
         ],
     )

@@ -21,7 +21,13 @@ from services.cli.descriptors.local_extractor import (
 )
 from services.cli.environment import read_settings
 from services.cli.ingest.geotags import list_photos
-from services.cli.output import atomic_write, check_output_path, printable_path, stage_bars
+from services.cli.output import (
+    atomic_write,
+    check_output_path,
+    printable_path,
+    stage_bars,
+    utf8_path,
+)
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.patches import fit_vocabulary, sample_photos
@@ -191,7 +197,7 @@ def _load_extractor(
 
 
 def _refusals(refused: list[tuple[Path, PlacewiseError]]) -> list[dict[str, str]]:
-    return [{"path": printable_path(path), "reason": error.detail} for path, error in refused]
+    return [{"path": utf8_path(path), "reason": error.detail} for path, error in refused]
 
 
 def _open_row_file(file: Path) -> Rows:

@@ -8,11 +8,9 @@ from typing import Annotated
 from uuid import UUID
 
 import typer
-from rich.progress import Progress
 from rich.table import Column
 
 from placewise.answers import Generation, Job
-from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
 from services.cli.output import (
     Json,
@@ -82,7 +80,7 @@ def fit(
     options = {"clusters": clusters, "sample": sample, "seed": seed}
     parameters = {name: value for name, value in options.items() if value is not None}
     with connect(server, map_name, key) as client, progress_bar() as progress:
-        job = fit_and_wait(client, parameters, progress)
+        job = wait_for_job(client, client.fit_vocabulary(**parameters), progress, "vocabulary")
     _print_generation(job, as_json)
 
 
@@ -245,11 +243,6 @@ def _fit_folder(
         f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
         f"{provenance['photos']} photos, mean cosine {provenance['mean_cosine']:.4f}.",
     )
-
-
-def fit_and_wait(client: Client, parameters: dict[str, int], progress: Progress) -> Job:
-    """Fit a vocabulary on the map's photos and wait until its generation is active."""
-    return wait_for_job(client, client.fit_vocabulary(**parameters), progress, "vocabulary")
 
 
 def _print_generation(job: Job, as_json: bool) -> None:

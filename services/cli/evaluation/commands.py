@@ -33,7 +33,7 @@ RuleOption = Annotated[
 ]
 FaissGpuOption = Annotated[
     bool,
-    typer.Option("--faiss-gpu", "--faiss_gpu", help="Run the nearest neighbour search on the GPU."),
+    typer.Option("--faiss-gpu", help="Run the nearest neighbour search on the GPU."),
 ]
 
 SIZE_PATTERN = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
@@ -103,6 +103,16 @@ def evaluate(
             help="Fit the VLAD vocabulary on the database photos. Default if none is shipped.",
         ),
     ] = False,
+    rows: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            metavar="DATABASE.npy QUERIES.npy",
+            exists=True,
+            dir_okay=False,
+            help="With --data and one --set: evaluate your own descriptors, one row per photo in "
+            "the order that `datasets list` prints.",
+        ),
+    ] = None,
     predictions: Annotated[
         Path | None,
         typer.Option(
@@ -217,13 +227,13 @@ def evaluate(
     """Measure retrieval recall in a live map or on a data set.
 
     Without --data and --predictions, evaluate the map with its own photos (leave-one-out) and its
-    labelled queries. With --data, evaluate a --checkpoint, an --extractor or a --server on a data
-    set. With --predictions, evaluate a file of predictions.
+    labelled queries. With --data, evaluate a --checkpoint, an --extractor, --rows or a --server on
+    a data set. With --predictions, evaluate a file of predictions.
     """
     map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
-        "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
+        "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
         "--place-labels-are-paths": place_labels_are_paths,
     }  # fmt: skip
     file_options: OptionValues = {
@@ -284,14 +294,14 @@ def evaluate(
 
         size = _parse_image_size(image_size, checkpoint)
         target = EvaluationTarget(
-            checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
+            checkpoint, size, extractor, rows, vocabulary, fit_vocabulary, server, map_name, key
         )
         if sequences:
             from services.cli.evaluation.sequences import evaluate_sequences
 
             unused: OptionValues = {
                 "--out": out, "--pairs": pairs, "--recall-at": recall_at,
-                "--ground-truth": ground_truth,
+                "--ground-truth": ground_truth, "--rows": rows,
             }  # fmt: skip
             _reject_options("with --sequences", unused)
             speeds = parse_motion(motion)

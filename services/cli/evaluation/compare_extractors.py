@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +32,7 @@ from services.cli.output import (
 from shared.config.settings import Settings
 from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
 from shared.descriptors.extractor import choose_device
+from shared.descriptors.inference import inference_clock
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import InvalidRequest
@@ -75,9 +75,10 @@ def _whiten_set(
     batches = (database[sampled[b : b + block_rows]] for b in range(0, len(sampled), block_rows))
     whitening = fit_pca_stream(batches, len(sampled), dimension, components, on_progress)
     projection = PcaProjection(whitening, device)
-    started = time.perf_counter()
+    clock = inference_clock(device)
+    started = clock()
     reduced = [_project(rows, projection, block_rows) for rows in (database, queries)]
-    seconds = time.perf_counter() - started
+    seconds = clock() - started
     return reduced[0], reduced[1], 1000 * seconds / max(1, len(database) + len(queries))
 
 
@@ -89,7 +90,6 @@ def _project(rows: Rows, projection: PcaProjection, block_rows: int) -> Rows:
     return reduced
 
 
-FLOAT32_BYTES = 4
 PCA_SUFFIX = re.compile(r"pca([1-9][0-9]{0,4})")
 
 
@@ -263,7 +263,7 @@ def _evaluate_entry(
     )
     return {
         "dimension": dimension,
-        "bytes_a_photo": FLOAT32_BYTES * dimension,
+        "bytes_a_photo": settings.stored_bytes(dimension),
         "milliseconds_a_photo": milliseconds,
         "fingerprint": describer.fingerprint,
         "device": str(describer.about.get("device", "")),
@@ -291,7 +291,7 @@ def _comparison_as_json(
 
 def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:
     ks = list(compared[0].measured.recalls.recall_all)
-    columns = (*(f"R@{k}" for k in ks), "R@1 95 % CI", "ms", "bytes", "vs. first")
+    columns = (*(f"R@{k}" for k in ks), "R@1 95 % CI", "CPU ms", "bytes", "vs. first")
     table = Table(
         evaluation_set.name, *(Column(name, justify="right", no_wrap=True) for name in columns)
     )
@@ -310,6 +310,6 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
     print_message(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
         f"fingerprint {evaluation_set.fingerprint[:16]}; confidence intervals over "
-        f"{clusters.count} {clusters.kind}. ms: inference and aggregation per photo, measured when "
-        "its descriptor was computed. bytes: float32 descriptor size."
+        f"{clusters.count} {clusters.kind}. CPU ms: CPU time of inference and aggregation for a "
+        "photo (on a GPU: time), measured when its descriptor was computed. bytes: that of a map."
     )

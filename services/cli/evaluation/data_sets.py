@@ -1,4 +1,4 @@
-"""`placewise evaluate --data DIR`: evaluate a checkpoint, an extractor or a server on data sets.
+"""`placewise evaluate --data DIR`: evaluate a model, rows of descriptors or a server on data sets.
 
 A server is evaluated over HTTP: the set's database photos are uploaded to a map, and its queries
 are sent as unstored query photos. Imports torch.
@@ -6,9 +6,11 @@ are sent as unstored query photos. Imports torch.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from typing import Any, TypeVar
 from uuid import UUID
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.progress import Progress
 
 from placewise.answers import Similar, Uploaded
@@ -28,7 +31,8 @@ from services.cli.evaluation.results import check_output_folders, evaluate_ranki
 from services.cli.ingest.upload import (
     RETRY_PERIOD_SECONDS,
     UPLOAD_CONCURRENCY,
-    fit_vocabulary_if_needed,
+    wait_for_automatic_fit,
+    wait_until_described,
 )
 from services.cli.output import progress_bar, stage_bars
 from shared.config.settings import Settings
@@ -39,7 +43,12 @@ from shared.evaluation.exact_knn import Rankings, exact_knn
 from shared.evaluation.places.data_set import measure_places
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.ranking import describe_evaluation_set, refused_photos_error
+from shared.evaluation.ranking import (
+    Rows,
+    describe_evaluation_set,
+    describe_to_matrix,
+    refused_photos_error,
+)
 from shared.evaluation.results import EvaluationResult, EvaluationRun
 
 Result = TypeVar("Result")
@@ -78,7 +87,8 @@ def _evaluate_server(
 
         def query(photo: Path) -> tuple[Similar, float]:
             started = time.perf_counter()
-            response = retrying_client.similar(photo, top_k=min(depth, len(indices_by_file)))
+            k = min(depth, len(indices_by_file))
+            response = retrying_client.similar(photo, top_k=k, history=False)
             progress.advance(bar)
             return response, time.perf_counter() - started
 
@@ -124,7 +134,13 @@ def _upload_database(
     indices_by_file: dict[UUID, list[int]] = {}
     for index, response in enumerate(uploaded):
         indices_by_file.setdefault(response.file_id, []).append(index)
-    stats, _ = fit_vocabulary_if_needed(client, client.stats(), progress)
+    for response in uploaded:
+        if response.job_id is not None:
+            wait_until_described(client, response.job_id)
+    fit = wait_for_automatic_fit(client, progress)
+    if fit is not None:
+        fit.raise_for_failure()
+    stats = client.stats()
     if stats.total_images != len(indices_by_file):
         raise Conflict(
             "map_holds_others",
@@ -179,6 +195,8 @@ class EvaluationTarget:
     checkpoint: Path | None
     image_size: str | tuple[int, int]
     extractor: str | None
+    rows: tuple[Path, Path] | None
+    """`.npy` files with the descriptors of the database and of the queries"""
     vocabulary: Path | None
     fit_vocabulary: bool
     server: str | None
@@ -191,9 +209,9 @@ class EvaluationTarget:
         Raises:
             InvalidRequest: `options_contradict`, `no_model`.
         """
-        if self.checkpoint is not None and self.extractor is not None:
+        if len([one for one in (self.checkpoint, self.extractor, self.rows) if one]) > 1:
             raise InvalidRequest(
-                "options_contradict", "--checkpoint and --extractor exclude each other."
+                "options_contradict", "--checkpoint, --extractor and --rows exclude each other."
             )
         if self.extractor is None and (self.vocabulary is not None or self.fit_vocabulary):
             raise InvalidRequest(
@@ -203,10 +221,11 @@ class EvaluationTarget:
             raise InvalidRequest(
                 "options_contradict", "--vocabulary and --fit-vocabulary exclude each other."
             )
-        if self.checkpoint is None and self.extractor is None and self.server is None:
+        if not (self.checkpoint or self.extractor or self.rows or self.server):
             raise InvalidRequest(
                 "no_model",
-                "Specify what to evaluate: --checkpoint F.ckpt, --extractor NAME or --server URL.",
+                "Specify what to evaluate: --checkpoint F.ckpt, --extractor NAME, --rows "
+                "DATABASE.npy QUERIES.npy, or --server URL.",
             )
 
 
@@ -230,11 +249,12 @@ def evaluate_sets(
         Misconfigured: `out_unwritable`, and errors of loading the model.
     """
     target.check()
-    if options.place_labels_are_paths and target.checkpoint is None and target.extractor is None:
+    described = target.checkpoint or target.extractor or target.rows
+    if options.place_labels_are_paths and not described:
         raise InvalidRequest(
             "options_contradict",
-            "--place-labels-are-paths requires --checkpoint or --extractor: with --server, levels "
-            "are not measured. To measure those of a map: placewise evaluate --map NAME.",
+            "--place-labels-are-paths requires --checkpoint, --extractor or --rows: with --server, "
+            "levels are not measured. To measure those of a map: placewise evaluate --map NAME.",
         )
     check_output_folders(options)
     settings = read_settings()
@@ -244,19 +264,25 @@ def evaluate_sets(
     evaluation_sets = [
         open_evaluation_set(data, name, protocol=protocol, rule=rule) for name in set_names
     ]
+    if len(evaluation_sets) > 1 and (ground_truth or target.rows):
+        option = "--ground-truth" if ground_truth else "--rows"
+        raise InvalidRequest(
+            "which_set",
+            f"{option} belongs to one set. Pass --set with one of: {', '.join(set_names)}.",
+        )
     if ground_truth is not None:
-        if len(evaluation_sets) > 1:
-            raise InvalidRequest(
-                "which_set",
-                f"--ground-truth belongs to one set. Pass --set with one of: "
-                f"{', '.join(set_names)}.",
-            )
         evaluation_sets = [_replace_ground_truth(evaluation_sets[0], ground_truth)]
     results: list[EvaluationResult] = []
     run: EvaluationRun | None = None
     with progress_bar() as progress:
         for evaluation_set in evaluation_sets:
-            if target.checkpoint is None and target.extractor is None:
+            if target.rows is not None:
+                with _open_rows(evaluation_set, target.rows) as (database, queries):
+                    result = _evaluate_rows(
+                        evaluation_set, database, queries, options, settings, progress
+                    )
+                run = EvaluationRun(target.rows[0].stem, None, {"rows": target.rows[0].name})
+            elif not described:
                 ranked, run, figures = _evaluate_server(
                     evaluation_set, target, options.depth, progress
                 )
@@ -309,31 +335,108 @@ def _evaluate_describer(
     describer.describe.on_lookup = lambda done, total: on_progress(
         "cached descriptors", done, total
     )
-    depth = max(options.depth, EVIDENCE_DEPTH)
-    scheme = LevelScheme(
-        labels_are_paths=options.place_labels_are_paths, radii_m=settings.level_radii_m
-    )
     with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
         database,
         queries,
     ):
-        ranked = exact_knn(
-            queries,
-            database,
-            depth,
-            faiss_gpu=options.faiss_gpu,
-            on_progress=lambda done, total: on_progress("search", done, total),
+        milliseconds = describer.describe.milliseconds_a_photo()
+        return _evaluate_rows(
+            evaluation_set, database, queries, options, settings, progress, milliseconds
         )
-        places = measure_places(
-            evaluation_set, database, ranked, scheme, settings.estimate_radius_m
-        )
-        dimension = database.shape[1]
+
+
+def _evaluate_rows(
+    evaluation_set: EvaluationSet,
+    database: Rows,
+    queries: Rows,
+    options: ReportOptions,
+    settings: Settings,
+    progress: Progress,
+    describe_ms_a_photo: float | None = None,
+) -> EvaluationResult:
+    """Rank the (m, D) rows of the database for the (n, D) of the queries, and measure."""
+    on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
+    scheme = LevelScheme(
+        labels_are_paths=options.place_labels_are_paths, radii_m=settings.level_radii_m
+    )
+    ranked = exact_knn(
+        queries,
+        database,
+        max(options.depth, EVIDENCE_DEPTH),
+        faiss_gpu=options.faiss_gpu,
+        on_progress=lambda done, total: on_progress("search", done, total),
+    )
+    places = measure_places(evaluation_set, database, ranked, scheme, settings.estimate_radius_m)
     figures: dict[str, Any] = {
-        "dimension": dimension,
-        "bytes_a_photo": 4 * dimension,
-        "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
+        "dimension": database.shape[1],
+        "bytes_a_photo": settings.stored_bytes(database.shape[1]),
+        "describe_ms_a_photo": describe_ms_a_photo,
     }
     shown = Rankings(ranked.indices[:, : options.depth], ranked.scores[:, : options.depth])
     return evaluate_rankings(
         evaluation_set, shown, options, has_scores=True, about=figures, places=places
     )
+
+
+ROWS_BLOCK_BYTES = 64_000_000  # size of the float32 rows that are read at once
+
+
+@contextlib.contextmanager
+def _open_rows(
+    evaluation_set: EvaluationSet, files: tuple[Path, Path]
+) -> Iterator[tuple[Rows, Rows]]:
+    """Read the descriptors of a set into matrices that are valid inside the `with` block.
+
+    Yields:
+        (m, D) float32 L2-normalised rows of the database and (n, D) of the queries.
+
+    Raises:
+        InvalidRequest: `bad_rows` if a file is not a 2-D array of finite numbers with a row other
+            than zero for each photo, or if their widths differ.
+    """
+    with contextlib.ExitStack() as stack:
+        matrices: list[Rows] = []
+        for file, role in zip(files, ("database", "queries"), strict=True):
+            photos = getattr(evaluation_set, role)
+            rows = _load_rows(file)
+            if len(rows) != len(photos):
+                raise InvalidRequest(
+                    "bad_rows",
+                    f"{file} has {len(rows)} rows for the {len(photos)} photos of the {role} of "
+                    f"{evaluation_set.name}. Write one row per photo, in the order of: placewise "
+                    f"datasets list {evaluation_set.root} --set {evaluation_set.name}",
+                )
+            paths = [photo.path for photo in photos]
+            normalised = functools.partial(_normalised_blocks, file, rows)
+            matrices.append(stack.enter_context(describe_to_matrix(normalised, paths)))
+        database, queries = matrices
+        if database.shape[1] != queries.shape[1]:
+            raise InvalidRequest(
+                "bad_rows",
+                f"{files[0]} has {database.shape[1]} columns and {files[1]} {queries.shape[1]}.",
+            )
+        yield database, queries
+
+
+def _load_rows(file: Path) -> NDArray[Any]:
+    try:
+        rows: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InvalidRequest("bad_rows", f"Can't read {file}: {error}.") from error
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind not in "fiu":
+        raise InvalidRequest("bad_rows", f"{file} must contain a (photos, D) array of numbers.")
+    return rows
+
+
+def _normalised_blocks(file: Path, rows: NDArray[Any], photos: Sequence[Path]) -> Iterator[Rows]:
+    height = max(1, ROWS_BLOCK_BYTES // (4 * max(1, rows.shape[1])))
+    for begin in range(0, len(photos), height):
+        block = np.asarray(rows[begin : begin + height], np.float64)
+        norms = np.linalg.norm(block, axis=1, keepdims=True)
+        bad = np.flatnonzero(~(np.isfinite(norms) & (norms > 0)))
+        if len(bad):
+            raise InvalidRequest(
+                "bad_rows",
+                f"Row {begin + bad[0]} of {file} is zero, or has values that are not finite.",
+            )
+        yield (block / norms).astype(np.float32)

@@ -146,20 +146,24 @@ def _print_figures(name: str, figures: Json) -> None:
         precise = figures["recall_at_99_precision"].get(key)
         table.add_row(title, format_percent(figures["recall"][key]), format_percent(precise))
     print_table(table)
-    print_message(
-        f"Tracking {format_percent(figures['tracking'])} of the frames in the map, of which "
-        f"{format_percent(figures['tracking_precision'])} are right; calibration error (ECE) "
-        f"{figures['calibration_error']:.3f}. Frames to localise: "
-        f"{_frame_counts(figures['frames_to_localise'])}; to notice that the map was left: "
-        f"{_frame_counts(figures['frames_to_notice_lost'])}; claimed to be tracked outside: "
-        f"{format_percent(figures['claimed_outside'])}."
-    )
+    rows = {
+        "frames in the map with the status tracking": format_percent(figures["tracking"]),
+        "right among them": format_percent(figures["tracking_precision"]),
+        "calibration error (ECE)": f"{figures['calibration_error']:.3f}",
+        "frames to localise": _frame_counts(figures["frames_to_localise"]),
+        "frames to notice that the map was left": _frame_counts(figures["frames_to_notice_lost"]),
+        "frames outside with the status tracking": format_percent(figures["claimed_outside"]),
+    }
     if "kidnapped" in figures:
-        print_message(
-            f"Carried away {figures['kidnapped']} times: "
-            f"{format_percent(figures['found_within_40_frames'])} are found again within "
-            f"40 frames; frames: {_frame_counts(figures['frames_until_found'])}."
-        )
+        rows |= {
+            "carried to another place": f"{figures['kidnapped']} times",
+            "found again within 40 frames": format_percent(figures["found_within_40_frames"]),
+            "frames until found again": _frame_counts(figures["frames_until_found"]),
+        }
+    table = Table("tracking", Column("value", justify="right"))
+    for title, value in rows.items():
+        table.add_row(title, value)
+    print_table(table)
 
 
 def _frame_counts(counts: list[int | None]) -> str:

@@ -27,7 +27,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.output import Json, printable_path
+from services.cli.output import Json, utf8_path
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 
@@ -201,7 +201,7 @@ def read_anyloc_folder(folder: Path, database: Path | None, uploads: Path | None
     listed, missing = _match_rows_to_files(rows, files)
     listed_paths = {photo.path for photo in listed}
     unlisted = [
-        AnylocPhoto(path, printable_path(Path(path.name)))
+        AnylocPhoto(path, utf8_path(Path(path.name)))
         for path in sorted(set().union(*files.values()) - listed_paths)
         if path.suffix.lower() in PHOTO_SUFFIXES
     ]
@@ -308,7 +308,7 @@ def _drop_duplicates(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list
         original.metadata.setdefault("anyloc_same_photo", []).append(duplicate)
         duplicates.append(
             {
-                "path": printable_path(photo.path),
+                "path": utf8_path(photo.path),
                 "filename": photo.name,
                 "reason": f"the same photo as {original.name}",
             }

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.cli.output import printable_path
+from services.cli.output import utf8_path
 from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
@@ -113,7 +113,7 @@ def find_photos(
             LocalPhoto(
                 path,
                 {**fields, **table_fields.get(path, {})},
-                relative_path=printable_path(path.relative_to(folder)),
+                relative_path=utf8_path(path.relative_to(folder)),
             )
         )
     return photos

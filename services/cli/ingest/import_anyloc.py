@@ -7,9 +7,14 @@ from typing import Annotated
 
 import typer
 
-from services.cli.client import connect
+from services.cli.client import client_command, connect
 from services.cli.ingest.anyloc_reader import AnylocFolder, read_anyloc_folder
-from services.cli.ingest.upload import FitOption, UpdateOption, upload_photos
+from services.cli.ingest.upload import (
+    NoFitOption,
+    UpdateOption,
+    switch_off_fits,
+    upload_photos,
+)
 from services.cli.output import (
     Json,
     JsonOption,
@@ -19,7 +24,6 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
-    program,
     progress_bar,
 )
 
@@ -52,7 +56,7 @@ def import_anyloc(
         ),
     ] = None,
     update: UpdateOption = False,
-    fit: FitOption = True,
+    no_fit: NoFitOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -64,13 +68,16 @@ def import_anyloc(
     """
     source = read_anyloc_folder(folder, database, uploads)
     with connect(server, map_name, key) as client, progress_bar() as progress:
+        if no_fit:
+            switch_off_fits(client)
         report = _build_report(
-            source, upload_photos(client, source.photos, fit, progress, update=update)
+            source, upload_photos(client, source.photos, progress, update=update)
         )
     if as_json:
         print_json(report)
     else:
         _print_report(report)
+        print_note(f"Next: {client_command('query', 'PHOTO', server=server, map_name=map_name)}")
     if report["refused"] or report["failed"] or report["missing"]:
         raise typer.Exit(1)
 
@@ -115,4 +122,3 @@ def _print_report(report: Json) -> None:
         f"(vocabulary: {report['vocabulary']})."
     )
     print_failures(report, "missing", "duplicates", "refused", "failed")
-    print_note(f"Next: {program()} query PHOTO")

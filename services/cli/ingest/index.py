@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from placewise.client import Client
-from services.cli.client import connect, describe_target
+from services.cli.client import client_command, connect, describe_target
 from services.cli.environment import read_settings
 from services.cli.ingest.geotags import (
     LocalPhoto,
@@ -24,12 +24,13 @@ from services.cli.ingest.geotags import (
     read_photo_manifest,
 )
 from services.cli.ingest.upload import (
-    FitOption,
+    NoFitOption,
     UpdateOption,
     check_archive,
     import_keys,
     import_prefix,
     manifest_has_keys,
+    switch_off_fits,
     upload_archive,
     upload_photos,
 )
@@ -45,7 +46,6 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
-    program,
     progress_bar,
 )
 from shared.catalog.photo_role import PhotoRole
@@ -58,7 +58,7 @@ def index(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="DIR|PHOTO...|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
+            metavar="SOURCE",
             help="Folders (searched recursively), photos and patterns such as 'trip/*.jpg'; or one "
             "zip, tar or gzipped tar archive; or one JSONL manifest with one photo per line; or "
             "one prefix of the server's own bucket.",
@@ -68,8 +68,8 @@ def index(
         Path | None,
         typer.Option(
             "--csv",
-            help="CSV table with the header filename,latitude,longitude,heading,captured_at,place,"
-            "tags. filename is relative to DIR; the other columns are optional.",
+            help="CSV table with the columns filename, latitude, longitude, heading, captured_at, "
+            "place and tags. filename is relative to the folder; the others are optional.",
         ),
     ] = None,
     utm_zone: Annotated[
@@ -93,7 +93,7 @@ def index(
         typer.Option(
             metavar="FILE",
             help="Record uploaded photos in FILE; a later run with the same FILE skips them. Only "
-            "for DIR and manifests of local files.",
+            "for folders and manifests of local files.",
         ),
     ] = None,
     failures: Annotated[
@@ -102,7 +102,7 @@ def index(
             metavar="FILE.jsonl", help="Write refused and failed photos with their reasons."
         ),
     ] = None,
-    fit: FitOption = True,
+    no_fit: NoFitOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -135,9 +135,7 @@ def index(
         ]
         if role != PhotoRole.DATABASE:
             photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-        # Vocabularies are fitted on database photos only.
-        fit_after_upload = fit and role == PhotoRole.DATABASE
-        report = _upload_photos(photos, fit_after_upload, update, journal, server, map_name, key)
+        report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
         suffixes = sum(map(count_other_files, local), Counter[str]())
         report["other_files"] = suffixes.total()
         report["other_suffixes"] = dict(suffixes.most_common())
@@ -150,39 +148,43 @@ def index(
         )
     elif source.startswith("s3://"):
         _reject_options("a bucket prefix", local_file_options)
-        with _connect(server, map_name, key) as client, progress_bar() as progress:
-            report = import_prefix(client, source, fit, progress)
+        with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
+            report = import_prefix(client, source, progress)
     elif path.suffix == ".jsonl":
         _reject_options("a manifest", folder_options)
         data = _read_manifest(path)
         if manifest_has_keys(data):
             _reject_options("a manifest of object keys", local_file_options)
-            with _connect(server, map_name, key) as client, progress_bar() as progress:
-                report = import_keys(client, data, fit, progress)
+            with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
+                report = import_keys(client, data, progress)
         else:
             photos = read_photo_manifest(path, data)
-            report = _upload_photos(photos, fit, update, journal, server, map_name, key)
+            report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
     else:
         check_archive(path)
         _reject_options("an archive", local_file_options)
-        with _connect(server, map_name, key) as client, progress_bar() as progress:
-            report = upload_archive(client, path, fit, progress)
+        with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
+            report = upload_archive(client, path, progress)
     if failures is not None:
         _write_failures(failures, report)
     _finish_command(report, server, map_name, role, as_json)
 
 
 @contextlib.contextmanager
-def _connect(server: str | None, map_name: str | None, key: str | None) -> Iterator[Client]:
+def _connect(
+    server: str | None, map_name: str | None, key: str | None, no_fit: bool
+) -> Iterator[Client]:
     with connect(server, map_name, key) as client:
         target = describe_target(client, server, map_name)
         print_note(f"Indexing into {target}")
+        if no_fit:
+            switch_off_fits(client)
         yield client
 
 
 def _upload_photos(
     photos: list[LocalPhoto],
-    fit: bool,
+    no_fit: bool,
     update: bool,
     journal: Path | None,
     server: str | None,
@@ -190,14 +192,14 @@ def _upload_photos(
     key: str | None,
 ) -> Json:
     with (
-        _connect(server, map_name, key) as client,
+        _connect(server, map_name, key, no_fit) as client,
         progress_bar() as progress,
         contextlib.ExitStack() as stack,
     ):
         # An embedded server has another port each time: PLACEWISE_HOME identifies it instead.
         url = server or str(read_settings().placewise_home.resolve())
         opened = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
-        return upload_photos(client, photos, fit, progress, update=update, journal=opened)
+        return upload_photos(client, photos, progress, update=update, journal=opened)
 
 
 def _read_manifest(manifest: Path) -> bytes:
@@ -260,10 +262,8 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
             f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
     print_failures(report, "refused", "failed")
-    options = f" --map {map_name}" if map_name else ""
-    options += f" --server {server}" if server else ""
-    command = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    print_note(f"Next: {program()} {command}{options}")
+    command = ("query", "PHOTO") if role == PhotoRole.DATABASE else ("evaluate",)
+    print_note(f"Next: {client_command(*command, server=server, map_name=map_name)}")
 
 
 def _count(number: int, noun: str) -> str:

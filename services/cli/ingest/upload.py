@@ -1,30 +1,32 @@
 """Bulk uploads: local photos one by one, or batches that the server ingests itself.
 
 Batches are archives, bucket prefixes and lists of object keys. Both ways wait until the photos are
-described, and fit a vocabulary if the map needs one.
+described, and for the vocabulary fit that the server starts if the map has enough photos.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
+from uuid import UUID
 
 import typer
 from rich.progress import Progress, TaskID
 
-from placewise.answers import FINISHED, BatchItem, BatchStarted, Job, Stats, Uploaded
+from placewise.answers import FINISHED, BatchItem, BatchStarted, Job, Uploaded
 from placewise.client import Client
-from services.cli.descriptors.vocabulary import fit_and_wait
+from placewise.protocol import open_file
+from services.cli.client import wait_for_job
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
-from services.cli.output import Json, print_note, printable_path
-from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from services.cli.output import Json, print_note, utf8_path
+from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from shared.imaging.file_formats import (
     ACCEPTED_ARCHIVES,
     ARCHIVE_SIGNATURE_BYTES,
@@ -38,12 +40,15 @@ UPLOAD_CONCURRENCY = 4
 RETRY_PERIOD_SECONDS = 60.0
 POLL_SECONDS = 1.0  # short: a long poll does not return when a job starts to wait for a vocabulary
 
-FitOption = Annotated[
+# For the steward to start a fit that is due: it waits until no photo arrives for some seconds.
+FIT_START_SECONDS = 60.0
+
+NoFitOption = Annotated[
     bool,
     typer.Option(
-        "--fit/--no-fit",
-        help="Fit a vocabulary afterwards if the map has none of its own and at least "
-        f"{MIN_PHOTOS_TO_FIT} photos.",
+        "--no-fit",
+        help="Switch automatic vocabulary fits off for this map; `placewise maps update NAME "
+        "--auto-fit` switches them on again.",
     ),
 ]
 UpdateOption = Annotated[
@@ -57,13 +62,12 @@ PendingJobs = list[tuple[LocalPhoto, str]]
 def upload_photos(
     client: Client,
     photos: list[LocalPhoto],
-    fit: bool,
     progress: Progress,
     *,
     update: bool = False,
     journal: UploadJournal | None = None,
 ) -> Json:
-    """Upload photos, wait until they are described, and fit a vocabulary if the map needs one.
+    """Upload photos, and wait until they are described and an automatic vocabulary fit has ended.
 
     The operation is idempotent: a photo that is already stored is not described again.
 
@@ -72,8 +76,8 @@ def upload_photos(
 
     Returns:
         Counts (`photos`, `uploaded`, `already_there`, and `searchable` in the whole map), the
-        `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`, and the
-        vocabulary that was `fitted`, if any.
+        `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`, and the job
+        of the vocabulary that was `fitted`, if any.
     """
     client.stats()  # fails early, and once, for a wrong URL, key or map
     counts: Counter[str] = Counter()
@@ -112,10 +116,9 @@ def upload_photos(
     describing = progress.add_task("describing", total=len(pending))
     pending = _wait_for_jobs(client, pending, failed, progress, describing)
 
-    stats, vocabulary = client.stats(), None
-    if fit:
-        stats, vocabulary = fit_vocabulary_if_needed(client, stats, progress)
+    fit = wait_for_automatic_fit(client, progress)
     _wait_for_jobs(client, pending, failed, progress, describing)
+    stats = client.stats()
     return {
         "photos": len(photos),
         "uploaded": counts["uploaded"],
@@ -124,7 +127,7 @@ def upload_photos(
         "refused": refused,
         "failed": failed,
         "vocabulary": stats.vocabulary,
-        "fitted": vocabulary,
+        "fitted": fit,
     }
 
 
@@ -143,18 +146,37 @@ def _split_by_journal(
     return remaining, recorded_jobs
 
 
-def fit_vocabulary_if_needed(
-    client: Client, stats: Stats, progress: Progress
-) -> tuple[Stats, Job | None]:
-    """Fit a vocabulary if the map has none of its own and enough photos.
+def switch_off_fits(client: Client) -> None:
+    """Switch automatic vocabulary fits off for the client's map."""
+    client.update_map(client.stats().map, auto_fit=False)
+
+
+def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
+    """Wait for the vocabulary fit that runs, or that is due and that the server is about to start.
 
     Returns:
-        The map's statistics afterwards, and the job of the fit or None.
+        The job as it ended, also if it failed; None if no fit is due.
     """
-    if stats.vocabulary in ("own", "none") or stats.total_images < MIN_PHOTOS_TO_FIT:
-        return stats, None
-    vocabulary = fit_and_wait(client, {}, progress)
-    return client.stats(), vocabulary
+    deadline = time.monotonic() + FIT_START_SECONDS
+    while True:
+        stats = client.stats()
+        job = next(client.jobs(kind="fit", state=["queued", "running"]), None)
+        if job is not None:
+            break
+        if stats.next_fit_photos is None or stats.total_images < stats.next_fit_photos:
+            return None
+        if time.monotonic() > deadline:
+            print_note("The map is improved later: other photos are still being added to it.")
+            return None
+        time.sleep(POLL_SECONDS)
+    try:
+        return wait_for_job(client, job, progress, job.label.lower())
+    except Unprocessable as error:
+        print_note(
+            f"The photos are stored, but no vocabulary was fitted: {error.detail} "
+            "Try it again with `placewise vocabulary fit`."
+        )
+        return client.job(job)
 
 
 def _upload_concurrently(
@@ -198,9 +220,7 @@ def _wait_for_jobs(
     waiting: PendingJobs = []
     for photo, job_id in pending:
         try:
-            job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
-            while not job.finished and not job.waiting_for:
-                job = client.job(job_id, POLL_SECONDS)
+            job = wait_until_described(client, job_id)
         except NotFound:  # recorded in the journal and deleted since
             progress.advance(bar)
             continue
@@ -213,9 +233,17 @@ def _wait_for_jobs(
     return waiting
 
 
+def wait_until_described(client: Client, job_id: str | UUID) -> Job:
+    """Wait until the photo's job ends, or waits for a vocabulary; return it."""
+    job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
+    while not job.finished and not job.waiting_for:
+        job = client.job(job_id, POLL_SECONDS)
+    return job
+
+
 def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
     filename = {"filename": photo.name} if photo.name else {}
-    return {"path": printable_path(photo.path), **filename, "reason": reason}
+    return {"path": utf8_path(photo.path), **filename, "reason": reason}
 
 
 def check_archive(path: Path) -> None:
@@ -224,11 +252,8 @@ def check_archive(path: Path) -> None:
     Raises:
         InvalidRequest: `not_an_archive`, `unreadable_file`.
     """
-    try:
-        with path.open("rb") as file:
-            signature = file.read(ARCHIVE_SIGNATURE_BYTES)
-    except OSError as error:
-        raise InvalidRequest("unreadable_file", f"Can't read {path}: {error.strerror}") from error
+    with open_file(path) as file:
+        signature = file.read(ARCHIVE_SIGNATURE_BYTES)
     if detect_archive_format(signature) is None:
         raise InvalidRequest(
             "not_an_archive",
@@ -236,8 +261,8 @@ def check_archive(path: Path) -> None:
         )
 
 
-def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress) -> Json:
-    """Upload an archive as a batch, wait until it ends, and fit a vocabulary if needed.
+def upload_archive(client: Client, archive: Path, progress: Progress) -> Json:
+    """Upload an archive as a batch, and wait until it and an automatic vocabulary fit have ended.
 
     Returns:
         The same report as `upload_photos`, with `ignored`: the number of other archive members.
@@ -250,12 +275,12 @@ def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress)
     started = client.upload_archive(
         archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
     )
-    return _wait_and_report(client, started, fit, progress)
+    return _wait_and_report(client, started, progress)
 
 
-def import_prefix(client: Client, prefix: str, fit: bool, progress: Progress) -> Json:
+def import_prefix(client: Client, prefix: str, progress: Progress) -> Json:
     """Import every photo of the server's store below a prefix; see `upload_archive`."""
-    return _wait_and_report(client, client.import_prefix(prefix), fit, progress)
+    return _wait_and_report(client, client.import_prefix(prefix), progress)
 
 
 def manifest_has_keys(manifest: bytes) -> bool:
@@ -267,17 +292,16 @@ def manifest_has_keys(manifest: bytes) -> bool:
         return False  # the parser of the whole manifest reports the error
 
 
-def import_keys(client: Client, manifest: bytes, fit: bool, progress: Progress) -> Json:
+def import_keys(client: Client, manifest: bytes, progress: Progress) -> Json:
     """Import the objects listed by `key` in a JSONL manifest; see `upload_archive`."""
-    return _wait_and_report(client, client.import_manifest(manifest), fit, progress)
+    return _wait_and_report(client, client.import_manifest(manifest), progress)
 
 
-def _wait_and_report(client: Client, started: BatchStarted, fit: bool, progress: Progress) -> Json:
+def _wait_and_report(client: Client, started: BatchStarted, progress: Progress) -> Json:
     describing = progress.add_task("describing", total=None)
     job = _wait_until_finished(client, started, progress, describing)
-    stats, fitted = client.stats(), None
-    if fit:
-        stats, fitted = fit_vocabulary_if_needed(client, stats, progress)
+    fit = wait_for_automatic_fit(client, progress)
+    stats = client.stats()
     if not job.finished and stats.vocabulary is not None:
         job = _wait_until_finished(client, started, progress, describing)
     job.raise_for_failure()
@@ -294,7 +318,7 @@ def _wait_and_report(client: Client, started: BatchStarted, fit: bool, progress:
         "refused": [_item_failure(item) for item in failed_items if not item.file_id],
         "failed": [_item_failure(item) for item in failed_items if item.file_id],
         "vocabulary": stats.vocabulary,
-        "fitted": fitted,
+        "fitted": fit,
         "ignored": counts.get("ignored", 0),
     }
 

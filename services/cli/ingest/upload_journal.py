@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.output import printable_path
+from services.cli.output import printable_path, utf8_path
 from shared.errors import InvalidRequest, Misconfigured
 
 JOURNAL_FORMAT = 1
@@ -65,7 +65,7 @@ class UploadJournal:
 
     def done(self, photo: LocalPhoto) -> JournalEntry | None:
         """The recorded upload of the photo, or None if it is new or has changed."""
-        line = self._done.get(printable_path(photo.path))
+        line = self._done.get(utf8_path(photo.path))
         if line is None or line["state"] != _file_state(photo):
             return None  # a missing file is reported by the upload itself
         return JournalEntry(line["file_id"], line["job_id"])
@@ -74,7 +74,7 @@ class UploadJournal:
         """Record an acknowledged upload."""
         self._write(
             {
-                "path": printable_path(photo.path),
+                "path": utf8_path(photo.path),
                 "state": _file_state(photo),
                 "file_id": entry.file_id,
                 "job_id": entry.job_id,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,16 @@ from rich.table import Column
 from placewise.answers import Similar
 from placewise.client import Client
 from services.cli.client import connect
+from services.cli.environment import read_settings
 from services.cli.locate.folder import FolderPhoto, check_time_zones, read_folder, read_gpx
+from services.cli.locate.preview import (
+    Preview,
+    SearchedPhoto,
+    file_state,
+    preview_file,
+    read_preview,
+    write_preview,
+)
 from services.cli.locate.undo_journal import UndoReport, undo
 from services.cli.locate.writers import Location, Target, WriteReport, write_locations
 from services.cli.output import (
@@ -33,9 +42,10 @@ from services.cli.output import (
     print_message,
     print_note,
     print_table,
-    printable_path,
+    printable_text,
     progress_bar,
 )
+from shared.config.command_line import command_line
 from shared.errors import PlacewiseError
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geotagging.evidence import (
@@ -72,6 +82,12 @@ class _LocatedPhoto:
         if self.proposal is not None:
             return self.proposal.probability
         return self.place_probability or 0.0
+
+    def shown(self) -> list[float | str]:
+        """Return coordinates and place, as far as they are known, rounded as they are shown."""
+        found = self.proposal
+        coordinates = [round(found.latitude, 6), round(found.longitude, 6)] if found else []
+        return [*coordinates, *([self.place] if self.place else [])]
 
 
 def locate(
@@ -156,6 +172,8 @@ def locate(
         return
     moves = parse_motion(motion)
     photos = read_folder(folder, time_zone, clock_offset)
+    preview_path = preview_file(read_settings().placewise_home, folder, server, map_name)
+    preview = read_preview(preview_path) if picture and write is not None else None
     if together:
         check_time_zones(photos, "--together")
     track: Sequence[KnownPosition] = ()
@@ -163,16 +181,19 @@ def locate(
         check_time_zones([p for p in photos if p.latitude is None], "--gpx")
         track = read_gpx(gpx)
     unlocated = [photo for photo in photos if photo.latitude is None]
-    searches: Sequence[Similar | str | None] = [None] * len(unlocated)
-    photo_count = 0
-    if picture and unlocated:
+    states = {photo.path: file_state(photo.path) for photo in unlocated}
+    searches: dict[Path, SearchedPhoto] = {}
+    if preview is not None:
+        found = {photo.path: preview.search_of(photo.name, photo.path) for photo in unlocated}
+        searches = {path: search for path, search in found.items() if search is not None}
+    new = [photo for photo in unlocated if photo.path not in searches] if picture else []
+    if new:
         with connect(server, map_name, key) as client:
-            photo_count = client.stats().searchable_images
-            searches = _search_photos(client, unlocated)
+            searches |= _search_photos(client, client.stats().searchable_images, new)
     neighbours = TimeNeighbours(photos, together)
     located = [
-        _locate_photo(photo, search, photo_count, neighbours, track, moves, radius)
-        for photo, search in zip(unlocated, searches, strict=True)
+        _locate_photo(photo, searches.get(photo.path), neighbours, track, moves, radius)
+        for photo in unlocated
     ]
     accept_from = max(accept, 1e-9)
     accepted = [each for each in located if each.probability >= accept_from]
@@ -185,40 +206,53 @@ def locate(
         print_json(_to_json(photos, located, accept, written))
     else:
         _print_proposals(folder, photos, located, accepted, accept, written)
+    if preview is not None:
+        _print_changes(preview, accepted)
+    if new:  # at the end, so that nothing is lost if it can't be written
+        now = datetime.now(UTC) if preview is None else preview.searched_at
+        entries = {each.name: (*states[each.path], searches[each.path]) for each in unlocated}
+        accepted_now = {each.photo.name: each.shown() for each in accepted}
+        write_preview(preview_path, Preview(now, entries, accepted_now))
     if any(each.error for each in located) or (written is not None and written.skipped):
         raise typer.Exit(1)
 
 
-def _search_photos(client: Client, photos: Sequence[FolderPhoto]) -> list[Similar | str]:
-    """Search the map with each photo; the reason for those that can't be searched with."""
+def _search_photos(
+    client: Client, photo_count: int, photos: Sequence[FolderPhoto]
+) -> dict[Path, SearchedPhoto]:
+    """Search the map, which has so many photos, with each photo."""
     with progress_bar() as progress, ThreadPoolExecutor(SEARCHES_AT_ONCE) as pool:
-        return list(
-            progress.track(
-                pool.map(partial(_search_photo, client), photos),
-                total=len(photos),
-                description="searching",
-            )
+        searched = progress.track(
+            pool.map(partial(_search_photo, client, photo_count), photos),
+            total=len(photos),
+            description="searching",
         )
+        return {photo.path: found for photo, found in zip(photos, searched, strict=True)}
 
 
-def _search_photo(client: Client, photo: FolderPhoto) -> Similar | str:
+def _search_photo(client: Client, photo_count: int, photo: FolderPhoto) -> SearchedPhoto:
     try:
-        answer = client.similar(photo.path, top_k=SIMILAR_PHOTOS)
-        first = answer.similar_images[0] if answer.similar_images else None
-        if first is not None and first.latitude is None and first.place is None:
-            # Photos of the map without coordinates, such as this one, hide those that have some.
-            return client.similar(photo.path, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES)
+        answer = client.similar(photo.path, top_k=SIMILAR_PHOTOS, history=False)
+        if answer.matches_without_place:  # they hide photos with coordinates
+            located = client.similar(
+                photo.path, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES, history=False
+            )
+            answer = answer.model_copy(update={"similar_images": located.similar_images})
     except PlacewiseError as error:
         if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
-        return error.detail
-    return answer
+        return SearchedPhoto(error=error.detail)
+    label = next((each for each in answer.estimate.levels if each.place), None)
+    return SearchedPhoto(
+        picture_evidence(answer, photo_count),
+        label.place if label else None,
+        label.probability if label else None,
+    )
 
 
 def _locate_photo(
     photo: FolderPhoto,
-    search: Similar | str | None,
-    photo_count: int,
+    searched: SearchedPhoto | None,
     neighbours: TimeNeighbours,
     track: Sequence[KnownPosition],
     moves: MotionModel,
@@ -226,15 +260,14 @@ def _locate_photo(
 ) -> _LocatedPhoto:
     speed = moves.max_speed_mps
     on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
-    answer = search if isinstance(search, Similar) else None
-    evidence = None if answer is None else picture_evidence(answer, photo_count)
-    label = next((each for each in answer.estimate.levels if each.place), None) if answer else None
+    searched = searched or SearchedPhoto()
+    by_time = neighbours.position_of(photo, speed)
     return _LocatedPhoto(
         photo,
-        propose_position(evidence, neighbours.position_of(photo, speed), on_track, radius_m),
-        label.place if label else None,
-        label.probability if label else None,
-        search if isinstance(search, str) else None,
+        propose_position(searched.evidence, by_time, on_track, radius_m),
+        searched.place,
+        searched.place_probability,
+        searched.error,
     )
 
 
@@ -267,6 +300,24 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
         ],
         OUT_OF_MAP_SHARE if missing is None else missing,
         photo_count,
+    )
+
+
+def _print_changes(preview: Preview, accepted: Sequence[_LocatedPhoto]) -> None:
+    """Say of which preview the written proposals are, and which of them it did not show so."""
+    shown = preview.accepted
+    present = {each.photo.name: each.shown() for each in accepted}
+    changed = [name for name in {**shown, **present} if shown.get(name) != present.get(name)]
+    print_note(
+        f"The searches are those of {preview.searched_at.astimezone():%Y-%m-%d %H:%M}; without "
+        "--write, the photos are searched again. "
+        + (
+            f"{len(changed)} proposals are not as they were accepted then, because options, photos "
+            f"or the track have changed: {', '.join(changed[:3])}"
+            + (" ..." if len(changed) > 3 else "")
+            if changed
+            else "All proposals are as they were then."
+        )
     )
 
 
@@ -351,13 +402,16 @@ def _print_proposals(
         if accepted:
             print_note("Nothing is written. --write sidecar, exif, csv or gpx writes them.")
         return
-    names = ", ".join(written.written[:3]) + (" ..." if len(written.written) > 3 else "")
+    names = ", ".join(map(printable_text, written.written[:3])) + (
+        " ..." if len(written.written) > 3 else ""
+    )
     print_note(
         f"{len(written.written)} files written{': ' if names else ''}{names}. "
-        f"Undo: {sys.argv[0]} locate {printable_path(folder)} --undo"
+        f"Undo: {command_line('locate', folder, '--undo')}"
     )
     for name, reason in written.skipped.items():
-        err_console.print(f"[red]skipped[/red] {escape(name)}: {escape(reason)}", soft_wrap=True)
+        line = f"[red]skipped[/red] {escape(printable_text(name))}: {escape(reason)}"
+        err_console.print(line, soft_wrap=True)
 
 
 def _report_undo(report: UndoReport, as_json: bool) -> None:
@@ -367,7 +421,8 @@ def _report_undo(report: UndoReport, as_json: bool) -> None:
         print_note(f"{len(report.restored)} files restored, {len(report.removed)} removed.")
         for name in report.changed_since:
             err_console.print(
-                f"[red]changed since[/red] {escape(name)}: left as it is", soft_wrap=True
+                f"[red]changed since[/red] {escape(printable_text(name))}: left as it is",
+                soft_wrap=True,
             )
     if report.changed_since:
         raise typer.Exit(1)

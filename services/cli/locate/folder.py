@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 
 from services.cli.ingest.geotags import list_photos
 from services.cli.locate.sidecars import embedded_xmp, find_sidecar, read_position
-from services.cli.output import printable_path
+from services.cli.output import printable_path, utf8_path
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.geotagging.evidence import DatedPhoto, KnownPosition
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
@@ -144,7 +144,7 @@ def read_photo(folder: Path, path: Path, zone: tzinfo | None = None) -> FolderPh
         if latitude is None and data is not None:
             latitude, longitude = read_position(data) or (None, None)
     return FolderPhoto(
-        printable_path(path.relative_to(folder)),
+        utf8_path(path.relative_to(folder)),
         time,
         header.time_zone_is_known or (time is not None and zone is not None),
         header.camera,

@@ -13,8 +13,9 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,20 +67,21 @@ class UndoJournal:
         else:
             self._read[staged] = _sha256(path)
             staged.write_bytes(content)
-            if path.exists():
-                shutil.copymode(path, staged)
         return staged
 
     def install(self, path: Path, staged: Path) -> None:
         """Replace `path`, which may not exist yet, by a staged file.
 
         Raises:
-            Unprocessable: `outside_folder`, for a link to a file that is not below the folder.
+            Unprocessable: `outside_folder`, for a link to a file that is not below the folder;
+                `owner_differs`, if only another user can write a file with the same owner.
             Conflict: `changed_meanwhile`, if another program changed the file since it was staged.
         """
         path = path.resolve()  # a link stays a link
         name = os.path.relpath(path, self._root)
         _check_is_below(self._root, name)
+        if path.exists():
+            _copy_ownership(path, staged)
         _sync(staged)
         line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
         if line["before"] != self._read.pop(staged):
@@ -170,8 +172,9 @@ def _exclusive(root: Path) -> Iterator[None]:
     folder = root / FOLDER
     try:
         folder.mkdir(exist_ok=True)
-        if any(path.is_symlink() for path in (folder, *folder.iterdir())):
-            raise OSError(f"{FOLDER} is or contains a symbolic link")
+        for path in (folder, *folder.iterdir()):
+            if path.is_symlink() or not (path.is_dir() or path.is_file()):
+                raise OSError(f"{FOLDER} is or contains a symbolic link or special file")
         with FileLock(folder / "lock", timeout=0):
             yield
     except Timeout as error:
@@ -221,6 +224,8 @@ def _to_line(line: dict[str, Any]) -> bytes:
 def _sha256(path: Path) -> str | None:
     if not path.exists():
         return None
+    if not path.is_file():  # reading a FIFO would wait for ever
+        raise Unprocessable("not_a_file", f"{printable_path(path)} is not a regular file.")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -230,7 +235,34 @@ def _link_or_copy(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:  # a file system without hard links
         shutil.copy2(source, target)
+        _copy_ownership(source, target)
         _sync(target)
+
+
+def _copy_ownership(source: Path, target: Path) -> None:
+    """Give a file the owner, group, mode and extended attributes (so the ACL) of another one.
+
+    Raises:
+        Unprocessable: `owner_differs`.
+    """
+    info, new = source.stat(), target.stat()
+    if (info.st_uid, info.st_gid) != (new.st_uid, new.st_gid):
+        try:
+            os.chown(target, info.st_uid, info.st_gid)
+        except PermissionError as error:
+            raise Unprocessable(
+                "owner_differs",
+                f"The file belongs to user {info.st_uid} and group {info.st_gid}, which writing it "
+                "would change. Run the command as its owner or as root.",
+            ) from error
+    if sys.platform == "linux":
+        names: list[str] = []
+        with suppress(OSError):  # of a file system without them
+            names = os.listxattr(source)
+        for name in names:
+            with suppress(OSError):  # only the system may set some
+                os.setxattr(target, name, os.getxattr(source, name))
+    shutil.copymode(source, target)  # last: a change of the owner clears bits of it
 
 
 def _write_synced(path: Path, content: bytes) -> None:

@@ -6,6 +6,7 @@ EXIF is written by the program exiftool or the library pyexiv2.
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import shutil
 import subprocess
@@ -21,13 +22,14 @@ from xml.etree import ElementTree
 from services.cli.locate.folder import read_photo
 from services.cli.locate.sidecars import METHOD, add_position, find_sidecar, sidecar_path
 from services.cli.locate.undo_journal import UndoJournal, open_journal
-from services.cli.output import printable_path
+from services.cli.output import utf8_path
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.geotagging.fusion import Proposal
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import escape_csv_text
 
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
+ERRORS_OF_ONE_FILE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)
 CSV_NAME, GPX_NAME = "placewise-locations.csv", "placewise-locations.gpx"
 
 
@@ -96,10 +98,12 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
                     path = write_one(journal, location.path, proposal)
                 except PlacewiseError as error:
                     report.skipped[location.name] = error.detail
-                except PermissionError as error:  # of its folder; others may be writable
+                except OSError as error:
+                    if error.errno not in ERRORS_OF_ONE_FILE:
+                        raise
                     report.skipped[location.name] = f"can't be written: {error.strerror}"
                 else:
-                    report.written.append(printable_path(path.relative_to(folder)))
+                    report.written.append(utf8_path(path.relative_to(folder)))
     return report
 
 

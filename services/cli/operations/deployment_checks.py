@@ -12,6 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from typing import Any
 
 import httpx2
 from sqlalchemy import func, select, text
@@ -162,20 +163,7 @@ def check_gateway(server: str, key: str | None) -> str:
         Unavailable: `server_unreachable`, or `gateway_ill` if one of its dependencies is unhealthy.
         Misconfigured: The answer is an error (with its code) or not a health report.
     """
-    try:
-        response = httpx2.get(
-            f"{server.rstrip('/')}/api/v1/health",
-            headers={"Authorization": f"Bearer {key}"} if key else {},
-            timeout=10,
-        )
-        body = response.json()
-    except (httpx2.HTTPError, ValueError) as error:
-        raise Unavailable(
-            "server_unreachable",
-            f"{server} does not answer ({type(error).__name__}). Check the gateway's URL.",
-        ) from error
-    if "parts" not in body:
-        raise Misconfigured(body.get("code", "bad_answer"), body.get("detail", response.text[:200]))
+    body = read_health(server, key)
     unhealthy = {name: part for name, part in body["parts"].items() if part["status"] != "healthy"}
     if unhealthy:
         problems = "; ".join(
@@ -187,6 +175,30 @@ def check_gateway(server: str, key: str | None) -> str:
         f"{server} is healthy ({body['version']}): {load['waiting_jobs']} jobs queued, "
         f"{load['finished_per_second']:.1f} photos/s"
     )
+
+
+def read_health(server: str, key: str | None) -> dict[str, Any]:
+    """Return the response of `GET /health`, whatever its status.
+
+    Raises:
+        Unavailable: `server_unreachable`.
+        Misconfigured: The answer is an error (with its code) or not a health report.
+    """
+    try:
+        response = httpx2.get(
+            f"{server.rstrip('/')}/api/v1/health",
+            headers={"Authorization": f"Bearer {key}"} if key else {},
+            timeout=10,
+        )
+        body: dict[str, Any] = response.json()
+    except (httpx2.HTTPError, ValueError) as error:
+        raise Unavailable(
+            "server_unreachable",
+            f"{server} does not answer ({type(error).__name__}). Check the gateway's URL.",
+        ) from error
+    if "parts" not in body:
+        raise Misconfigured(body.get("code", "bad_answer"), body.get("detail", response.text[:200]))
+    return body
 
 
 def _names_by_release(processes: list[ProcessStatus]) -> str:

@@ -17,10 +17,12 @@ from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NoReturn
 from uuid import UUID
 
 from sqlalchemy import func, select
 
+from placewise.answers import Map
 from placewise.client import Client
 from services.cli.descriptors.local_weights import find_dinov2_weights, suggest_extractor
 from services.cli.operations.deployment_checks import (
@@ -32,11 +34,14 @@ from services.cli.operations.deployment_checks import (
     check_search,
     check_steward,
     open_for_check,
+    read_health,
 )
 from shared.catalog.database.schema import check_pages, check_schema
 from shared.catalog.installation import Installation
+from shared.catalog.maps import count_failed_photos
 from shared.catalog.photos import Photo
 from shared.catalog.tables import open_catalog
+from shared.config.command_line import command_line
 from shared.config.embedded_home import find_running_server
 from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
@@ -75,7 +80,11 @@ def list_checks(settings: Settings, server: str | None, key: str | None) -> list
         checks.append(("uploads", _check_upload_dir))
     else:
         checks.append(("objects", check_object_store))
-    checks += [("collection", _check_collection), ("journal", _check_journal)]
+    checks += [
+        ("collection", _check_collection),
+        ("journal", _check_journal),
+        ("photos", _check_photos),
+    ]
     if settings.database_url is None:
         checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
@@ -169,7 +178,12 @@ def check_extractor(settings: Settings) -> str:
     Raises:
         Misconfigured: The weights are missing or don't fit the extractor.
     """
-    config = _default_extractor_config(settings)
+    summary = _check_weights(_default_extractor_config(settings), settings)
+    suggestion = suggest_extractor(settings)
+    return f"{summary}; {suggestion}" if suggestion else summary
+
+
+def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
     if config.depth is not None:
         return _check_dinov2(config, settings.dino_weights)
     if config.hub is not None:
@@ -180,13 +194,11 @@ def check_extractor(settings: Settings) -> str:
 
     extractor = load_extractor(config, settings)
     shipped = extractor.shipped_vocabulary()
-    summary = f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
+    return f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
         f"shipped vocabulary of {shipped[0].clusters} centres"
         if shipped
         else "no shipped vocabulary"
     )
-    suggestion = suggest_extractor(settings)
-    return f"{summary}; {suggestion}" if suggestion else summary
 
 
 def _check_dinov2(config: ExtractorConfig, weights: Path | None) -> str:
@@ -256,40 +268,84 @@ def _check_journal(settings: Settings) -> str:
     return "the catalog is up to date with the object store"
 
 
+def _check_photos(settings: Settings) -> str:
+    """Check that no stored photo is left out of searches because its description failed."""
+    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
+        return "nothing is stored yet"
+    with open_for_check(settings, CHECK_FILE) as catalog:
+        check_schema(catalog)
+        with catalog.read() as session:
+            failed = count_failed_photos(session)
+    if not failed:
+        return "no photo is left out of searches because its description failed"
+    named = ", ".join(f"{number} in the map {name}" for name, number in failed.items())
+    raise Misconfigured(
+        "photos_failed",
+        f"Stored photos can't be searched for, because their description failed: {named}. List "
+        "them with GET /api/v1/search?failed=true&map=NAME; the page shows the reason with each. "
+        "Delete or replace photos that can't be decoded; the next model change describes all "
+        "others again.",
+    )
+
+
 def _check_vocabulary(settings: Settings) -> str:
     running = find_running_server(settings.placewise_home)
     if running is None:
         return "checked only while a server runs"
+    extractors = read_health(running.url, running.key)["parts"].get("extractors", {})
     with Client(running.url, key=running.key) as client:
         maps = client.maps()
-    waiting = [m for m in maps if m.photos and m.generation_id is None]
+    unloadable = {
+        name: code
+        for each in extractors.get("processes", ())
+        for name, code in each["errors"].items()
+    }
+    for each in maps:
+        if each.photos and each.generation_id is None and each.extractor in unloadable:
+            _raise_unloadable(each, unloadable[each.extractor], settings)
+    waiting = extractors.get("waiting_for_vocabulary")
     if waiting:
-        names = ", ".join(f"{m.name} ({m.photos} photos)" for m in waiting)
+        names = ", ".join(f"{m.name} ({m.photos} photos)" for m in maps if m.name in waiting)
         raise Misconfigured(
             "vocabulary_missing",
             f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
-            "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless the "
-            "photos were uploaded just now.",
+            "--map NAME) or import one (placewise vocabulary import FILE --map NAME).",
         )
     pending = [m.name for m in maps if m.vocabulary == "pending"]
     if pending:
         return (
             f"no vocabulary yet in {', '.join(pending)}: their descriptors are GeM-pooled until "
             "one is fitted (placewise vocabulary fit --map NAME), which starts by itself at "
-            f"AUTO_FIT_PHOTOS ({settings.auto_fit_photos}) photos"
+            f"{MIN_PHOTOS_TO_FIT} photos"
         )
     provisional = [m.name for m in maps if m.vocabulary == "provisional"]
     if provisional:
         return (
-            f"vocabulary fitted on too few photos in {', '.join(provisional)}: fit another with "
-            f"`placewise vocabulary fit` when the map has {MIN_PHOTOS_TO_FIT} photos"
+            f"vocabulary fitted on too few photos in {', '.join(provisional)}: another one is "
+            f"fitted by itself at {MIN_PHOTOS_TO_FIT} photos"
         )
     foreign = [m.name for m in maps if m.vocabulary == "foreign"]
     if foreign:
         return (
-            f"foreign vocabulary in {', '.join(foreign)}: fit one with `placewise vocabulary fit`"
+            f"foreign vocabulary in {', '.join(foreign)}: one is fitted by itself at "
+            f"{MIN_PHOTOS_TO_FIT} photos unless a map's auto_fit is off, or with `placewise "
+            "vocabulary fit`"
         )
     return "no map uses a foreign vocabulary"
+
+
+def _raise_unloadable(map_: Map, code: str, settings: Settings) -> NoReturn:
+    """Say why the extractor of a map can't be loaded; it needs no vocabulary before."""
+    try:
+        _check_weights(settings.extractor_config(map_.extractor), settings)
+        reason = "The server's log has the details."
+    except Misconfigured as error:
+        reason = error.detail
+    raise Misconfigured(
+        code,
+        f"{map_.name} ({map_.photos} photos) can't be described: its extractor {map_.extractor} "
+        f"can't be loaded ({code}). {reason}",
+    )
 
 
 def _check_server(settings: Settings) -> str:
@@ -301,13 +357,14 @@ def _check_server(settings: Settings) -> str:
         searchable, stored = sum(m.searchable for m in maps), sum(m.photos for m in maps)
         names = ", ".join(m.name for m in maps)
         return f"running on {running.url}: {searchable} of {stored} photos searchable ({names})"
+    start = command_line("serve", home=settings.placewise_home)
     if not (settings.placewise_home / "catalog.sqlite").exists():
-        return "not running, nothing is stored yet (start it with make run)"
+        return f"not running, nothing is stored yet. Start it: {start}"
     with open_for_check(settings, CHECK_FILE) as catalog:
         check_pages(catalog, max_bytes=None)
         with catalog.read() as session:
             photos = session.scalar(select(func.count()).where(Photo.deleted_at.is_(None)))
-    return f"not running; {photos} photos are stored (start it with make run)"
+    return f"not running; {photos} photos are stored. Start it: {start}"
 
 
 def _check_collection(settings: Settings) -> str:

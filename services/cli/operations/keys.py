@@ -125,7 +125,8 @@ def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:
         raise NotFound(
             "map_not_found",
             f"There is no map named {', '.join(map(repr, missing))}. The maps are "
-            f"{', '.join(sorted(existing))}. Create a map: `placewise maps create NAME`.",
+            f"{', '.join(sorted(existing))}. Create a map: `placewise maps create NAME`. A key "
+            "for all maps has no --map.",
             map=missing[0],
         )
 

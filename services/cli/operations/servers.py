@@ -8,13 +8,18 @@ service only.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
 import os
-import shlex
+import shutil
+import signal
+import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +27,7 @@ from typing import TYPE_CHECKING
 from services.cli.environment import read_settings
 from services.cli.imports import collection_paused
 from services.cli.output import err_console, print_note
+from shared.config.command_line import command_line
 from shared.config.settings import Settings
 from shared.security.api_keys import is_loopback
 
@@ -32,6 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROOT = Path(__file__).parents[3]
+PARENT_POLL_SECONDS = 1.0
 CODE_FOLDERS = tuple(ROOT / package for package in ("placewise", "services", "shared"))
 
 
@@ -50,17 +57,23 @@ def serve() -> None:
     is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
 
     def announce(running: Standalone) -> None:
-        print_note(_startup_message(running, settings))
+        suggestion = None
         if is_first_start and settings.database_url is None:
             from services.cli.descriptors.local_weights import suggest_extractor
 
-            if suggestion := suggest_extractor(settings):
-                print_note(f"  note:     {suggestion}")
+            suggestion = suggest_extractor(settings)
+        print_note(_startup_message(running, settings, suggestion))
+
+        def stop() -> None:
+            running.server.should_exit = True
+
+        if "MAKELEVEL" in os.environ:
+            stop_with_make(stop)
         if settings.debug and can_reload():
 
             def restart() -> None:
                 changed.set()
-                running.server.should_exit = True
+                stop()
 
             watch_code(restart)
 
@@ -69,15 +82,15 @@ def serve() -> None:
         restart_process()
 
 
-def _startup_message(running: Standalone, settings: Settings) -> str:
+def _startup_message(running: Standalone, settings: Settings, suggestion: str | None) -> str:
+    """Return what `serve` prints; the address is at the end, where it stays visible."""
     # Complete: without its folder, a command of another shell would start a second Placewise.
-    command = f"PLACEWISE_HOME={shlex.quote(str(settings.placewise_home))} {sys.argv[0]}"
+    command = partial(command_line, home=settings.placewise_home)
     url = running.url
     header = '-H "Authorization: Bearer $PLACEWISE_KEY" ' if running.local_key else ""
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
         *_key_instructions(running, settings, command),
-        f"  open:     {url}   (console)   {url}/docs   (API reference)",
         (
             f"  upload:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
             f"{url}/api/v1/upload"
@@ -86,13 +99,17 @@ def _startup_message(running: Standalone, settings: Settings) -> str:
             f"  query:    curl {header}-F file=@OTHER.jpg -H 'Prefer: wait=30' "
             f"{url}/api/v1/similarity"
         ),
-        f"  folder:   {command} index DIR",
-        f"            {command} query PHOTO",
+        f"  folder:   {command('index', 'DIR')}",
+        f"            {command('query', 'PHOTO')}",
     ]
     if running.lan_url is not None:
         lines.append(f"  phone:    {running.lan_url}   (in the same network)")
         if err_console.is_terminal:
             lines.append(_qr_code(running.lan_url))
+    if suggestion:
+        lines.append(f"  note:     {suggestion}")
+    lines.append(f"  API:      {url}/docs")
+    lines.append(f"  open:     {url}")
     return "\n".join(lines)
 
 
@@ -105,7 +122,9 @@ def _qr_code(text: str) -> str:
     return drawing.getvalue()
 
 
-def _key_instructions(running: Standalone, settings: Settings, command: str) -> list[str]:
+def _key_instructions(
+    running: Standalone, settings: Settings, command: Callable[..., str]
+) -> list[str]:
     if running.local_key is None:
         return []
     lines = []
@@ -115,11 +134,63 @@ def _key_instructions(running: Standalone, settings: Settings, command: str) -> 
         lines.append(f"  key:      export PLACEWISE_KEY={running.first_admin_key}")
         lines.append("            It is shown only once. Every call requires a key.")
     elif settings.admin_key is not None:
-        lines.append(f"  key:      ADMIN_KEY, or one of those listed by {command} keys list")
+        lines.append(f"  key:      ADMIN_KEY, or one of those listed by {command('keys', 'list')}")
     else:
-        lines.append(f"  key:      one of those listed by {command} keys list")
-        lines.append(f"            To create one: {command} keys create NAME --scope admin")
+        create = command("keys", "create", "NAME", "--scope", "admin")
+        lines.append(f"  key:      one of those listed by {command('keys', 'list')}")
+        lines.append(f"            To create one: {create}")
     return lines
+
+
+def stop_with_make(stop: Callable[[], object]) -> None:
+    """Call `stop` once the `make` that runs this process, or the shell that runs `make`, has ended.
+
+    A closed terminal sends SIGHUP to all of them. A killed shell sends nothing, and its server
+    would keep the port and PLACEWISE_HOME. `nohup make run` ignores SIGHUP: it outlives its shell,
+    and so does `make run &`.
+    """
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return
+    make = shell = os.getppid()
+    ps = None if _is_in_background() else shutil.which("ps")
+    if ps is not None:
+        command = [ps, "-o", "ppid=", "-p", str(make)]
+        # Without an answer, for example of a process that is hidden, only make is watched.
+        with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError):
+            shell = int(subprocess.check_output(command))  # noqa: S603  (our own command)
+
+    def run() -> None:
+        while os.getppid() == make and _is_running(shell):
+            time.sleep(PARENT_POLL_SECONDS)
+        stop()
+
+    threading.Thread(target=run, name="parent watch", daemon=True).start()
+
+
+def _is_in_background() -> bool:
+    """Return whether a shell has started this process in the background.
+
+    A shell without job control lets such processes ignore SIGINT; another one gives them a process
+    group that is not the terminal's.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        return True
+    try:
+        with Path("/dev/tty").open() as terminal:
+            return os.tcgetpgrp(terminal.fileno()) != os.getpgrp()
+    except OSError:  # no terminal
+        return False
+
+
+def _is_running(process_id: int) -> bool:
+    try:
+        os.kill(process_id, 0)
+        # Linux: one that has ended stays there, as a zombie, until its parent reads its status.
+        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except ProcessLookupError:
+        return False
+    except OSError:  # of another user, or a system without /proc
+        return True
 
 
 def can_reload() -> bool:

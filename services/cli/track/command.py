@@ -57,9 +57,7 @@ MAX_PHOTOS_DRAWN = 20_000
 def track(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="PHOTOS_OR_VIDEO", exists=True, help="A folder of photos, or a video."
-        ),
+        typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
     ],
     out: Annotated[
         list[Path] | None,
@@ -95,7 +93,7 @@ def track(
         datetime | None,
         typer.Option(
             help="Time of the first frame, UTC, for videos and photos in the order of their names. "
-            "Default: the time of the file."
+            "Default: when the video was recorded, otherwise 1970-01-01."
         ),
     ] = None,
     gps_accuracy: Annotated[
@@ -118,7 +116,7 @@ def track(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Follow the camera that took PHOTOS_OR_VIDEO through a map, frame by frame.
+    """Follow the camera that took the photos or the video in SOURCE through a map, frame by frame.
 
     The photos are not added to the map. The track stays on the server for some time, where the page
     shows it.

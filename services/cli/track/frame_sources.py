@@ -12,10 +12,11 @@ from pathlib import Path
 from PIL import Image
 
 from services.cli.ingest.geotags import list_photos
-from services.cli.output import printable_path
+from services.cli.output import print_note, printable_path, utf8_path
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
 
+UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of its last copy
 MAX_HEADER_PIXELS = 2**31  # only headers are read here; the server has a limit of its own
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
 JPEG_QUALITY = 92  # of the frames of a video
@@ -47,7 +48,7 @@ class FrameTiming:
     order: Order | None
     """of photos; None: by their times if all have one, otherwise by their names"""
     begin: datetime | None
-    """time of the first frame; None: that of the file"""
+    """time of the first frame; None: of a video when it was recorded, else UNKNOWN_BEGIN"""
 
 
 def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
@@ -57,7 +58,6 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
         InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
     """
     photos = [(path, _header_of(path)) for path in list_photos(folder)]
-    first = timing.begin or _modified_at(photos[0][0])
     without_time = next((path for path, header in photos if header.captured_at is None), None)
     if timing.order == Order.TIME and without_time is not None:
         raise InvalidRequest(
@@ -66,10 +66,13 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
             "and --every with the seconds between two photos.",
         )
     by_name = timing.order == Order.NAME or without_time is not None
+    first = timing.begin or UNKNOWN_BEGIN
+    if by_name:
+        _print_clock(timing.begin, None, "photos in the order of their names")
     frames = [
         SourceFrame(
             path,
-            printable_path(path.relative_to(folder)),
+            utf8_path(path.relative_to(folder)),
             first + timedelta(seconds=number * timing.every_seconds)
             if by_name or header.captured_at is None
             else header.captured_at,
@@ -104,8 +107,9 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
                     "unreadable_video",
                     f"{printable_path(video)} is neither a folder of photos nor a video.",
                 )
-            created = container.metadata.get("creation_time")
-            first = timing.begin or _parse_created(created) or _modified_at(video)
+            recorded = _parse_created(container.metadata.get("creation_time"))
+            first = timing.begin or recorded or UNKNOWN_BEGIN
+            _print_clock(timing.begin, recorded, "the video")
             begin = due = 0.0
             for number, frame in enumerate(container.decode(video=0)):
                 if number == 0:
@@ -139,8 +143,15 @@ def _with_distinct_times(frames: list[SourceFrame]) -> list[SourceFrame]:
     return distinct
 
 
-def _modified_at(path: Path) -> datetime:
-    return datetime.fromtimestamp(path.stat().st_mtime, UTC)
+def _print_clock(begin: datetime | None, recorded: datetime | None, source: str) -> None:
+    """Say which clock the times of frames are of that have none in their EXIF."""
+    if begin is not None:
+        clock = f"{begin:%Y-%m-%d %H:%M:%S} UTC (--begin)"
+    elif recorded is not None:
+        clock = f"{recorded.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC, when it was recorded"
+    else:
+        clock = f"{UNKNOWN_BEGIN:%Y-%m-%d %H:%M:%S} UTC: their time is unknown (--begin sets it)"
+    print_note(f"Times of {source} count from {clock}.")
 
 
 def _parse_created(text: str | None) -> datetime | None:

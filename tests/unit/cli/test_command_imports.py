@@ -49,7 +49,7 @@ def test_the_help_of_the_program_imports_no_command_and_names_each_as_the_comman
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     overview, imported = run.stdout.rstrip("\n").rsplit("\n", 1)
-    assert imported == "services.cli.main"
+    assert imported == "services.cli.main services.cli.help_layout"
     complete = CliRunner().invoke(build_app(), ["--help"], prog_name="placewise")
     assert overview.split() == complete.output.split()
 

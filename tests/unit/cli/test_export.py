@@ -97,14 +97,22 @@ def test_a_map_without_queries_pairs_its_own_photos_and_passes_over_what_waits(
     assert report["passed_over"] == 1
 
 
-@pytest.mark.parametrize("names", [("a.jpg", "a.jpg"), ("a b.jpg",)])
-def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused(
-    server: FakeServer, client: Client, names: tuple[str, ...]
+@pytest.mark.parametrize(
+    ("photos", "names", "remedy"),
+    [
+        (("a.jpg", "a.jpg"), PairNames.FILENAME, "--names path or --names id."),
+        (("a b.jpg",), PairNames.FILENAME, "by ID: --names id."),
+        (("a b.jpg",), PairNames.PATH, "by ID: --names id."),
+    ],
+)
+def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused_with_names_that_it_can(
+    server: FakeServer, client: Client, photos: tuple[str, ...], names: PairNames, remedy: str
 ) -> None:
-    will_list(server, *(photo(name) for name in names))
+    will_list(server, *(photo(name) for name in photos))
     with pytest.raises(InvalidRequest) as caught:
-        pairs_of(client)
+        pairs_of(client, names)
     assert caught.value.code == "ambiguous_names"
+    assert caught.value.detail.endswith(remedy)
 
 
 def test_pairs_name_photos_of_one_name_by_their_paths(server: FakeServer, client: Client) -> None:

@@ -1,4 +1,4 @@
-"""When `placewise index` fits a vocabulary after the upload."""
+"""How `placewise index` follows the vocabulary fit that the server starts."""
 
 from __future__ import annotations
 
@@ -7,29 +7,47 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
-from placewise.answers import Stats
+from placewise.answers import Job
 from placewise.client import Client
-from services.cli.ingest.upload import fit_vocabulary_if_needed
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
-from tests.support.api_responses import JOB, STARTED, STATS
+from services.cli.ingest.upload import wait_for_automatic_fit
+from tests.support.api_responses import JOB, STATS
 from tests.unit.client.test_client import running_server
 
+FIT = {**JOB, "kind": "fit", "label": "Improving the map", "state": "running"}
 
-def fits(**stats: Any) -> bool:
-    """Whether a vocabulary is fitted for a map with these statistics."""
+
+def wait(
+    *answers: Any, photos: int = 50, next_fit: int | None = 50
+) -> tuple[Job | None, list[str]]:
+    """The job of the fit on a server with this map; the methods of the requests."""
     with running_server() as server, Client(server.url) as client:
-        for answer in (STARTED, {**JOB, "state": "succeeded"}, STATS):
+        for answer in ({**STATS, "total_images": photos, "next_fit_photos": next_fit}, *answers):
             server.will_answer(200, answer)
-        fit_vocabulary_if_needed(client, Stats(**{**STATS, **stats}), Progress(disable=True))
-        return any(path.endswith("/vocabularies") for _, path, _ in server.requests)
+        job = wait_for_automatic_fit(client, Progress(disable=True))
+        assert not server.answers
+        return job, [method for method, _, _ in server.requests]
 
 
-@pytest.mark.parametrize("vocabulary", ["foreign", "provisional", "pending", None])
-def test_enough_photos_replace_a_vocabulary_that_is_not_their_own(vocabulary: str | None) -> None:
-    assert fits(vocabulary=vocabulary, total_images=MIN_PHOTOS_TO_FIT)
-    assert not fits(vocabulary=vocabulary, total_images=MIN_PHOTOS_TO_FIT - 1)
+def jobs(*listed: Any) -> dict[str, Any]:
+    return {"jobs": list(listed), "next_cursor": None}
 
 
-@pytest.mark.parametrize("vocabulary", ["own", "none"])
-def test_a_map_with_a_vocabulary_of_its_own_or_without_any_keeps_it(vocabulary: str) -> None:
-    assert not fits(vocabulary=vocabulary, total_images=10 * MIN_PHOTOS_TO_FIT)
+def test_a_fit_that_runs_is_waited_for_and_none_is_started() -> None:
+    job, requests = wait(jobs(FIT), FIT, {**FIT, "state": "succeeded"})
+    assert job is not None
+    assert job.state == "succeeded"
+    assert set(requests) == {"GET"}
+
+
+@pytest.mark.parametrize(("photos", "next_fit"), [(49, 50), (500, None)])
+def test_a_map_that_is_not_due_is_not_waited_for(photos: int, next_fit: int | None) -> None:
+    assert wait(jobs(), photos=photos, next_fit=next_fit)[0] is None
+
+
+def test_a_fit_that_failed_leaves_the_upload_a_success(capsys: pytest.CaptureFixture[str]) -> None:
+    error = {"type": "urn:a", "title": "t", "status": 422, "code": "change_loses_photos"}
+    failed = {**FIT, "state": "failed", "error": {**error, "detail": "Too many failed."}}
+    job, _ = wait(jobs(FIT), failed, failed)
+    assert job is not None
+    assert job.state == "failed"
+    assert "Too many failed." in " ".join(capsys.readouterr().err.split())

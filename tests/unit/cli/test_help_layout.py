@@ -21,6 +21,13 @@ def walk(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
         yield path, command
 
 
+def description_columns(panel: str) -> int:
+    """Return the width of a panel's last column: from where its wrapped lines begin."""
+    rows = [line[1:-1] for line in panel.splitlines() if line.startswith("│")]
+    wrapped = [len(row) - len(row.lstrip()) for row in rows if row.startswith(" " * 8)]
+    return 78 - max(wrapped, default=0)
+
+
 def test_the_help_of_every_command_names_all_options_in_full_and_fills_its_lines(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -34,7 +41,30 @@ def test_the_help_of_every_command_names_all_options_in_full_and_fills_its_lines
         for parameter in command.params:
             for name in parameter.opts:
                 assert not name.startswith("--") or name in shown, (path, name)
+                assert "_" not in name or not name.startswith("--"), (path, name)
+        for panel in shown.split("╭")[1:]:
+            assert description_columns(panel) >= 36, (path, panel)
         text = "\n".join(map(str.rstrip, shown.splitlines()))
         for paragraph in text.partition("╭")[0].strip().split("\n\n")[1:]:
             for line, following in pairwise(paragraph.splitlines()):
                 assert len(line) + 1 + len(following.split()[0]) > 79, (path, line)
+
+
+def test_options_and_commands_are_accepted_with_hyphens_and_underscores(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    program: Any = typer.main.get_command(build_app())
+    program.main(["rebuild_catalog", "--help"], standalone_mode=False)
+    assert "rebuild-catalog" in capsys.readouterr().out
+    for option in ("--top-k", "--top_k"):
+        with pytest.raises(SystemExit, match="2"):
+            program.main(["query", __file__, option, "many"])
+        assert "Invalid value for '--top-k'" in capsys.readouterr().err
+
+
+def test_every_command_is_in_a_panel_of_the_overview(capsys: pytest.CaptureFixture[str]) -> None:
+    program: Any = typer.main.get_command(build_app())
+    program.main(["--help"], standalone_mode=False)
+    shown = capsys.readouterr().out
+    assert "─ Commands ─" not in shown
+    assert all(f"│ {name} " in shown for name in program.commands)

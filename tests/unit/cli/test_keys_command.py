@@ -23,6 +23,7 @@ def test_a_map_that_does_not_exist_is_refused_by_a_servers_list_of_maps() -> Non
         server.will_answer(200, [MAP])
         result = CliRunner().invoke(app, [*CREATE, "tover", "--server", server.url])
     assert "There is no map named 'tover'. The maps are tower." in str(result.exception)
+    assert "A key for all maps has no --map." in str(result.exception)
     assert [request[1] for request in server.requests] == ["/api/v1/maps"], "no key is created"
 
 

@@ -36,6 +36,7 @@ def estimate(levels: list[dict[str, Any]], **fields: Any) -> dict[str, Any]:
         "answer_level": None,
         "certainty": 0.95,
         "not_in_map_probability": 0.02,
+        "has_place": True,
         "calibration_source": "own_photos",
         **fields,
     }
@@ -70,10 +71,7 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
         relative_path="Day 2/a[/b].jpg",
     )
     lines = shown.splitlines()
-    assert (
-        "At a certainty of 95 %, the finest answer is tower/floor 7 [east], with a probability of "
-        "97.2 %." in lines
-    )
+    assert "97.2 % sure it is in tower/floor 7 [east]." in lines
     for name, probability in (
         *((level["place"], level["probability"]) for level in PLACES),
         ("not in this map", 0.02),
@@ -93,11 +91,11 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
 def test_a_finer_level_that_is_as_certain_is_explained(tmp_path: Path) -> None:
     levels = [{**PLACES[0], "probability": 0.96}, *PLACES[1:]]
     answered, _ = query(tmp_path, estimate(levels, answer_level=1))
-    assert "Finer levels require stronger evidence" in " ".join(answered.split())
+    assert "A finer answer needs clearer signs" in " ".join(answered.split())
     unanswered, _ = query(tmp_path, estimate(levels))
-    assert "but it requires stronger evidence" in " ".join(unanswered.split())
+    assert "but it is not clear whether the place is in the map" in " ".join(unanswered.split())
     plain, _ = query(tmp_path, estimate(PLACES, answer_level=1))
-    assert "stronger evidence" not in plain
+    assert "clear" not in plain
 
 
 def test_a_long_label_leaves_room_for_the_probability_and_the_bar(tmp_path: Path) -> None:
@@ -116,29 +114,29 @@ def test_circles_are_named_by_their_radius_with_the_radii_of_68_and_95_percent(
         estimate(CIRCLES, answer_level=3, radius_68_m=79.4, radius_95_m=1750.2),
     )
     text = " ".join(shown.split())
-    assert "the finest answer is within 2 km of 45.000000, 7.000000, with a prob" in text
+    assert "96.0 % sure it is within 2 km of 45.000000, 7.000000." in text
     assert "Position: 68 % within 79 m, 95 % within 1.8 km." in text
     for name in ("within 25 m", "within 100 m", "within 500 m", "within 2 km"):
         assert f"\n{name} " in shown
 
 
 @pytest.mark.parametrize(
-    ("outside", "sentence"),
+    ("outside", "has_place", "sentence"),
     [
-        (0.62, "The map probably has no photo of this place (62.0 %)."),
+        (0.62, True, "62.0 % sure that the map has no photo of this place."),
+        (0.1, False, "Probably not in this map."),
         (
             0.1,
-            (
-                "No level is certain enough at a certainty of 99.5 %; the most probable is within "
-                "2 km of 45.000000, 7.000000, with 96.0 %."
-            ),
+            True,
+            ("96.0 % sure it is within 2 km of 45.000000, 7.000000: an answer needs 99.5 %."),
         ),
     ],
 )
 def test_without_an_answer_one_sentence_gives_the_reason(
-    tmp_path: Path, outside: float, sentence: str
+    tmp_path: Path, outside: float, has_place: bool, sentence: str
 ) -> None:
     answer = estimate(CIRCLES, certainty=0.995, not_in_map_probability=outside)
+    answer |= {"has_place": has_place, "reason": "Probably not in this map."}
     assert sentence in query(tmp_path, answer)[0].splitlines()
 
 
@@ -149,7 +147,9 @@ def test_the_certainty_is_sent_to_the_server(tmp_path: Path) -> None:
 
 def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_path: Path) -> None:
     shown, path = query(tmp_path, {"reason": "No place is known."})
-    assert "No place estimate: No place is known." in shown.splitlines()
+    assert "No estimate. No place is known." in shown.splitlines()
+    guess = {"latitude": 45.0, "longitude": 7.0, "radius_m": 25.0, "reason": "Not measured yet."}
+    assert "Best guess: 45.000000, 7.000000. Not measured yet." in query(tmp_path, guess)[0]
     assert "probability" not in shown
     assert "match" not in shown
     assert "certainty" not in path

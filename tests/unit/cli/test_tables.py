@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from rich.progress_bar import ProgressBar
 
-from services.cli.output import Table, print_table, progress_bar
+from services.cli.output import Table, print_message, print_table, progress_bar
 from services.cli.training.commands import _TerminalDisplay
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
@@ -50,6 +50,23 @@ def test_long_names_are_shortened_in_the_middle_to_fit_80_columns(
         assert name.endswith(end), shown
     assert " foreign " in row
     assert "(PCA" in " ".join(lines), "text with spaces wraps"
+
+
+@pytest.mark.usefixtures("terminal")
+def test_a_terminal_gets_no_escape_sequences_of_names(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "\x1b]0;owned\x9b2J"
+    table = Table("photo", "text")
+    table.add_row(name, f"a text with {name} in it")
+    print_table(table)
+    print_message(f"first line\n{name}")
+    with progress_bar() as progress:
+        progress.add_task(name, total=1)
+    printed = "".join(capsys.readouterr())
+    assert printed.count("\ufffd]0;owned\ufffd2J") == 3
+    assert "\ufffd]0;owned" in printed.splitlines()[-2], "the progress bar"
+    assert "\x1b]" not in printed
+    assert "\x9b" not in printed
+    assert "first line\n" in printed
 
 
 @pytest.mark.usefixtures("terminal")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -37,7 +36,8 @@ from tests.support.api_responses import PHOTO
 from tests.support.photos import photo_bytes, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
-BY_FILE = FrameTiming(every_seconds=2.0, order=None, begin=None)
+UNKNOWN = FrameTiming(every_seconds=2.0, order=None, begin=None)
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def taken_at(number: int, time: datetime | None) -> bytes:
@@ -57,7 +57,7 @@ def test_photos_are_in_the_order_of_their_times_and_no_two_times_are_equal(tmp_p
     for number, (name, seconds) in enumerate(times.items()):
         photo = taken_at(number, NOON + timedelta(seconds=seconds))
         (tmp_path / name).write_bytes(photo)
-    frames = read_photo_frames(tmp_path, BY_FILE)
+    frames = read_photo_frames(tmp_path, UNKNOWN)
     assert [frame.name for frame in frames] == ["c.jpg", "a.jpg", "b.jpg", "sub/d.jpg"]
     assert [(frame.captured_at - NOON).total_seconds() for frame in frames] == [0, 5, 5.001, 9]
 
@@ -66,10 +66,9 @@ def test_photos_without_a_time_are_in_the_order_of_their_names(tmp_path: Path) -
     for number, name in enumerate(("b.jpg", "a.jpg")):
         (tmp_path / name).write_bytes(photo_bytes(number))
     (tmp_path / "c.jpg").write_bytes(b"no photo")
-    os.utime(tmp_path / "a.jpg", (NOON.timestamp(), NOON.timestamp()))
-    frames = read_photo_frames(tmp_path, BY_FILE)
+    frames = read_photo_frames(tmp_path, UNKNOWN)
     assert [frame.name for frame in frames] == ["a.jpg", "b.jpg", "c.jpg"]
-    assert [(frame.captured_at - NOON).total_seconds() for frame in frames] == [0, 2, 4]
+    assert [(frame.captured_at - EPOCH).total_seconds() for frame in frames] == [0, 2, 4]
     later = FrameTiming(1.0, Order.NAME, NOON + timedelta(days=1))
     assert read_photo_frames(tmp_path, later)[1].captured_at == NOON + timedelta(days=1, seconds=1)
     with pytest.raises(InvalidRequest, match=r"a\.jpg has no capture time") as refusal:
@@ -77,11 +76,11 @@ def test_photos_without_a_time_are_in_the_order_of_their_names(tmp_path: Path) -
     assert refusal.value.code == "no_times"
 
 
-@pytest.fixture
-def video(tmp_path: Path) -> Path:
+def write_video(path: Path, recorded: datetime | None = None) -> Path:
     """Three seconds with ten frames each, brighter from second to second."""
-    path = tmp_path / "ride.mp4"
     with av.open(str(path), "w") as container:
+        if recorded is not None:
+            container.metadata["creation_time"] = recorded.isoformat()
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         for number in range(30):
@@ -89,6 +88,35 @@ def video(tmp_path: Path) -> Path:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
     return path
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    return write_video(tmp_path / "ride.mp4")
+
+
+@pytest.mark.parametrize(
+    ("recorded", "begin", "first", "words"),
+    [
+        (None, None, EPOCH, "1970-01-01 00:00:00 UTC: their time is unknown"),
+        (NOON, None, NOON, "2026-05-01 12:00:00 UTC, when it was recorded"),
+        (NOON, EPOCH, EPOCH, r"1970-01-01 00:00:00 UTC (--begin)"),
+    ],
+)
+def test_a_video_has_its_own_clock_which_is_named(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    recorded: datetime | None,
+    begin: datetime | None,
+    first: datetime,
+    words: str,
+) -> None:
+    path = write_video(tmp_path / "copied.mp4", recorded)
+    frames = list(read_video_frames(path, FrameTiming(1.0, None, begin), tmp_path))
+    assert [frame.captured_at for frame in frames] == [
+        first + timedelta(seconds=seconds) for seconds in range(3)
+    ]
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("every", "seconds"), [(1.0, [0, 1, 2]), (1.25, [0, 1.3, 2.5])])
@@ -107,11 +135,11 @@ def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
     text = tmp_path / "notes.txt"
     text.write_text("no video")
     with pytest.raises(InvalidRequest, match=r"notes\.txt") as refusal:
-        list(read_video_frames(text, BY_FILE, tmp_path))
+        list(read_video_frames(text, UNKNOWN, tmp_path))
     assert refusal.value.code == "unreadable_video"
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(Misconfigured, match=r"uv pip install '\.\[tracks\]'"):
-        list(read_video_frames(text, BY_FILE, tmp_path))
+        list(read_video_frames(text, UNKNOWN, tmp_path))
 
 
 def state(status: str, latitude: float | None, place: str | None = None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from tests.support.api_responses import JOB, PHOTO_ID, STATS, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 
 TAKEN = JournalEntry("file", "job")
+NO_JOBS: dict[str, Any] = {"jobs": [], "next_cursor": None}
 
 
 @pytest.fixture
@@ -103,10 +104,10 @@ def test_a_run_that_was_broken_off_sends_only_the_rest(
     server.will_answer(200, STATS)
     server.will_answer(202, UPLOADED)
     server.will_answer(404, NotFound("job_not_found", "Deleted.").as_problem())
-    server.will_answer(200, JOB)
-    server.will_answer(200, STATS)
+    for answer in (JOB, STATS, NO_JOBS, STATS):
+        server.will_answer(200, answer)
     with Client(server.url) as client, UploadJournal(path, server.url, None) as journal:
-        report = upload_photos(client, photos, False, Progress(disable=True), journal=journal)
+        report = upload_photos(client, photos, Progress(disable=True), journal=journal)
     assert uploads(server) == 1
     assert (report["uploaded"], report["already_there"]) == (1, 1)
     assert report["refused"] == report["failed"] == []
@@ -119,11 +120,11 @@ def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(
 ) -> None:
     server.will_answer(200, STATS)
     server.will_answer(202, UPLOADED)
-    for _ in ("before a fit", "and after"):
-        server.will_answer(200, {**JOB, "state": "queued", "waiting_for": "vocabulary"})
-        server.will_answer(200, STATS)
+    waiting = {**JOB, "state": "queued", "waiting_for": "vocabulary"}
+    for answer in (waiting, STATS, NO_JOBS, waiting, STATS):
+        server.will_answer(200, answer)
     with Client(server.url) as client:
-        report = upload_photos(client, [photo], False, Progress(disable=True))
+        report = upload_photos(client, [photo], Progress(disable=True))
     assert report["failed"] == []
     polls = [path for _, path, _ in server.requests if path.startswith("/api/v1/jobs/")]
     assert len(polls) == 2

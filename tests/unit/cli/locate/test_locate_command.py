@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import json
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import pytest
@@ -15,7 +20,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
 from placewise.answers import Similar
-from services.cli.locate import command, writers
+from services.cli.locate import command, preview, undo_journal, writers
 from services.cli.locate.folder import FolderPhoto, read_folder, read_gpx
 from services.cli.locate.sidecars import add_position, read_position
 from services.cli.main import build_app
@@ -182,6 +187,7 @@ def test_sidecars_are_written_for_accepted_proposals_and_undone(folder: Path) ->
     written = run(folder, "--write", "sidecar")
     assert written.exit_code == 0, written.output
     assert "1 files written: day 1/2.jpg.xmp" in written.stderr
+    assert written.stderr.rstrip().endswith(f" locate {folder} --undo")
     position = read_position((folder / "day 1" / "2.jpg.xmp").read_bytes())
     assert position == pytest.approx((LATITUDE + 20 * DEGREES_PER_M, LONGITUDE), abs=1e-5)
     assert proposals(folder).keys() == {"4.jpg"}, "it has coordinates now"
@@ -219,6 +225,90 @@ def test_exif_is_written_into_the_photo_and_undone(
     assert Image.open(folder / "day 1" / "2.jpg").tobytes() == pixels
     assert run(folder, "--undo").exit_code == 0
     assert contents(folder) == before
+
+
+def test_a_photo_keeps_its_owner_group_mode_and_attributes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pyexiv2
+    path = folder / "day 1" / "2.jpg"
+    if os.geteuid() == 0:
+        os.chown(path, 10001, 10002)
+    else:
+        os.chown(path, -1, os.getgroups()[-1])
+    path.chmod(0o640)
+    with contextlib.suppress(OSError):  # a file system without extended attributes
+        os.setxattr(path, "user.note", b"kept")
+
+    def attributes() -> object:
+        status = path.stat()
+        names = os.listxattr(path)
+        return status.st_uid, status.st_gid, status.st_mode, [os.getxattr(path, n) for n in names]
+
+    before, content = attributes(), path.read_bytes()
+    assert run(folder, "--write", "exif").exit_code == 0
+    assert path.read_bytes() != content
+    assert attributes() == before
+    monkeypatch.setattr("os.link", Mock(side_effect=OSError("no hard links")))
+    assert run(folder, "--undo").exit_code == 0
+    assert (path.read_bytes(), attributes()) == (content, before)
+
+
+def test_a_photo_whose_owner_would_change_is_left_as_it_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pyexiv2
+    before = contents(folder)
+    mine = Path.stat
+
+    def of_another_user(path: Path, **options: Any) -> os.stat_result:
+        status = mine(path, **options)
+        return os.stat_result(
+            [*status[:4], status.st_uid + (path.parent.name == "day 1"), *status[5:]]
+        )
+
+    monkeypatch.setattr(Path, "stat", of_another_user)
+    monkeypatch.setattr("os.chown", Mock(side_effect=PermissionError))
+    result = run(folder, "--write", "exif")
+    assert result.exit_code == 1
+    assert "belongs to user" in result.stderr
+    assert {n: c for n, c in contents(folder).items() if "placewise" not in n} == before
+
+
+def test_a_name_that_is_too_long_for_a_sidecar_stops_only_its_own_photo(folder: Path) -> None:
+    (folder / f"{'x' * 249}.jpg").write_bytes(photo(30))
+    result = run(folder, "--write", "sidecar")
+    assert result.exit_code == 1
+    assert "xxx.jpg: can't be written: File name too long" in result.stderr
+    assert (folder / "day 1" / "2.jpg.xmp").exists()
+
+
+def test_what_is_no_regular_file_is_never_opened(folder: Path) -> None:
+    os.mkfifo(folder / "day 1" / "2.jpg.xmp")
+    os.mkfifo(folder / "5.jpg")
+    result = run(folder, "--write", "sidecar")  # it would wait for ever
+    assert result.exit_code == 1
+    assert "2.jpg.xmp is not a regular file" in result.stderr
+    assert "5.jpg" not in result.stdout
+    os.mkfifo(folder / undo_journal.FOLDER / "lock2")
+    for arguments in (("--write", "sidecar"), ("--undo",)):
+        refused = run(folder, *arguments)
+        assert "out_unwritable" in refused.stderr
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(folder: Path) -> None:
+    name = "\x1b]0;title\x9b31m\nfake\trow.jpg"
+    (folder / name).write_bytes(photo(30))
+    os.mkfifo(folder / f"{name}.xmp")
+    result = run(folder, "--write", "sidecar")
+    shown = "\ufffd]0;title\ufffd31m"
+    assert not set("\x1b\x9b") & set(result.output)
+    (row,) = [line for line in result.stdout.splitlines() if "title" in line]
+    assert row.startswith(f"{shown} fake row.jpg\t")
+    assert f"skipped {shown}\ufffdfake\ufffdrow.jpg:" in result.stderr
+    as_json = run(folder, "--json")
+    assert not set("\x1b\x9b") & set(as_json.output)
+    assert name in {each["filename"] for each in json.loads(as_json.stdout)["proposals"]}
 
 
 def test_a_photo_whose_exif_cannot_be_written_is_skipped_with_the_reason(
@@ -303,7 +393,8 @@ class ScriptedClient:
         self.answers = list(answers)
         self.boxes: list[str | None] = []
 
-    def similar(self, path: Path, top_k: int, box: str | None = None) -> Similar:
+    def similar(self, path: Path, top_k: int, history: bool, box: str | None = None) -> Similar:
+        assert not history
         self.boxes.append(box)
         return self.answers.pop(0)
 
@@ -311,16 +402,15 @@ class ScriptedClient:
 def search(*answers: Similar) -> tuple[Any, list[str | None]]:
     client = ScriptedClient(*answers)
     photos = [FolderPhoto("a.jpg", None, False, None, None, None, Path("a.jpg"))]
-    found = command._search_photos(client, photos)  # type: ignore[arg-type]
-    return found[0], client.boxes
+    found = command._search_photos(client, 1000, photos)  # type: ignore[arg-type]
+    return found[Path("a.jpg")].evidence, client.boxes
 
 
 def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others() -> None:
     unlocated = {**PHOTO, "latitude": None, "longitude": None, "place": None}
-    first = answer(similar_images=[{**unlocated, "similarity_score": 1.0}], estimate={"reason": ""})
-    found, boxes = search(first, answer())
+    first = answer(similar_images=[{**unlocated, "similarity_score": 1.0}], matches_without_place=1)
+    evidence, boxes = search(first, answer())
     assert boxes == [None, command.WITH_COORDINATES]
-    evidence = command.picture_evidence(found, 1000)
     assert [circle.radius_m for circle in evidence.circles] == [25.0, 100.0]
     assert evidence.similar[0].name == "Day 2/street.jpg"
     assert search(answer())[1] == [None]
@@ -343,6 +433,47 @@ def connect(monkeypatch: pytest.MonkeyPatch, response: Similar) -> None:
             return response
 
     monkeypatch.setattr(command, "connect", lambda *options: Connection())
+
+
+def test_what_a_preview_has_shown_is_written_although_the_map_answers_differently_since(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connect(monkeypatch, answer())
+    shown = proposals(folder, picture=True)
+    (folder / "new.jpg").write_bytes(photo(None))
+    sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
+    connect(monkeypatch, answer(estimate={"reason": "", "levels": sure}))
+    written = run(folder, "--write", "csv", picture=True)
+    assert written.exit_code == 0, written.output
+    assert "1 proposals are not as they were accepted then" in written.stderr
+    assert written.stderr.rstrip().endswith(": new.jpg")
+    rows = (folder / "placewise-locations.csv").read_text().splitlines()[1:]
+    coordinates = {name: (latitude, longitude) for name, latitude, longitude, _ in csv.reader(rows)}
+    for name, each in shown.items():
+        position = each["position"]
+        assert coordinates.pop(name) == (str(position["latitude"]), str(position["longitude"]))
+    assert coordinates.keys() == {"new.jpg"}
+
+
+def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connect(monkeypatch, answer())
+    shown = run(folder, picture=True)
+    monkeypatch.setattr(command, "connect", None)
+    written = run(folder, "--write", "csv", picture=True)
+    assert written.exit_code == 0, written.output
+    assert written.stdout == shown.stdout
+    assert "All proposals are as they were then." in written.stderr
+    (folder / "4.jpg").write_bytes(photo(26, camera="another"))
+    connect(monkeypatch, answer(estimate={"reason": "", "levels": []}))
+    written = run(folder, "--write", "csv", picture=True)
+    assert written.stderr.rstrip().endswith(": 4.jpg")
+    old = datetime.now(UTC) - preview.KEPT_FOR
+    for file in (Path(os.environ["PLACEWISE_HOME"]) / "locate").iterdir():
+        kept = preview.PREVIEW.validate_json(file.read_bytes())
+        file.write_bytes(preview.PREVIEW.dump_json(replace(kept, searched_at=old)))
+    assert "The searches are those of" not in run(folder, "--write", "csv", picture=True).stderr
 
 
 def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
