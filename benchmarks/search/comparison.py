@@ -26,6 +26,7 @@ from benchmarks.search.methods import (
     BruteForce,
     FaissBinary,
     FaissFlat,
+    FaissPanorama,
     NumpySearch,
     PlacewiseSearch,
     PlacewiseWorker,
@@ -146,8 +147,10 @@ def report_comparison(report: Report, compared: MethodComparison) -> None:
     for case, method, least in (
         (MATCHED_CASE, NumpySearch.name, 40),
         (MATCHED_CASE, FaissFlat.name, 100),
+        (MATCHED_CASE, FaissPanorama.name, 1),
         (MATCHED_CASE, AnyLocSearch.name, 300),
         (OUT_OF_MAP_CASE, NumpySearch.name, 6),
+        (OUT_OF_MAP_CASE, FaissPanorama.name, 1),
     ):
         ratio = compared.ratio(case, method)
         target = least if has_targets else None
@@ -161,6 +164,8 @@ def report_comparison(report: Report, compared: MethodComparison) -> None:
     ):
         report.add(f"{size}: {what}", value, "x", at_most=most if has_targets else None)
 
+
+PANORAMA_LEVELS = 8  # as in faiss' own benchmark of it
 
 # So long BLAS' threads look for more work before they sleep, on a core that the next method needs.
 PAUSE_SECONDS = 0.05
@@ -270,6 +275,8 @@ def _make_methods(
     photos = len(world.photo_ids)
     rows = faiss.rev_swig_ptr(index.get_xb(), photos * world.dimension)
     rows = rows.reshape(photos, world.dimension)
+    panorama = faiss.IndexFlatIPPanorama(world.dimension, PANORAMA_LEVELS)
+    panorama.add(rows)
     ids = world.photo_ids
     ours = PlacewiseSearch(world, worker, queries)
     snapshot = worker.snapshot(world.generation_id, world.version)
@@ -278,6 +285,7 @@ def _make_methods(
         PlacewiseWorker(world, worker, ours),
         NumpySearch(ids, queries, rows),
         FaissFlat(ids, queries, index),
+        FaissPanorama(ids, queries, panorama),
         FaissBinary(ids, queries, rows, _sign_codes_of(snapshot, rows)),
         AnyLocSearch(ids, queries, paths),
     ]

@@ -214,7 +214,7 @@ class FaissFlat(SearchMethod):
     """`faiss.IndexFlatIP`; shares its rows with NumPy, to hold a single copy."""
 
     name = "faiss.IndexFlatIP"
-    index: faiss.IndexFlatIP
+    index: faiss.IndexFlat
 
     def search(self, params: BenchmarkQuery) -> Ranking:
         k = min(params.k, len(self.photo_ids))
@@ -222,6 +222,17 @@ class FaissFlat(SearchMethod):
         found = zip(rows[0].tolist(), scores[0].tolist(), strict=True)
         min_score = -np.inf if params.min_score is None else params.min_score
         return [(self.photo_ids[row], score) for row, score in found if score >= min_score]
+
+
+@dataclass(eq=False)
+class FaissPanorama(FaissFlat):
+    """`faiss.IndexFlatIPPanorama`: exact, and skips the rest of rows that can't be among the best.
+
+    It bounds a product by the first parts of a row and the norms of the others; the bytes that it
+    is said to read are those of all rows.
+    """
+
+    name = "faiss.IndexFlatIPPanorama"
 
 
 class FaissBinary(SearchMethod):

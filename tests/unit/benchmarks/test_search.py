@@ -202,7 +202,7 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
     assert figures["load: results"] > 0
     assert figures["growth: scan of 3,000 codes, p50"] > 0
     (comparison,) = report.details["comparisons"]
-    assert len(comparison["rows"]) == 5 * 6
+    assert len(comparison["rows"]) == 5 * 7
     exact = [row for row in comparison["rows"] if "Binary" not in row["method"]]
     assert not any(row["differ"] for row in exact)
     json.dumps(report.as_json())
