@@ -25,9 +25,8 @@ from benchmarks.generated_city import generate_city
 from placewise.answers import Estimate
 from placewise.client import Client
 from services.cli.client import connect, wait_for_job
-from services.cli.descriptors.vocabulary import fit_and_wait
 from services.cli.ingest.geotags import LocalPhoto, find_photos
-from services.cli.ingest.upload import upload_photos
+from services.cli.ingest.upload import switch_off_fits, upload_photos
 from services.cli.output import progress_bar
 from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
@@ -235,12 +234,13 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     database = find_photos(city / "database", None, None)
     queries = find_photos(city / "queries", None, None)
     labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]
-    indexed = upload_photos(client, database + labelled, fit=False, progress=progress)
+    switch_off_fits(client)
+    indexed = upload_photos(client, database + labelled, progress)
     print(NOT_COMPARABLE)
     print(f"{indexed['searchable']} photos indexed; R@1 / R@5 / R@10 of the labelled queries:")
     for vocabulary in ("foreign", "own"):
         if vocabulary == "own":
-            fit_and_wait(client, {}, progress)
+            wait_for_job(client, client.fit_vocabulary(), progress, "vocabulary")
         job = wait_for_job(client, client.evaluate(), progress, "evaluating")
         metrics = (job.result or {})["labelled_queries"]
         shares = " / ".join(f"{metrics[f'R@{k}']:.1%}" for k in (1, 5, 10))

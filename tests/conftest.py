@@ -36,6 +36,7 @@ from tests.support.spare_databases import SpareDatabases
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
+IMAGES = "PLACEWISE_TEST_IMAGES"
 SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
@@ -47,7 +48,11 @@ COMPUTING = ("integration", "contract", "unit")
 gc.set_threshold(50_000)
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
-collect_ignore = [] if os.environ.get(BROWSER) else ["browser"]
+collect_ignore = [
+    folder
+    for variable, folder in ((BROWSER, "browser"), (IMAGES, "deploy/images"))
+    if not os.environ.get(variable)
+]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -120,6 +125,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if not os.environ.get(BROWSER):
         terminalreporter.write_line(
             "The tests in a browser were left out: make test-browser runs them."
+        )
+    if not os.environ.get(IMAGES):
+        terminalreporter.write_line(
+            "The tests of the images were left out: make test-images runs them."
         )
 
 

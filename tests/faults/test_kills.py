@@ -93,9 +93,7 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
 
 
 def test_a_fit_that_is_killed_goes_on_after_the_restart(tmp_path: Path) -> None:
-    with ServerProcess(
-        tmp_path / "home", extractor="test-tiny-vlad", batch_photos=2, auto_fit_photos=1000
-    ) as server:
+    with ServerProcess(tmp_path / "home", extractor="test-tiny-vlad", batch_photos=2) as server:
         for number in range(40):
             assert server.upload(photo_bytes(number)).status_code == 202
         job_id = server.client.post("/api/v1/vocabularies", json={"clusters": 8}).json()["job_id"]

@@ -28,7 +28,7 @@ from tests.support.servers import S3Server
 
 WAIT_SECONDS = 60.0
 EARLY, LATE = 2, 3  # photos before and after the catalog was copied
-SETTINGS = {"orphan_age_seconds": 0, "auto_fit_photos": 1000, "auto_evaluate_photos": 0}
+SETTINGS = {"orphan_age_seconds": 0, "auto_evaluate_photos": 0}
 
 
 @dataclass

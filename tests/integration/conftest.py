@@ -12,7 +12,8 @@ import pytest
 from services.extractor import worker as worker_module
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks import reindex_jobs
+from services.steward.tasks import auto_fit, reindex_jobs
+from shared.catalog import vocabularies
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
@@ -126,6 +127,13 @@ def workplace_of(
 
     made: list[UUID] = []
     return make
+
+
+@pytest.fixture
+def fit_at_four_photos(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vocabularies are fitted automatically at four photos, however lately the last one arrived."""
+    monkeypatch.setattr(vocabularies, "MIN_PHOTOS_TO_FIT", 4)
+    monkeypatch.setattr(auto_fit, "QUIET_SECONDS", -1.0)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from sqlalchemy import select
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
+from services.steward.tasks.auto_fit import fit_due_vocabularies
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.reindex_jobs import QueuedChunks
 from shared.catalog.chunks import count_searchable
@@ -84,6 +85,13 @@ class Workplace:
         """Begin a model change; its job."""
         with self.catalog.write() as session:
             return start_model_change(session, self.map_id, kind, params).id
+
+    def fit_if_due(self) -> list[UUID]:
+        """The steward's look for maps to fit a vocabulary for; the map's fits, oldest first."""
+        fit_due_vocabularies(self.catalog, self.wakeups)
+        with self.catalog.read() as session:
+            fits = select(Job.id).where(Job.kind == JobKind.FIT, Job.map_id == self.map_id)
+            return list(session.scalars(fits.order_by(Job.id)))
 
     def cancel(self, job_id: UUID) -> None:
         """Cancel a model change."""

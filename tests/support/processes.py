@@ -89,11 +89,12 @@ def start(
 ) -> Process:
     """A process of this command, with nothing to read.
 
-    PLACEWISE is a fork of the fork server, unless `executed` asks for a new interpreter, which
-    takes seconds, or `env` has what a library may read at its import.
+    PLACEWISE, or a program in Python (*.py), is a fork of the fork server, unless `executed` asks
+    for a new interpreter, which takes seconds, or `env` has what a library may read at its import.
     """
     words = list(map(str, command))
-    forked = words[0] == PLACEWISE and not executed and _before(env) == _before(INHERITED)
+    in_python = words[0] == PLACEWISE or words[0].endswith(".py")
+    forked = in_python and not executed and _before(env) == _before(INHERITED)
     if forked and sys.platform == "linux":
         return _fork_server().start(words, env, cwd, stdout, stderr)
     return subprocess.Popen(

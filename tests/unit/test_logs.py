@@ -84,6 +84,24 @@ def test_text_lines_end_with_the_facts(set_up: Set, capsys: pytest.CaptureFixtur
     assert "only with DEBUG" in capsys.readouterr().err
 
 
+def test_a_terminal_of_the_embedded_server_shows_warnings_and_with_debug_all(
+    set_up: Set, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    set_up()
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    log_file = tmp_path / "log"
+    configure_logging(Settings(log_file=log_file), "embedded", for_operators=False)
+    log = logging.getLogger("services.request_log")
+    log.info("POST /api/v1/upload: 202")
+    log.warning("the disk is full")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("the disk is full")
+    assert "POST /api/v1/upload: 202" in log_file.read_text()
+    configure_logging(Settings(debug=True), "embedded", for_operators=False)
+    log.info("POST /api/v1/upload: 202")
+    assert "POST /api/v1/upload: 202" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("log_format", ["text", "json"])
 @pytest.mark.parametrize(
     "control",

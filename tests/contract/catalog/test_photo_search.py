@@ -40,6 +40,16 @@ def test_a_file_name_is_found_by_a_part_of_it_in_any_case(catalog: Catalog, map_
     assert found(catalog, map_id) == {"Market-Street.JPG", "market hall.png", "harbour.jpg"}
 
 
+def test_a_photo_is_found_by_a_part_of_its_relative_path(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        add_photo(session, map_id, filename="1.jpg", relative_path="Spring/old_town/1.jpg")
+        add_photo(session, map_id, filename="2.jpg", relative_path="autumn/2.jpg")
+        add_photo(session, map_id, filename="spring.jpg")
+    assert found(catalog, map_id, filename="spring") == {"1.jpg", "spring.jpg"}
+    assert found(catalog, map_id, filename="ring/OLD_") == {"1.jpg"}
+    assert found(catalog, map_id, filename="ring/old%") == set()
+
+
 def test_wildcards_in_a_file_name_are_ordinary_characters(catalog: Catalog, map_id: UUID) -> None:
     specials = ["%", "_", "/", "\\", "'", '"', "[a-z]", "*", "?"]
     with catalog.write() as session:

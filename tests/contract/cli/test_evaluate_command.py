@@ -104,7 +104,7 @@ def test_extractor_is_evaluated_and_everything_is_written(
     }
     assert answer["fingerprint"] == town.fingerprint
     assert (answer["rule"], answer["protocol"]) == ("radius 25 m", "placewise")
-    assert (answer["dimension"], answer["bytes_a_photo"]) == (16, 64)
+    assert (answer["dimension"], answer["bytes_a_photo"]) == (16, 2 * 16)
     assert answer["describe_ms_a_photo"] > 0
     assert answer["published"] == []
     assert {"placewise", "numpy", "torch"} <= set(answer["versions"])
@@ -293,6 +293,58 @@ def test_set_that_is_not_there_is_named(city: Path) -> None:
     assert problem["code"] == "set_missing"
 
 
+def test_own_rows_in_the_listed_order_have_the_recall_of_the_extractor_that_made_them(
+    city: Path, town: EvaluationSet, tmp_path: Path
+) -> None:
+    listed = run_json("datasets", "list", city)
+    files = []
+    for role, photos in listed.items():
+        out = tmp_path / f"{role}.npy"
+        run("describe", *photos, "--out", out, "--extractor", "test-tiny-avg")
+        np.save(out, 3 * np.load(out))  # rows need not have unit length
+        files.append(out)
+    own = run_json("evaluate", "--data", city, "--rows", *files)
+    made = run_json("evaluate", "--data", city, "--extractor", "test-tiny-avg")
+    for figure in ("recall", "recall_findable", "dimension", "bytes_a_photo"):
+        assert own[figure] == made[figure], figure
+
+
+def test_a_checkpoint_describes_photos_as_the_extractor_of_its_path_does(
+    town: EvaluationSet, checkpoint: Path, tmp_path: Path
+) -> None:
+    photos = [photo.path for photo in town.queries[:2]]
+    for name, model in (
+        ("a", ["--checkpoint", checkpoint]),
+        ("b", ["--extractor", f"gsv:{checkpoint}"]),
+    ):
+        run("describe", *photos, "--out", tmp_path / f"{name}.npy", *model)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"))
+    both = ["--checkpoint", checkpoint, "--extractor", "test-tiny-avg"]
+    answer = run_json("describe", *photos, "--out", tmp_path / "c.npy", *both, code=1)
+    assert answer["code"] == "options_contradict"
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (np.ones((9, 4)), "has 9 rows for the 10 photos of the database"),
+        (np.ones((10, 3)), "has 3 columns and .* 4"),
+        (np.ones(10), r"\(photos, D\) array"),
+        (np.vstack([np.ones((7, 4)), np.zeros((3, 4))]), "Row 7 of .* is zero"),
+        (np.full((10, 4), np.nan), "Row 0 of .* not finite"),
+    ],
+)
+def test_rows_that_do_not_fit_the_set_are_refused(
+    city: Path, tmp_path: Path, rows: np.ndarray[Any, Any], message: str
+) -> None:
+    np.save(tmp_path / "db.npy", rows)
+    np.save(tmp_path / "q.npy", np.ones((6, 4)))
+    arguments = ["evaluate", "--data", city, "--rows", tmp_path / "db.npy", tmp_path / "q.npy"]
+    answer = run_json(*arguments, code=1)
+    assert answer["code"] == "bad_rows"
+    assert re.search(message, answer["detail"])
+
+
 def test_people_are_shown_a_table(city: Path) -> None:
     shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg")
     for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m", "certainty", "0.95"):
@@ -306,7 +358,7 @@ def test_descriptors_are_compared_by_recall_time_and_size(
     extractors = f"test-tiny-avg,{vlad},{checkpoint}"
     report = run_json("compare", city, "--extractors", extractors, "--out", tmp_path / "out")
     sizes = [one["bytes_a_photo"] for one in report["extractors"]]
-    assert sizes == [16 * 4, 4 * 4, 128 * 4]
+    assert sizes == [16 * 2, 4 * 2, 128 * 2]
     assert all(one["milliseconds_a_photo"] > 0 for one in report["extractors"])
     assert report["extractors"][0]["against_first"] is None
     assert report["extractors"][1]["pareto_by_size"], "nothing is smaller"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +22,7 @@ from shared.ids import new_id
 from shared.journal import outbox, segments
 from shared.journal.outbox import catalog_lag, write_journal
 from shared.journal.segments import Line, last_states, list_segments, read_segment
+from shared.rebuild.rows import LatestStates
 from shared.storage import FolderStore, ObjectStore
 from shared.storage.s3 import S3Store
 from tests.support.catalog_rows import add_map, add_photo
@@ -225,6 +228,55 @@ def test_a_restored_state_of_before_is_behind(
     with catalog.write() as session:
         session.execute(back(photo_id))
     assert catalog_lag(catalog, store) is not None
+
+
+MALFORMED: dict[str, Any] = {
+    "no JSON": b'{"table": ',
+    "no object": b"[1, 2]",
+    "no text": b"\xff\xfe",
+    "deep": b"[" * 100_000,
+    "id": {"id": 5},
+    "revision": {"revision": "seven"},
+    "large revision": {"revision": 2**70},
+    "row": {"row": [1]},
+    "missing column": {"row": {"sha256": "0" * 64}},
+    "text as a number": {"latitude": "north"},
+    "number as a text": {"filename": 7},
+    "number as a time": {"uploaded_at": 5},
+    "time without a zone": {"uploaded_at": "2026-05-01T12:00:00"},
+    "too large": {"width": 2**40},
+    "null": {"object_key": None},
+    "half a character": {"filename": "\ud800"},
+    "NUL": {"filename": "a\0b"},
+}
+
+
+@pytest.mark.databases("sqlite")  # lines are checked before a database sees them
+@pytest.mark.parametrize("store", ["folder"], indirect=True)
+@pytest.mark.parametrize("malformed", MALFORMED.values(), ids=MALFORMED.keys())
+def test_a_malformed_line_is_named_and_its_segment_is_left_out_of_a_rebuild(
+    catalog: Catalog, store: ObjectStore, malformed: bytes | dict[str, Any]
+) -> None:
+    _, photo_id = filled(catalog)
+    write_journal(catalog, store)
+    (segment,) = list_segments(store)
+    head, *lines = gzip.decompress(store.get(segment.key)).splitlines()
+    number = next(n for n, line in enumerate(lines) if str(photo_id) in json.loads(line)["id"])
+    if isinstance(malformed, dict):
+        line = json.loads(lines[number])
+        of_line = malformed.keys() & {"id", "revision", "row"}
+        (line if of_line else line["row"]).update(malformed)
+        malformed = json.dumps(line).encode()
+    lines[number] = malformed
+    store.put(segment.key, gzip.compress(b"\n".join([head, *lines])))
+    with pytest.raises(Unavailable) as caught:
+        read_segment(store, segment.key)
+    assert caught.value.code == "journal_damaged"
+    assert f"{segment.key} can't be read (line {number + 2}: " in caught.value.detail
+    with LatestStates() as states:
+        states.read(store, lambda *_: None)
+        (damaged,) = states.damaged
+    assert damaged.startswith(f"{segment.key} (line {number + 2}: ")
 
 
 @pytest.mark.parametrize("store", ["folder"], indirect=True)

@@ -20,14 +20,16 @@ from services.cli.operations.deployment_checks import (
     check_search,
     check_steward,
 )
+from services.cli.operations.installation_checks import _check_photos
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
+from shared.catalog.jobs import JobState
 from shared.catalog.processes import RegisteredProcess, list_processes, process_heartbeat
 from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.storage import FolderStore
-from tests.support.catalog_rows import add_job, add_map, set_columns, take
+from tests.support.catalog_rows import add_job, add_map, add_photo, set_columns, take
 from tests.support.search_tier import SearchServer
 from tests.support.servers import PostgresServer, RedisServer
 
@@ -106,6 +108,17 @@ def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) ->
         assert re.search(r"The last heartbeat was \d+ s ago", gone.detail)
     with deployed.read() as session:
         assert list_processes(session) == [], "it has signed off"
+
+
+def test_stored_photos_that_can_not_be_searched_for_are_named(deployed: Catalog) -> None:
+    assert "no photo is left out" in _check_photos(Settings())
+    with deployed.write() as session:
+        map_id = add_map(session, "quay").id
+        photo = add_photo(session, map_id)
+        photo.job_id = add_job(session, map_id, photo_id=photo.id, state=JobState.FAILED).id
+    error = refused(_check_photos, Settings())
+    assert error.code == "photos_failed"
+    assert "1 in the map quay" in error.detail
 
 
 def test_a_steward_that_lives_and_frees_no_lease_is_found_out(deployed: Catalog) -> None:

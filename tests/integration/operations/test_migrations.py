@@ -13,14 +13,17 @@ from alembic import command
 from alembic.config import Config
 from sqlalchemy import MetaData, Table, func, make_url, select, text
 
+from shared.catalog.chunks import Chunk
 from shared.catalog.database import schema
 from shared.catalog.database.base import db_now
 from shared.catalog.database.schema import check_schema, migrate, wait_for_schema
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
-from tests.support.catalog_rows import made_up_photo
+from tests.support.catalog_rows import add_generation, add_map, made_up_photo
 from tests.support.servers import PostgresServer
 
 
@@ -87,6 +90,42 @@ def test_migration_under_uploads_loses_none_and_fails_none(catalog: Catalog) -> 
     check_schema(catalog)
     with catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(Photo)) == len(stored)
+
+
+@pytest.mark.parametrize(
+    ("origin", "auto_fit", "fitted_photos"),
+    [("fitted", True, 7), ("imported", False, None), ("shipped", True, None)],
+)
+def test_an_existing_map_keeps_its_vocabulary_unless_it_is_foreign(
+    catalog: Catalog, origin: str, auto_fit: bool, fitted_photos: int | None
+) -> None:
+    migrate(catalog)
+    with catalog.write() as session:
+        map_id = add_map(session, extractor="test-tiny-vlad").id
+        vocabulary = add_vocabulary(
+            session,
+            map_id,
+            VocabularyOrigin(origin),
+            shape=(8, 16),
+            object_key="vocabulary",
+            sha256="0" * 64,
+            provenance={},
+        )
+        generation = add_generation(session, map_id, vocabulary_id=vocabulary.id)
+        columns = {"slot": 0, "object_key": "chunk", "size_bytes": 1, "sha256": "0" * 64}
+        session.add(Chunk(generation_id=generation.id, rows=7, **columns))
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql(
+            "ALTER TABLE maps DROP COLUMN auto_fit, DROP COLUMN fitted_photos, "
+            "DROP COLUMN place_labels_are_automatic"
+        )
+        connection.exec_driver_sql("ALTER TABLE searches DROP COLUMN has_place")
+        connection.exec_driver_sql("DROP INDEX ix_photos_relative_path")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0026'")
+    migrate(catalog)
+    with catalog.read() as session:
+        map_ = session.get_one(Map, map_id)
+        assert (map_.auto_fit, map_.fitted_photos) == (auto_fit, fitted_photos)
 
 
 def test_migration_gives_way_to_a_lock_and_is_tried_again(catalog: Catalog) -> None:

@@ -52,7 +52,7 @@ def test_no_statement_reads_a_whole_map(filled: Filled, tmp_path: Path) -> None:
     explainer = Explainer(catalog, small=True)
     calls = list(run_all_calls(catalog, contents, explainer, tmp_path))
     assert {e.call for e in explainer.plans} >= set(calls) - {
-        "steward: fit maps that wait",
+        "steward: fit vocabularies",
         "steward: evaluate changed maps",
         "steward: free trash",  # looks at the disk
     }, "every call asks something"

@@ -25,6 +25,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.errors import Unavailable
+from shared.evaluation.places.levels import LevelScheme
 from shared.jobs import InProcessWakeups
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse
@@ -339,7 +340,8 @@ def test_a_map_is_not_measured_while_a_shard_is_missing(
     with catalog.write() as session:
         session.get_one(Photo, next(iter(places.rows))).place = "hall"
         generation = session.get_one(Generation, places.generation_id)
-    measure = MapEvaluation(catalog, tier.port, generation, 25.0, (25.0,), lambda: None)
+    scheme = LevelScheme(labels_are_paths=False, radii_m=(25.0,))
+    measure = MapEvaluation(catalog, tier.port, generation, 25.0, scheme, lambda: None)
     sample = measure.draw_sample(1, 0)
     measure.evaluate(sample)
     tier.servers[1][0].stop()

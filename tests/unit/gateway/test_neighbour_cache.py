@@ -7,7 +7,7 @@ from services.gateway.similarity.neighbours import NeighbourCache, Neighbours
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.ids import new_id
 
-FOUND: Neighbours = ((new_id(), RankedPhoto(0.9, PhotoLocation(45.0, 7.0, None))),)
+FOUND: Neighbours = (RankedPhoto(0.9, PhotoLocation(45.0, 7.0, None), new_id()),)
 
 
 class Searches:

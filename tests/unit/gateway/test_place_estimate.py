@@ -32,6 +32,8 @@ from shared.evaluation.places.evidence import (
 )
 from shared.search_api.protocol import SearchHit
 
+pytestmark = pytest.mark.numerics
+
 RADIUS_M = 25.0
 DEGREE_M = 111_195.0  # of latitude, on the sphere
 
@@ -228,7 +230,7 @@ def answer(
     photos = {UUID(int=n): photo(n, spot) for n, (_, spot) in enumerate(pairs)}
     hits = [SearchHit(photo_id=UUID(int=n), score=score) for n, (score, _) in enumerate(pairs)]
     ranked = locate_hits(hits, photos)
-    return estimate_place(calibration, ranked, ranked, RADIUS_M)
+    return estimate_place(calibration, ranked, ranked, RADIUS_M, "no place")
 
 
 def calibration(
@@ -274,26 +276,18 @@ def test_labelled_queries_give_a_confidence() -> None:
     assert reported.confidence == pytest.approx(learnt.probability(PlaceEvidence(0.3, 0.5)))
 
 
-def test_nothing_found_differs_from_nothing_known() -> None:
-    assert answer(None).reason == "The map has no searchable photos yet."
-    assert (
-        "neither coordinates nor a place"
-        in answer(None, (0.9, PhotoLocation(None, None, None))).reason
-    )
-
-
-def test_a_filter_that_nothing_passes_differs_from_an_empty_map() -> None:
+def test_an_empty_ranking_gives_no_estimate() -> None:
     everything = ranking((0.5, north(0)))
-    filtered = estimate_place(None, [], everything, RADIUS_M)
-    assert filtered.reason == "No photo of the map matches the filter."
+    reported = estimate_place(calibration(0.1), [], everything, RADIUS_M, "no place")
+    assert (reported.in_map, reported.latitude, reported.reason) == (None, None, "no place")
 
 
 def test_a_filter_that_leaves_no_rival_makes_nobody_sure() -> None:
     everything = ranking((0.5, north(0)), (0.45, north(700)), (0.2, north(3000)))
     filtered = [everything[2]]
     known = calibration(0.01)
-    reported = estimate_place(known, filtered, everything, RADIUS_M)
+    reported = estimate_place(known, filtered, everything, RADIUS_M, "no place")
     assert reported.in_map is False
-    alone = estimate_place(known, everything[:1], everything, RADIUS_M)
-    whole = estimate_place(known, everything, everything, RADIUS_M)
+    alone = estimate_place(known, everything[:1], everything, RADIUS_M, "no place")
+    whole = estimate_place(known, everything, everything, RADIUS_M, "no place")
     assert alone.in_map is whole.in_map is True

@@ -20,6 +20,8 @@ from shared.geotagging.evidence import (
 from shared.geotagging.fusion import Proposal, propose_position
 from shared.geotagging.mixture import REGION_AREA_M2, Mixture, Plane
 
+pytestmark = pytest.mark.numerics
+
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 LATITUDE, LONGITUDE = 45.0691, 7.6853
 PLANE = Plane(LATITUDE, LONGITUDE)

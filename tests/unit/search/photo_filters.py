@@ -109,6 +109,7 @@ def photo_filters(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> PhotoFi
             "tags_like": sometimes(some.sampled_from(PARTS_OF_TAGS).map(lambda part: (part,)))
             or (),
             "ids": sometimes(some.lists(some.sampled_from(ids)).map(tuple)),
+            "has_place": sometimes(some.just(True)) or False,
         }
     )
 
@@ -128,6 +129,7 @@ def passes(photo: PhotoFilterValues, photo_filter: PhotoFilter) -> bool | None:
             for part in photo_filter.tags_like
         ),
         photo_filter.ids is None or photo.photo_id in photo_filter.ids,
+        not photo_filter.has_place or (photo.latitude, photo.place) != (None, None),
     ]
     if not all(certain):
         return False

@@ -18,6 +18,8 @@ from shared.search_api.protocol import RowReference
 from shared.storage import FolderStore
 from shared.storage.chunks import encode_rows
 
+pytestmark = pytest.mark.numerics
+
 
 def unit(rows: np.ndarray) -> np.ndarray:
     rows /= np.linalg.norm(rows, axis=-1, keepdims=True)

@@ -27,6 +27,8 @@ from shared.search_api.protocol import SearchResponse
 from shared.storage.chunks import StoredRows
 from tests.unit.search.search_rows import assert_best, facts_of
 
+pytestmark = pytest.mark.numerics
+
 Rows = NDArray[np.float32]
 
 

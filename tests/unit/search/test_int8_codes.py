@@ -18,6 +18,8 @@ from shared.codes.serialization import (
     encode_sign_codes,
 )
 
+pytestmark = pytest.mark.numerics
+
 ANYLOC = 98_304
 
 Rows = NDArray[np.float32]

@@ -32,6 +32,8 @@ from tests.unit.search.search_rows import (
     snapshot_of,
 )
 
+pytestmark = pytest.mark.numerics
+
 DIMENSION = 7168
 
 

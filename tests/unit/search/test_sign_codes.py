@@ -15,6 +15,8 @@ from shared.codes.rotation import get_rotation
 from shared.codes.serialization import decode_sign_codes, encode_sign_codes
 from shared.codes.sign_codes import WORD_BITS, SignCodes, encode_signs, level_words, pack_signs
 
+pytestmark = pytest.mark.numerics
+
 ANYLOC = 98_304
 
 Rows = NDArray[np.float32]
