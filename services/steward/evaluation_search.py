@@ -1,18 +1,20 @@
 """Search client of evaluations: ranks a map's own geotagged photos through the search tier.
 
-Also the index of geotagged photos, which counts those that show a given place.
+Also the index of geotagged photos, which finds those that show a given place, and tells whether two
+photos are frames of one sequence.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from uuid import UUID
 
 import numpy as np
-from numpy.typing import NDArray
+import sqlalchemy as sql
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -27,6 +29,9 @@ from shared.geodesy import distances_m, latitude_bounds
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchBackend, SearchHit, SearchRequest
 
+SEQUENCE_PERIOD = timedelta(seconds=60)
+SEQUENCE_NUMBERS = 60
+
 
 @dataclass(frozen=True, slots=True)
 class GeotaggedPhoto:
@@ -35,6 +40,32 @@ class GeotaggedPhoto:
     photo_id: UUID
     spot: PhotoLocation
     captured_at: datetime | None
+    name: str
+    """its path in its folder, else its file name"""
+    _name_parts: list[str] = field(init=False, compare=False)
+    """text and digits of the name in turn"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_name_parts", re.split(r"([0-9]+)", self.name))
+
+    def is_same_sequence(self, other: GeotaggedPhoto) -> bool:
+        """Return whether two photos are frames of one walk, drive or video.
+
+        They are if they were taken within `SEQUENCE_PERIOD`, or if one number in their names
+        differs, by at most `SEQUENCE_NUMBERS`, and nothing else does. The catalog does not know
+        the camera: photos that two cameras took in the same minute count as one sequence.
+        """
+        times = (self.captured_at, other.captured_at)
+        if times[0] and times[1] and abs(times[0] - times[1]) <= SEQUENCE_PERIOD:
+            return True
+        mine, others = self._name_parts, other._name_parts
+        if len(mine) != len(others):
+            return False
+        different = [i for i, (a, b) in enumerate(zip(mine, others, strict=True)) if a != b]
+        if len(different) != 1 or different[0] % 2 == 0:
+            return False
+        (number,) = different
+        return abs(int(mine[number]) - int(others[number])) <= SEQUENCE_NUMBERS
 
 
 class GeotaggedPhotos:
@@ -42,36 +73,34 @@ class GeotaggedPhotos:
 
     def __init__(self, photos: Sequence[GeotaggedPhoto]) -> None:
         self.photos = photos
-        self._labels = Counter(p.spot.place for p in photos if p.spot.place is not None)
-        on_earth = sorted(
+        self._by_label: defaultdict[str, list[GeotaggedPhoto]] = defaultdict(list)
+        for photo in photos:
+            if photo.spot.place is not None:
+                self._by_label[photo.spot.place].append(photo)
+        self._on_earth = sorted(
             (p for p in photos if p.spot.latitude is not None), key=lambda p: p.spot.latitude or 0.0
         )
-        self._ids = [photo.photo_id for photo in on_earth]
         self._spots = np.array(
-            [(p.spot.latitude, p.spot.longitude) for p in on_earth], dtype=np.float64
+            [(p.spot.latitude, p.spot.longitude) for p in self._on_earth], dtype=np.float64
         ).reshape(-1, 2)
 
-    def count_at_place(self, spot: PhotoLocation, radius_m: float) -> int:
-        """Count the photos within `radius_m` metres of the spot, or with its place label.
+    def find_at_place(self, spot: PhotoLocation, radius_m: float) -> list[GeotaggedPhoto]:
+        """Return the photos within `radius_m` metres of the spot, or with its place label."""
+        near = self.find_within(spot, radius_m)
+        if spot.place is None:
+            return near
+        return [*self._by_label[spot.place], *(p for p in near if p.spot.place != spot.place)]
 
-        Returns the larger of the two counts, so that a photo that meets both is counted once.
-        """
-        labelled = self._labels[spot.place] if spot.place is not None else 0
-        return max(labelled, len(self._within(spot, radius_m)))
-
-    def find_within(self, spot: PhotoLocation, radius_m: float) -> list[UUID]:
+    def find_within(self, spot: PhotoLocation, radius_m: float) -> list[GeotaggedPhoto]:
         """Return the photos within `radius_m` metres; none for a spot without coordinates."""
-        return [self._ids[index] for index in self._within(spot, radius_m).tolist()]
-
-    def _within(self, spot: PhotoLocation, radius_m: float) -> NDArray[np.int64]:
         if spot.latitude is None or spot.longitude is None:
-            return np.empty(0, np.int64)
+            return []
         south, north = latitude_bounds(spot.latitude, radius_m)
         first, last = np.searchsorted(self._spots[:, 0], [south, north])
         candidates = self._spots[first : last + 1]
         distances = distances_m(spot.latitude, spot.longitude, candidates[:, 0], candidates[:, 1])
-        indices: NDArray[np.int64] = first + np.flatnonzero(distances <= radius_m)
-        return indices
+        indices = first + np.flatnonzero(distances <= radius_m)
+        return [self._on_earth[index] for index in indices.tolist()]
 
 
 def read_geotagged_photos(
@@ -79,7 +108,14 @@ def read_geotagged_photos(
 ) -> list[GeotaggedPhoto]:
     """Return the live geotagged photos of a role with a descriptor in the generation, by id."""
     photos = session.execute(
-        select(Photo.id, Photo.latitude, Photo.longitude, Photo.place, Photo.captured_at)
+        select(
+            Photo.id,
+            Photo.latitude,
+            Photo.longitude,
+            Photo.place,
+            Photo.captured_at,
+            sql.func.coalesce(Photo.relative_path, Photo.filename),
+        )
         .join(Descriptor, Descriptor.photo_id == Photo.id)
         .where(
             Photo.map_id == map_id,
@@ -90,7 +126,7 @@ def read_geotagged_photos(
         )
         .order_by(Photo.id)
     )
-    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), row[4]) for row in photos]
+    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), *row[4:]) for row in photos]
 
 
 MAX_READ_ATTEMPTS = 2

@@ -1,9 +1,9 @@
 """Map evaluation: recall, calibration and false accepts of a live map, through the search tier.
 
-*Leave-one-out*: each photo of a sample of the map is searched, itself excluded. Photos of one
-session resemble each other, so the recall is optimistic; use it to compare two generations of a
-map. *Labelled queries* (photos of role `query`) were taken at another time: their recall is what
-users see.
+*Leave-one-out*: each photo of a sample of the map is searched, itself excluded. The frames before
+and after it are easy matches, so the recall is optimistic; it is measured a second time without the
+photos of its sequence. Use both to compare two generations of a map. *Labelled queries* (photos of
+role `query`) were taken at another time: their recall is what users see.
 
 Word weights change the ranking and the meaning of its scores: a calibration is valid only for
 results with the weights that it was measured with.
@@ -11,9 +11,10 @@ results with the weights that it was measured with.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import filterfalse, islice
 from statistics import median
 from typing import Any
 from uuid import UUID
@@ -80,6 +81,31 @@ class RecallCounter:
             "queries": self.queries,
             **{f"R@{k}": ratio(hits, self.queries) for k, hits in self.hits.items()},
         }
+
+
+@dataclass(slots=True)
+class _OwnPhotoRecall:
+    """Recall@k of own photos, and the number of those without another photo of their place."""
+
+    radius_m: float
+    recall: RecallCounter = field(default_factory=RecallCounter)
+    without_positive: int = 0
+
+    def add(
+        self,
+        query: GeotaggedPhoto,
+        ranked: Iterable[GeotaggedPhoto],
+        at_place: Iterable[GeotaggedPhoto],
+    ) -> None:
+        """Add a query: the photos that it finds, best first, and all others of its place."""
+        if not any(True for _ in at_place):
+            self.without_positive += 1
+            return
+        first = islice(ranked, RECALL_RANKS[-1])
+        self.recall.add([is_same_place(query.spot, p.spot, self.radius_m) for p in first])
+
+    def figures(self) -> dict[str, Any]:
+        return {**self.recall.figures(), "without_positive": self.without_positive}
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +247,7 @@ class MapEvaluation:
             self.radius_m,
             partial(self._rank_own_photo, rank_photo),
         )
-        recall, impostors, alone = self._leave_one_out(sample, own_photos)
+        recalls, impostors = self._leave_one_out(sample, own_photos)
         threshold = fit_threshold(impostors)
         provisional = Calibration(
             radius_m=self.radius_m,
@@ -242,7 +268,7 @@ class MapEvaluation:
         )
         figures = {
             "radius_m": self.radius_m,
-            "leave_one_out": {**recall.figures(), "without_positive": alone},
+            **recalls,
             "labelled_queries": labelled.figures() if self.queries else None,
             "estimate": {
                 "support_threshold": threshold,
@@ -255,29 +281,38 @@ class MapEvaluation:
 
     def _leave_one_out(
         self, sample: Sequence[GeotaggedPhoto], own_photos: OwnPhotoSampler
-    ) -> tuple[RecallCounter, list[PlaceEvidence], int]:
-        """Return recall, the evidence of impostors, and the number of photos alone at their place.
+    ) -> tuple[dict[str, Any], list[PlaceEvidence]]:
+        """Return recall with and without the photos of a query's sequence, and the evidence of
+        impostors.
 
         An impostor is the best match at another place: what a query outside the map would find.
         """
-        recall, impostors, alone = RecallCounter(), [], 0
+        recall, apart = _OwnPhotoRecall(self.radius_m), _OwnPhotoRecall(self.radius_m)
+        impostors = []
+        photos = self.database.photos
         for query in sample:
             found = own_photos.ranking(self._index_of[query.photo_id])
             if found is None:
                 continue
-            ranking = [
-                RankedPhoto(float(score), self.database.photos[index].spot)
-                for index, score in zip(*found, strict=True)
+            ranked = [photos[index] for index in found[0].tolist()]
+            at_place = self.database.find_at_place(query.spot, self.radius_m)
+            at_place = [photo for photo in at_place if photo.photo_id != query.photo_id]
+            recall.add(query, ranked, at_place)
+            is_apart = partial(filterfalse, query.is_same_sequence)
+            apart.add(query, is_apart(ranked), is_apart(at_place))
+            others = [
+                RankedPhoto(float(score), photo.spot)
+                for photo, score in zip(ranked, found[1], strict=True)
+                if is_different_place(query.spot, photo.spot)
             ]
-            if self.database.count_at_place(query.spot, self.radius_m) > 1:  # includes the query
-                recall.add([is_same_place(query.spot, r.location, self.radius_m) for r in ranking])
-            else:
-                alone += 1
-            others = [r for r in ranking if is_different_place(query.spot, r.location)]
             evidence = compute_evidence(others[:EVIDENCE_DEPTH], self.radius_m)
             if evidence is not None:
                 impostors.append(evidence)
-        return recall, impostors, alone
+        figures = {
+            "leave_one_out": recall.figures(),
+            "leave_one_out_without_sequence": apart.figures(),
+        }
+        return figures, impostors
 
     def _rank_own_photo(self, rank_photo: RankPhoto, index: int) -> IndexRanking | None:
         """Rank the photos with a location by their similarity to one of them."""
@@ -322,7 +357,7 @@ class MapEvaluation:
             self.on_query()
             if ranking is None:
                 continue
-            in_map = self.database.count_at_place(query.spot, self.radius_m) > 0
+            in_map = bool(self.database.find_at_place(query.spot, self.radius_m))
             if in_map:
                 labelled.recall.add(
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]

@@ -224,11 +224,13 @@ class WordWeightsFit:
         or the burst is too large."""
         database, radius_m = self.evaluation.database, self.evaluation.radius_m
         if by == PairSource.PLACES:
-            # The count includes the query itself.
-            return () if database.count_at_place(query.spot, radius_m) > 1 else None
+            # They include the query itself.
+            return () if len(database.find_at_place(query.spot, radius_m)) > 1 else None
         burst = database.find_within(query.spot, NEAREST_M)  # includes the query itself
         alone = len(database.find_within(query.spot, radius_m)) == len(burst)
-        return None if alone or len(burst) > MAX_BURST_PHOTOS else tuple(burst)
+        if alone or len(burst) > MAX_BURST_PHOTOS:
+            return None
+        return tuple(photo.photo_id for photo in burst)
 
     def _correct_ranks(
         self, query: GeotaggedPhoto, weights: tuple[float, ...], excluded: tuple[UUID, ...]

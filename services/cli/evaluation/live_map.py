@@ -119,7 +119,10 @@ def answers_table(places: Json) -> Table:
     if not from_queries:
         others = ("impostors", "impostors_at_finest_level")
     source = places["source"].replace("_", " ")
-    measured = f"queries; fitted on {source}" if from_queries else f"{source}, cross-validated"
+    measured = f"queries; fitted on {source}"
+    if not from_queries:
+        own = "" if source == "labelled queries" else f", own photos each {places['own_photos']}"
+        measured = f"{source}, cross-validated{own}"
     table = Table(
         Column("certainty", justify="right"),
         *(
@@ -154,6 +157,9 @@ def _format_share(figure: Json) -> str:
 
 def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
     rows = [("own photos", figures["leave_one_out"])]
+    # Evaluations of earlier releases have no `leave_one_out_without_sequence`.
+    if without_sequence := figures.get("leave_one_out_without_sequence"):
+        rows.append(("without sequence", without_sequence))
     if figures["labelled_queries"]:
         rows.append(("labelled queries", figures["labelled_queries"]))
     return rows
@@ -161,7 +167,11 @@ def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
 
 def _estimate_lines(figures: Json) -> list[str]:
     labelled, estimate = figures["labelled_queries"], figures["estimate"]
-    lines = [f"Positive match: within {figures['radius_m']:g} m, or the same place label."]
+    lines = [
+        f"Positive match: within {figures['radius_m']:g} m, or the same place label.",
+        "Own photos find the frames before and after them, which flatters.",
+        "Without sequence: nor photos of the same minute or of near numbers in their names.",
+    ]
     if labelled is None:
         lines.append(
             "Confidence is uncalibrated. To calibrate it, upload photos taken on another day, with "

@@ -54,7 +54,9 @@ class EvaluationResponse(ResponseModel):
     automatic: bool = Field(description="started automatically after a change of the map")
     searchable: int = Field(description="number of searchable photos at that time")
     figures: dict[str, Any] = Field(
-        description="`leave_one_out`: queries with the map's own photos, each without itself; "
+        description="`leave_one_out`: queries with the map's own photos, each without itself, "
+        "which flatters; `leave_one_out_without_sequence`: each without the photos that were taken "
+        "within 60 s of it, or whose names differ by one number only, at most 60 apart; "
         "`labelled_queries`: queries with the photos of role `query`; R@k is the share of queries "
         "with a right photo among the first k, of those that have a right photo in the map; "
         "`with_word_weights`: the same, ranked by the word weights; null if there are none"

@@ -17,6 +17,7 @@ from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.fit import PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.samples import OWN_PHOTO_RULE
 from shared.evaluation.places.thresholds import HeldOutEstimate
 
 REPORTED_CERTAINTIES = (0.8, 0.9, 0.95, 0.99)
@@ -52,6 +53,7 @@ def evaluate_places(
     positions = range(max(len(estimate.probabilities) for estimate in fitted.held_out))
     figures = {
         "source": fitted.model.source,
+        "own_photos": OWN_PHOTO_RULE,
         "samples": len(fitted.held_out),
         "answers": [
             {

@@ -34,6 +34,11 @@ from shared.place_paths import label_levels
 # A photo taken less than this before or after another one belongs to the same session.
 SAME_SESSION_PERIOD = timedelta(hours=12)
 BURST_PERIOD = timedelta(seconds=1)
+OWN_PHOTO_RULE = (
+    "without the photos of its session (12 h) where another session shows its place, else without "
+    "those of the same second"
+)
+"""what each of the map's own photos is searched without, in words"""
 
 Indices = NDArray[np.int64]
 IndexRanking = tuple[Indices, NDArray[np.float64]]

@@ -50,6 +50,46 @@ def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
     assert town.calibration() is not None
 
 
+def test_second_recall_leaves_out_the_frames_of_a_walk(town: Town) -> None:
+    """Each photo of the walk finds the next frame first; the photo of another day comes later."""
+    spring = NOON + 240 * HOUR
+    town.publish(
+        [
+            (0, at(0, filename="gate.jpg", captured_at=NOON)),
+            (1, at(0, 1, filename="tree.jpg", captured_at=NOON + timedelta(seconds=60))),
+            (40, at(5, filename="hall.jpg")),
+            (60, at(0, filename="wall.jpg", captured_at=spring)),
+            # By their numbers; no capture times.
+            (180, at(1, filename="walk_0007.jpg")),
+            (181, at(1, filename="walk_0067.jpg")),
+            # 61 apart, and numbers in the same place of another name.
+            (250, at(2, filename="walk_1000.jpg")),
+            (251, at(2, filename="walk_1061.jpg")),
+            (300, at(3, filename="a_1.jpg")),
+            (301, at(3, filename="b_1.jpg")),
+            # The name is the path.
+            (330, at(4, filename="1.jpg", relative_path="north/1.jpg")),
+            (331, at(4, filename="2.jpg", relative_path="south/2.jpg")),
+        ]
+    )
+    figures = town.figures()
+    assert figures["leave_one_out"] == {
+        "queries": 11,
+        "R@1": 10 / 11,
+        "R@5": 1,
+        "R@10": 1,
+        "without_positive": 1,
+    }
+    # Of the walk, 0 and 1 find 40 before 60; 180 and 181 have nothing else at their place.
+    assert figures["leave_one_out_without_sequence"] == {
+        "queries": 9,
+        "R@1": 6 / 9,
+        "R@5": 1,
+        "R@10": 1,
+        "without_positive": 3,
+    }
+
+
 def test_a_little_farther_than_the_radius_is_another_place(town: Town) -> None:
     town.publish([(0, at(0)), (1, at(0, 24.9)), (90, at(1)), (91, at(1, 25.1))])
     loo = town.figures()["leave_one_out"]

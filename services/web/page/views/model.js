@@ -115,7 +115,7 @@ function comparison(evaluations, generations, vocabularies, onmeasure) {
     return h("section", { class: "card" }, head, h("p", {}, "Not measured yet. Placewise searches with the map’s own photos, each left out once, and counts how often another photo of the same place comes first. It does so automatically once 20 photos have coordinates or a place."));
   }
   const nameOf = (evaluation) => nameGeneration(generations.find((one) => one.generation_id === evaluation.generation_id), vocabularies);
-  const sets = [["labelled_queries", "Test photos"], ["leave_one_out", "The map’s own photos, each left out once"]];
+  const sets = [["labelled_queries", "Test photos"], ["leave_one_out_without_sequence", "The map’s own photos, each searched without the photos of its minute and its numbered series"], ["leave_one_out", "The map’s own photos, each left out once. This flatters: the photo before it and the one after it are easy to find"]];
   return h("section", { class: "card" }, head,
     h("p", { class: "soft" }, `Right means within ${after.figures.radius_m} m, or the same place label. R@k: the share of queries with a right photo among the first k.`),
     h("div", { class: "comparisons" }, sets.filter(([set]) => after.figures[set]?.queries).map(([set, title]) =>
