@@ -13,9 +13,10 @@ from services.search.chunk_loader import LoadedChunk
 # Upper bound of the error of float32 dot products of unit rows at 98,304 dimensions (measured
 # 4e-7): candidates this close to the k-th score are scored again in float64 before ranking.
 FLOAT32_MARGIN = 1e-5
+FLOAT64_MARGIN = 1e-12  # scores are rounded to as much, and equal ones ordered by photo
 
 # NumPy converts as many float16 numbers in 2 ms, but ten times as slowly as it multiplies. More are
-# multiplied by a compiled kernel, whose import takes a second.
+# multiplied in float64 by a compiled kernel, whose import takes a second.
 NUMPY_FLOAT16_NUMBERS = 1_000_000
 
 # Selecting rows copies them, which pays up to this share of a chunk; beyond, all are multiplied.
@@ -40,20 +41,34 @@ def scan_top_k(
     Returns:
         Row numbers and float64 cosines, unsorted; at least `k` rows if as many are selected.
     """
-    rows, rough = _float32_scores(chunks, query, row_mask)
-    k = min(k, len(rough))
-    kth = np.partition(rough, len(rough) - k)[len(rough) - k]
-    near_top = rows[rough >= kth - FLOAT32_MARGIN]
-    return near_top, exact_scores(chunks, query, near_top)
+    rows, scores, margin = _score_rows(chunks, query, row_mask)
+    k = min(k, len(scores))
+    kth = np.partition(scores, len(scores) - k)[len(scores) - k]
+    return _select(chunks, query, rows, scores, kth, margin)
 
 
 def scan_min_score(
     chunks: Sequence[LoadedChunk], query: QueryRow, min_score: float, row_mask: NDArray[np.bool_]
 ) -> tuple[RowNumbers, Scores]:
     """Find all rows whose cosine may be at least `min_score`; see `scan_top_k`."""
-    rows, rough = _float32_scores(chunks, query, row_mask)
-    passing = rows[rough >= min_score - FLOAT32_MARGIN]
-    return passing, exact_scores(chunks, query, passing)
+    rows, scores, margin = _score_rows(chunks, query, row_mask)
+    return _select(chunks, query, rows, scores, min_score, margin)
+
+
+def _select(
+    chunks: Sequence[LoadedChunk],
+    query: QueryRow,
+    rows: RowNumbers,
+    scores: NDArray[Any],
+    min_score: float,
+    margin: float,
+) -> tuple[RowNumbers, Scores]:
+    """Return the rows whose score may be at least `min_score`, and their float64 cosines."""
+    # Answers have no score above 1, which a float16 row may exceed: such rows are equal.
+    near = scores >= min(min_score, 1.0) - margin
+    if margin == FLOAT64_MARGIN:
+        return rows[near], scores[near]
+    return rows[near], exact_scores(chunks, query, rows[near])
 
 
 def exact_scores(chunks: Sequence[LoadedChunk], query: QueryRow, rows: RowNumbers) -> Scores:
@@ -65,48 +80,40 @@ def exact_scores(chunks: Sequence[LoadedChunk], query: QueryRow, rows: RowNumber
     return np.array([chunks[chunk].rows[row].astype(np.float64) @ unit for chunk, row in places])
 
 
-def _float32_scores(
+def _score_rows(
     chunks: Sequence[LoadedChunk], query: QueryRow, row_mask: NDArray[np.bool_]
-) -> tuple[RowNumbers, NDArray[Any]]:
-    """Return the selected row numbers, and their cosines, whose error is that of float32."""
+) -> tuple[RowNumbers, NDArray[Any], float]:
+    """Return the selected row numbers, their cosines, and the margin of equal ones."""
+    selected = np.flatnonzero(row_mask)
+    has_float16 = any(chunk.rows.dtype == np.float16 for chunk in chunks)
+    if has_float16 and len(selected) * len(query) > NUMPY_FLOAT16_NUMBERS:
+        return selected, _kernel_cosines(chunks, query, selected), FLOAT64_MARGIN
     unit = _normalize(query).astype(np.float32)
-    use_kernel = int(np.count_nonzero(row_mask)) * len(unit) > NUMPY_FLOAT16_NUMBERS
     scores: list[NDArray[Any]] = []
-    numbers: list[RowNumbers] = []
     first = 0
     for chunk in chunks:
         rows = np.flatnonzero(row_mask[first : first + len(chunk.rows)])
         if len(rows):
-            scores.append(_multiply(chunk, rows, unit, use_kernel))
-            numbers.append(rows + first)
+            gather = len(rows) <= GATHER_SHARE * len(chunk.rows)
+            scores.append(chunk.rows[rows] @ unit if gather else (chunk.rows @ unit)[rows])
         first += len(chunk.rows)
-    return np.concatenate(numbers), np.concatenate(scores)
+    return selected, np.concatenate(scores), FLOAT32_MARGIN
 
 
-def _multiply(
-    chunk: LoadedChunk, rows: RowNumbers, unit: QueryRow, use_kernel: bool
-) -> NDArray[Any]:
-    """Return the products of the given rows of a chunk with the query, float32 or float64."""
-    if chunk.rows.dtype == np.float16:
-        return _kernel_products(chunk, rows, unit) if use_kernel else chunk.rows[rows] @ unit
-    gather = len(rows) <= GATHER_SHARE * len(chunk.rows)
-    return chunk.rows[rows] @ unit if gather else (chunk.rows @ unit)[rows]
-
-
-def _kernel_products(chunk: LoadedChunk, rows: RowNumbers, unit: QueryRow) -> Scores:
+def _kernel_cosines(chunks: Sequence[LoadedChunk], query: QueryRow, rows: RowNumbers) -> Scores:
     from services.search.exact_rerank import RowBlocks  # importing numba is slow
 
     products = np.empty(len(rows))
-    RowBlocks.of([chunk]).multiply(rows, unit, products)
-    return products
+    RowBlocks.of(chunks).multiply(rows, query, products)
+    return products / np.linalg.norm(query.astype(np.float64))
 
 
 def compile_kernel(chunks: Sequence[LoadedChunk]) -> None:
     """Compile what scans of these chunks use, so that no query waits for it."""
     float16 = [chunk for chunk in chunks if chunk.rows.dtype == np.float16]
     if sum(chunk.rows.size for chunk in float16) > NUMPY_FLOAT16_NUMBERS:
-        unit = np.ones(float16[0].rows.shape[1], np.float32)
-        _kernel_products(float16[0], np.zeros(1, np.int64), unit)
+        query = np.ones(float16[0].rows.shape[1], np.float32)
+        _kernel_cosines(float16, query, np.zeros(1, np.int64))
 
 
 def _normalize(query: QueryRow) -> Scores:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
@@ -160,14 +161,14 @@ def test_answers_equal_brute_force_with_order_and_ties(
 def test_the_kernel_is_compiled_in_advance_exactly_for_maps_that_use_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    products = dense_scan._kernel_products
+    cosines = dense_scan._kernel_cosines
     used: list[int] = []
 
-    def record(chunk: LoadedChunk, rows: NDArray[np.int64], unit: Rows) -> Any:
+    def record(chunks: Sequence[LoadedChunk], query: Rows, rows: NDArray[np.int64]) -> Any:
         used.append(len(rows))
-        return products(chunk, rows, unit)
+        return cosines(chunks, query, rows)
 
-    monkeypatch.setattr(dense_scan, "_kernel_products", record)
+    monkeypatch.setattr(dense_scan, "_kernel_cosines", record)
     rows = unit_rows(6, 80, 14_336)
     cases: list[tuple[StoredRows, bool]] = [
         (rows.astype(np.float16), True),
@@ -200,20 +201,22 @@ def test_chunks_of_both_types_are_searched_as_one_map() -> None:
         np.testing.assert_allclose(products, rows.astype(np.float64) @ query, atol=1e-12)
 
 
+@pytest.mark.parametrize("row_type", [np.float32, np.float16])
 @pytest.mark.parametrize("seed", range(3))
-def test_near_duplicates_at_7168_dimensions_are_distinguished(seed: int) -> None:
+def test_near_duplicates_at_7168_dimensions_are_distinguished(seed: int, row_type: Any) -> None:
     """Far below what float32 sums can tell: many rows, all within 1e-6 of each other."""
     rng = np.random.default_rng(seed)
     place = unit_rows(seed, 1, 7168)[0]
-    rows = np.tile(place, (60, 1))
+    rows = np.tile(place, (110, 1))
     rows += rng.standard_normal(rows.shape).astype(np.float32) * np.float32(3e-6)
     rows = normalised(rows)
     rows[10:20] = rows[30:40]  # and some of them the same
     rows = np.concatenate([rows, unit_rows(seed + 9, 40, 7168)])
-    numbers = rng.permutation(100).tolist()
+    numbers = rng.permutation(150).tolist()
+    stored: StoredRows = rows.astype(row_type)
     for k in (1, 7, 60, 200):
-        found = hits_of(split(rows, 3, numbers), place, k)
-        assert found == brute_force(rows, numbers, place, k)
+        found = hits_of(split(stored, 3, numbers), place, k)
+        assert found == brute_force(stored, numbers, place, k)
 
 
 def test_scores_equal_exact_arithmetic() -> None:
