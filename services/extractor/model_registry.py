@@ -74,7 +74,9 @@ class ModelRegistry:
         # Extractors with the same local features share a backbone.
         self._backbones: WeakValueDictionary[object, Backbone] = WeakValueDictionary()
         # Kept beyond eviction, so that a reloaded model does not run out of memory again.
-        self._pass_limits = defaultdict[object, BatchSizeLimit](BatchSizeLimit)
+        self._pass_limits = defaultdict[object, BatchSizeLimit](
+            lambda: BatchSizeLimit(self._device)
+        )
         self._load_errors: dict[str, str] = {}
         self._update_state()
         self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)

@@ -63,7 +63,7 @@ class ModelDescriber:
             if image_size is not None
             else Preprocessing("native", 1, True, max_pixels, (480, 640), _keep_size)
         )
-        self._limit = BatchSizeLimit()
+        self._limit = BatchSizeLimit(device)
         self.seconds = 0.0
         self.photos = 0
         self._mean = torch.tensor(IMAGENET_MEAN, device=device)[:, None, None] * 255

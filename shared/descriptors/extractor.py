@@ -128,7 +128,7 @@ class Extractor:
         """
         self.config = config
         self.precision: Precision = precision
-        self.limit = limit or BatchSizeLimit()
+        self.limit = limit or BatchSizeLimit(device)
         self.backbone = backbone or BACKBONES[config.backbone](config, device, dino_weights)
         self.preprocessing: Preprocessing = _preprocessing(config, self.backbone)
         assert config.width in (None, self.backbone.width), "config.width must match the backbone"

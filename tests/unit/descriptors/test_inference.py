@@ -49,7 +49,7 @@ def on(backbone: SmallGpu, limit: BatchSizeLimit | None = None) -> Extractor:
     config = get_extractor_config(
         "test-tiny-vlad:aggregator=avg,preprocessing=square224", allow_test_extractors=True
     )
-    return Extractor(config, CPU, backbone=backbone, limit=limit)
+    return Extractor(config, CPU, backbone=backbone, limit=limit or BatchSizeLimit(CUDA))
 
 
 def photos(count: int, side: int = SIDE) -> list[NDArray[np.uint8]]:
@@ -118,14 +118,14 @@ def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegistry) -> None:
-    models.extractor("test-tiny-avg").limit.record_out_of_memory(8, SIDE * SIDE)
+    models.extractor("test-tiny-avg").limit.record_out_of_memory(2, SIDE * SIDE)
     first_backbone = weakref.ref(models.extractor("test-tiny-avg").backbone)
     other = models.extractor("test-slow-avg")
     gc.collect()
     assert first_backbone() is None, "its memory is free"
     again = models.extractor("test-tiny-avg")
-    assert again.limit.photos(16, SIDE * SIDE) == 4
-    assert other.limit.photos(16, SIDE * SIDE) == 16
+    assert again.limit.photos(16, SIDE * SIDE) == 1
+    assert other.limit.photos(16, SIDE * SIDE) == 2
 
 
 @pytest.mark.parametrize(("device", "warmed"), [(CPU, []), (CUDA, [7])])
@@ -167,7 +167,7 @@ def test_threads_share_a_gpu_one_pass_at_a_time(device: torch.device, most: int)
 
     def work() -> None:
         meeting.wait()
-        list(run_in_batches(photos(1), run, BatchSizeLimit(), device))
+        list(run_in_batches(photos(1), run, BatchSizeLimit(device), device))
 
     threads = [threading.Thread(target=work) for _ in range(2)]
     for thread in threads:
