@@ -35,9 +35,7 @@ from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sampl
 from shared.descriptors.pca_whitening import PcaWhiteningFile, Rows
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
-from shared.extractor_config.configs import get_extractor_config
-
-DEFAULT_SAMPLE_PHOTOS = 1000  # same default as for fits on a map
+from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS, get_extractor_config
 
 
 def fit_vocabulary_on_folder(

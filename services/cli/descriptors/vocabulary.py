@@ -28,7 +28,7 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import InvalidRequest
-from shared.extractor_config.configs import MAX_CLUSTERS
+from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS, MAX_CLUSTERS
 
 app = typer.Typer(help="Manage VLAD vocabularies (cluster centres): fit, import, export, list.")
 
@@ -57,7 +57,10 @@ def fit(
         ),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=1, help="Maximum number of photos to fit on. Default: 1000.")
+        int | None,
+        typer.Option(
+            min=1, help=f"Maximum number of photos to fit on. Default: {DEFAULT_SAMPLE_PHOTOS}."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Random seed.")] = None,
     map_name: MapOption = None,

@@ -29,7 +29,12 @@ from shared.catalog.photos import PhotoRole, has_live_photo
 from shared.catalog.vocabularies import get_pca_source_generation, get_vocabulary, list_vocabularies
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured, invalid_field_error
-from shared.extractor_config.configs import MAX_CLUSTERS, MAX_PCA_DIMENSION, ExtractorConfig
+from shared.extractor_config.configs import (
+    DEFAULT_SAMPLE_PHOTOS,
+    MAX_CLUSTERS,
+    MAX_PCA_DIMENSION,
+    ExtractorConfig,
+)
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.storage.keys import new_vocabulary_key
@@ -48,7 +53,9 @@ class FitVocabularyRequest(RequestModel):
         description="null: the number in the extractor's name, or 64; fewer are fitted if the "
         "photos have too few features",
     )
-    sample: int = Field(1000, ge=1, le=1_000_000, description="maximum number of photos to fit on")
+    sample: int = Field(
+        DEFAULT_SAMPLE_PHOTOS, ge=1, le=1_000_000, description="maximum number of photos to fit on"
+    )
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 

@@ -12,6 +12,7 @@ from uuid import UUID
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
+from services.steward.tasks.auto_fit import is_fit_due
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
@@ -64,6 +65,8 @@ def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool
     statistics, _ = get_map_statistics(session, map_id)
     if statistics.located < min_photos:
         return None
+    if is_fit_due(session, session.get_one(Map, map_id)):
+        return None  # which makes a generation that has to be evaluated anyway
     searchable, queries = statistics.searchable, statistics.located_queries
     params = {
         "sample": AUTO_SAMPLE_PHOTOS,

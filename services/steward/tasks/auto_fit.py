@@ -18,13 +18,14 @@ from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map, has_database_photos, list_maps, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import next_fit_photos
+from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS
 from shared.jobs import Job, JobKind, Wakeups
 from shared.jobs.model_changes import get_unfinished_model_change, start_model_change
 
 log = logging.getLogger(__name__)
 
 # The defaults of `POST /vocabularies`; without `clusters` the extractor's own number is used.
-DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
+DEFAULT_FIT_PARAMS = {"clusters": None, "sample": DEFAULT_SAMPLE_PHOTOS, "seed": 0}
 
 # An upload is under way until no photo has arrived for so long ...
 QUIET_SECONDS = 5.0
@@ -39,12 +40,12 @@ def fit_due_vocabularies(catalog: Catalog, wakeups: Wakeups) -> bool:
         Whether a map is due but for photos that arrived less than QUIET_SECONDS ago.
     """
     with catalog.read() as session:
-        due = [map_.id for map_ in list_maps(session) if _is_due(session, map_)]
+        due = [map_.id for map_ in list_maps(session) if is_fit_due(session, map_)]
         settled = [map_id for map_id in due if not _has_arrivals(session, map_id)]
     for map_id in settled:
         with catalog.write() as session:
             map_ = lock_map(session, map_id)
-            if not _is_due(session, map_):
+            if not is_fit_due(session, map_):
                 continue  # another steward has started the fit
             job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
         log.info(
@@ -54,7 +55,7 @@ def fit_due_vocabularies(catalog: Catalog, wakeups: Wakeups) -> bool:
     return len(settled) < len(due)
 
 
-def _is_due(session: Session, map_: Map) -> bool:
+def is_fit_due(session: Session, map_: Map) -> bool:
     """Return whether the map has enough photos, and none of them waits to be described."""
     photos = next_fit_photos(session, map_)
     return (

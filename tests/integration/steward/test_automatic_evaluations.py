@@ -14,6 +14,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import JobKind, JobState
 from shared.jobs.transitions import cancel_job, fail_job
 from shared.storage import FolderStore
@@ -169,3 +170,13 @@ def test_each_map_is_evaluated_for_itself(town: Town, catalog: Catalog, store: F
     assert automatic(town)
     assert (len(town.evaluations()), len(other.evaluations())) == (1, 0)
     assert (town.calibration() is None, other.calibration() is None) == (False, True)
+
+
+def test_a_map_that_waits_for_its_vocabulary_is_evaluated_after_the_fit(town: Town) -> None:
+    with town.catalog.write() as session:
+        lock_map(session, town.map_id).extractor = "efficientnet-lite0-vlad128"
+    town.publish([(n, at(n)) for n in range(MIN_PHOTOS_TO_FIT)])
+    assert not automatic(town), "the fit makes a generation that is evaluated anyway"
+    with town.catalog.write() as session:
+        lock_map(session, town.map_id).fitted_photos = MIN_PHOTOS_TO_FIT
+    assert automatic(town)

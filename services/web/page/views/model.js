@@ -89,13 +89,13 @@ async function followJob(work, started, words, again, signal) {
 
 async function fitVocabulary(follow) {
   const clusters = h("input", { type: "number", min: 1, max: 4096, placeholder: "set by the extractor" });
-  const sample = h("input", { type: "number", min: 1, value: "1000" });
+  const sample = h("input", { type: "number", min: 1, value: "500" });
   const { dialog, closed } = openDialog("Fit a vocabulary", h("form", { method: "dialog" },
     h("p", {}, "Centres are found in this map’s own photos, and every photo is described again with them. Answers go on meanwhile; the new descriptors take over when all are ready."),
     h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to fit on, at most", sample)),
     h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
   if ((await closed) !== "yes") return;
-  const options = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
+  const options = { sample: Number(sample.value) || 500, clusters: Number(clusters.value) || null };
   follow(await post("/vocabularies", { json: options }), CHANGES.fit);
 }
 
