@@ -136,7 +136,6 @@ class Estimate(Answer):
     place: str | None = None
     has_place: bool = False
     confidence: float | None = None
-    calibration: str = "uncalibrated"
     reason: str
     levels: list[EstimateLevel] = []
     """finest first"""

@@ -164,10 +164,9 @@ class EstimateResponse(ResponseModel):
     )
     confidence: float | None = Field(
         None,
-        description="probability of being right, calibrated on labelled queries; null while "
-        "uncalibrated",
+        description="probability that the place named here is right: that of the finest level; "
+        "null without levels",
     )
-    calibration: str = Field("uncalibrated", description="`calibrated` or `uncalibrated`")
     reason: str
     levels: list[EstimateLevelResponse] = Field(
         [],

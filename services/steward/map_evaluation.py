@@ -33,15 +33,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
-from shared.evaluation.calibration import (
-    Calibration,
-    auroc,
-    cross_validate,
-    expected_calibration_error,
-    fit_confidence,
-    fit_threshold,
-    recall_at_precision,
-)
+from shared.evaluation.calibration import Calibration, fit_threshold
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     PhotoLocation,
@@ -133,19 +125,10 @@ class _LabelledQueryMetrics:
     recall: RecallCounter = field(default_factory=RecallCounter)
     outcomes: list[QueryOutcome] = field(default_factory=list)
 
-    def confidence_samples(self) -> list[tuple[PlaceEvidence, bool]]:
-        """Return (evidence, is correct) of the queries that were taken in another session."""
-        return [
-            (o.evidence, o.is_correct)
-            for o in self.outcomes
-            if o.evidence is not None and not o.same_session
-        ]
-
     def figures(self) -> dict[str, Any]:
         """Return the metrics as JSON.
 
-        Recall is over queries whose place is in the map, the other metrics are over all. Those of
-        the confidence are cross-validated: the confidence of a query is fitted on the others.
+        Recall is over queries whose place is in the map, the other metrics are over all.
         """
         inside = [o for o in self.outcomes if o.in_map]
         outside = [o for o in self.outcomes if not o.in_map]
@@ -161,20 +144,6 @@ class _LabelledQueryMetrics:
                 sum(bool(o.accepted) for o in self.outcomes),
             ),
             "false_accepts": ratio(sum(bool(o.accepted) for o in outside), len(outside)),
-            **self._confidence(),
-        }
-
-    def _confidence(self) -> dict[str, Any]:
-        samples = self.confidence_samples()
-        predicted = cross_validate(samples)
-        if predicted is None:
-            return {"calibration_error": None, "auroc": None, "recall_at_99_precision": None}
-        is_correct = [correct for _, correct in samples]
-        findable = sum(o.in_map and not o.same_session for o in self.outcomes)
-        return {
-            "calibration_error": expected_calibration_error(predicted, is_correct),
-            "auroc": auroc(predicted, is_correct),
-            "recall_at_99_precision": recall_at_precision(predicted, is_correct, findable),
         }
 
 
@@ -253,28 +222,15 @@ class MapEvaluation:
             radius_m=self.radius_m,
             support_threshold=threshold,
             impostors=len(impostors),
-            labelled_queries=0,
-            confidence=None,
         )
         labelled = self._evaluate_labelled_queries(provisional, rank_photo)
-        samples = labelled.confidence_samples()
         places = self._evaluate_places(sample, own_photos, labelled)
-        calibration = provisional.model_copy(
-            update={
-                "labelled_queries": len(samples),
-                "confidence": fit_confidence(samples),
-                "places": places.model,
-            }
-        )
+        calibration = provisional.model_copy(update={"places": places.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
             "labelled_queries": labelled.figures() if self.queries else None,
-            "estimate": {
-                "support_threshold": threshold,
-                "impostors": len(impostors),
-                "calibration": calibration.state,
-            },
+            "estimate": {"support_threshold": threshold, "impostors": len(impostors)},
             "places": places.figures,
         }
         return MapEvaluationResult(figures, calibration)

@@ -1,14 +1,12 @@
-"""Calibration of a generation's scores: open-set threshold, confidence, and their metrics.
+"""Calibration of a generation's scores: open-set threshold, place model, and metrics.
 
 The *threshold* decides whether a query shows a place of the map. It is fitted on *impostors*: the
 map's own photos, searched with all photos of their place excluded, so that every match is wrong.
 Their evidence is that of photos from outside the map, so a threshold that 95 % of them do not
 exceed accepts about one outside photo in twenty. It needs no labelled queries.
 
-The *confidence*, P(the estimate is correct), needs queries whose place is known and that were taken
-on another day than the photos they match. Within one session the correct photo always scores high,
-and a confidence fitted on such queries would be overconfident. It is a logistic regression on the
-evidence (Platt 1999), fitted by Newton's method with a small L2 penalty.
+`fit_confidence` fits P(the first match is correct) to queries whose place is known, for evaluations
+of data sets: a logistic regression (Platt 1999) by Newton's method with a small L2 penalty.
 
 Metrics of a confidence: expected calibration error (ECE), AUROC, recall at a given precision.
 """
@@ -30,7 +28,6 @@ MIN_LABELLED_QUERIES = 40
 MIN_QUERIES_PER_CLASS = 8  # correct and wrong queries each; with fewer the slope is unreliable
 L2_PENALTY = 0.1  # on standardised evidence; keeps weights finite on separable data
 NEWTON_STEPS = 50
-FOLDS = 5
 
 
 class LogisticRegression(BaseModel):
@@ -66,17 +63,8 @@ class Calibration(BaseModel):
     """Queries whose support does not exceed it are "not in this map"; None: too few impostors."""
     impostors: int
     """number of impostors that the threshold was fitted on"""
-    labelled_queries: int
-    """number of labelled queries that the confidence was fitted on"""
-    confidence: LogisticRegression | None
-    """None: uncalibrated"""
     places: PlaceModel | None = None
     """probabilities of the levels of estimates; None in calibrations of earlier releases"""
-
-    @property
-    def state(self) -> str:
-        """`calibrated` if estimates have a confidence, else `uncalibrated`."""
-        return "uncalibrated" if self.confidence is None else "calibrated"
 
     def accepts(self, evidence: PlaceEvidence) -> bool | None:
         """Return whether the query shows a place of the map; None without a threshold."""
@@ -133,22 +121,6 @@ def fit_confidence(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> LogisticRe
         means=tuple(means.tolist()),
         scales=tuple(scales.tolist()),
     )
-
-
-def cross_validate(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> list[float] | None:
-    """Predict P(correct) of each query by k-fold cross-validation, with `FOLDS` folds.
-
-    Returns:
-        The predictions in the order of the queries; None if a fold has too few queries to fit on.
-    """
-    predictions = [0.0] * len(labelled)
-    for fold in range(FOLDS):
-        model = fit_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
-        if model is None:
-            return None
-        for index in range(fold, len(labelled), FOLDS):
-            predictions[index] = model.probability(labelled[index][0])
-    return predictions
 
 
 def _matrix(evidence: Sequence[PlaceEvidence]) -> NDArray[np.float64]:

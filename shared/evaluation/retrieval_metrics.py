@@ -23,7 +23,6 @@ from shared.evaluation.bootstrap import (
     bootstrap_intervals,
 )
 from shared.evaluation.calibration import (
-    FOLDS,
     auroc,
     expected_calibration_error,
     fit_confidence,
@@ -154,6 +153,7 @@ def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
 
 
 TARGET_PRECISION = 0.99
+FOLDS = 5
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,6 @@ ESTIMATE_FIELDS = {
     "place",
     "has_place",
     "confidence",
-    "calibration",
     "reason",
     "certainty",
     "levels",
@@ -97,7 +96,7 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
     assert before["in_map"] is None
     assert "is not measured yet" in before["reason"]
     assert got(server.client.get("/api/v1/maps/streets"))["measurement"] == "not_measured"
-    assert (before["confidence"], before["calibration"]) == (None, "uncalibrated")
+    assert (before["confidence"], before["calibration_source"]) == (None, None)
     assert (before["latitude"], before["longitude"]) == (pytest.approx(3), pytest.approx(7))
 
     job = evaluate(server, "streets")
@@ -123,7 +122,7 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
             pytest.approx(7),
         )
         assert (estimate["radius_m"], estimate["place"]) == (25, None)
-        assert (estimate["confidence"], estimate["calibration"]) == (None, "uncalibrated")
+        assert estimate["confidence"] == estimate["levels"][0]["probability"]
     strangers = [ask(server, "streets", photo_bytes(next(fresh)))["estimate"] for _ in range(20)]
     refused = [estimate for estimate in strangers if estimate["in_map"] is False]
     assert len(refused) >= 14, "about one in twenty is accepted"

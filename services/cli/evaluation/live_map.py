@@ -21,7 +21,6 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Conflict
-from shared.evaluation.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
 MAX_EVALUATIONS_SHOWN = 6  # the current evaluation and earlier ones
 
@@ -166,7 +165,7 @@ def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
 
 
 def _estimate_lines(figures: Json) -> list[str]:
-    labelled, estimate = figures["labelled_queries"], figures["estimate"]
+    labelled = figures["labelled_queries"]
     lines = [
         f"Positive match: within {figures['radius_m']:g} m, or the same place label.",
         "Own photos find the frames before and after them, which flatters.",
@@ -174,28 +173,14 @@ def _estimate_lines(figures: Json) -> list[str]:
     ]
     if labelled is None:
         lines.append(
-            "Confidence is uncalibrated. To calibrate it, upload photos taken on another day, with "
-            "coordinates, as labelled queries (placewise index DIR --role query)."
+            "Photos of another day, with coordinates or labels, make the probabilities better: "
+            "placewise index DIR --role query."
         )
         return lines
-    if estimate["calibration"] == "uncalibrated":
-        usable = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
-        lines.append(
-            f"Confidence is uncalibrated: the map has {usable} labelled queries of another "
-            f"session. At least {MIN_LABELLED_QUERIES} are required, including "
-            f"{MIN_QUERIES_PER_CLASS} with a correct and {MIN_QUERIES_PER_CLASS} with an incorrect "
-            "first match."
-        )
     lines.append(
         f"{format_percent(labelled['accepted_in_map'])} of the {labelled['queries']} queries in "
         f"the map and {format_percent(labelled['false_accepts'])} of the "
         f"{labelled['out_of_map']} queries outside it are accepted. "
         f"{format_percent(labelled['right_of_accepted'])} of the accepted queries are correct."
     )
-    if labelled["auroc"] is not None:
-        lines.append(
-            f"Confidence ({estimate['calibration']}, cross-validated): expected calibration error "
-            f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
-            f"precision {format_percent(labelled['recall_at_99_precision'])}."
-        )
     return lines

@@ -46,18 +46,12 @@ def estimate_place(
         radius_m: Photos within this distance in metres show the same place.
         no_place_reason: The reason if a ranking is empty.
     """
-    state = calibration.state if calibration else "uncalibrated"
     evidence = (
         compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
     )
     if evidence is None:
-        return EstimateResponse(calibration=state, reason=no_place_reason)
+        return EstimateResponse(reason=no_place_reason)
     accepted = calibration.accepts(evidence) if calibration else None
-    confidence = (
-        calibration.confidence.probability(evidence)
-        if calibration and calibration.confidence
-        else None
-    )
     spot = (
         estimate_location(ranking, radius_m)
         if accepted is not False
@@ -70,8 +64,6 @@ def estimate_place(
         radius_m=None if spot.latitude is None else radius_m,
         place=spot.place,
         has_place=accepted is not False,
-        confidence=confidence,
-        calibration=state,
         reason=_estimate_reason(accepted, evidence.support, calibration),
     )
 
@@ -92,6 +84,7 @@ def add_levels(
                 )
                 for level, probability in zip(estimate.levels, estimate.probabilities, strict=True)
             ],
+            "confidence": estimate.probabilities[0],
             "answer_level": estimate.answer,
             "has_place": response.has_place
             or estimate.answer is not None

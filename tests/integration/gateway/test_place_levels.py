@@ -32,8 +32,6 @@ def fit(service: Service, map_name: str = "default") -> None:
         radius_m=25.0,
         support_threshold=None,
         impostors=0,
-        labelled_queries=0,
-        confidence=None,
         places=PlaceModel(source="own_photos", own_photos=20),
     )
     with service.catalog.write() as session:

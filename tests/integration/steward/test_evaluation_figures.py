@@ -157,7 +157,7 @@ def queried_photos(town: Town, **params: Any) -> list[UUID]:
     ("later", "same"),
     [(0 * HOUR, True), (11.9 * HOUR, True), (-11.9 * HOUR, True), (12 * HOUR, False)],
 )
-def test_queries_of_the_session_of_their_match_teach_no_confidence(
+def test_queries_of_the_session_of_their_match_refine_no_probability(
     town: Town, later: timedelta, same: bool
 ) -> None:
     """40 of them are right and 20 wrong: enough to learn from, if they were of another day."""
@@ -170,12 +170,9 @@ def test_queries_of_the_session_of_their_match_teach_no_confidence(
     )
     figures = town.figures()
     assert figures["labelled_queries"]["same_session"] == (60 if same else 0)
-    calibration = town.calibration()
-    assert calibration is not None
-    assert calibration["labelled_queries"] == (0 if same else 60)
-    expected = "uncalibrated" if same else "calibrated"
-    assert figures["estimate"]["calibration"] == expected
-    assert (figures["labelled_queries"]["auroc"] is None) == same
+    places = figures["places"]
+    refined = places is not None and places["source"] == "labelled_queries"
+    assert refined != same
 
 
 def test_a_photo_deleted_meanwhile_counts_neither_way(town: Town, catalog: Catalog) -> None:

@@ -11,7 +11,6 @@ from hypothesis import strategies as some
 
 from shared.evaluation.calibration import (
     auroc,
-    cross_validate,
     expected_calibration_error,
     fit_confidence,
     fit_threshold,
@@ -144,7 +143,6 @@ def test_no_confidence_is_learnt_from_too_few_or_of_one_kind() -> None:
         [],
     ):
         assert fit_confidence(judged) is None
-        assert cross_validate(judged) is None
     assert fit_confidence([(e, n % 2 == 0) for n, e in enumerate(evidence)]) is not None
 
 
@@ -160,9 +158,6 @@ def test_a_confidence_separates_right_from_wrong_and_stays_between_0_and_1() -> 
         found = auroc(reported, [ok for _, ok in judged])
         assert found is not None
         assert found > 0.9
-        predicted = cross_validate(judged)
-        assert predicted is not None
-        assert len(predicted) == len(judged)
 
 
 # --- places ----------------------------------------------------------------------------------

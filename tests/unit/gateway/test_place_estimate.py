@@ -16,8 +16,6 @@ from shared.evaluation.calibration import (
     FALSE_ACCEPT_RATE,
     MIN_IMPOSTORS,
     Calibration,
-    LogisticRegression,
-    cross_validate,
     fit_confidence,
     fit_threshold,
 )
@@ -202,17 +200,6 @@ def test_evidence_that_never_varies_does_not_break_the_fit() -> None:
 def test_too_few_labels_or_only_one_kind_stay_uncalibrated() -> None:
     assert fit_confidence(labelled(39)) is None
     assert fit_confidence([(PlaceEvidence(0.1, 0.1), True)] * 100) is None
-    assert cross_validate(labelled(30)) is None
-
-
-def test_a_cross_validated_confidence_is_one_that_never_saw_its_query() -> None:
-    pairs = labelled(200)
-    predicted = cross_validate(pairs)
-    assert predicted is not None
-    others = [pair for index, pair in enumerate(pairs) if index % 5 != 3]
-    learnt = fit_confidence(others)
-    assert learnt is not None
-    assert predicted[3] == learnt.probability(pairs[3][0])
 
 
 # --- the answer ------------------------------------------------------------------------------
@@ -233,16 +220,8 @@ def answer(
     return estimate_place(calibration, ranked, ranked, RADIUS_M, "no place")
 
 
-def calibration(
-    threshold: float | None, confidence: LogisticRegression | None = None
-) -> Calibration:
-    return Calibration(
-        radius_m=RADIUS_M,
-        support_threshold=threshold,
-        impostors=100,
-        labelled_queries=0,
-        confidence=confidence,
-    )
+def calibration(threshold: float | None) -> Calibration:
+    return Calibration(radius_m=RADIUS_M, support_threshold=threshold, impostors=100)
 
 
 PAIRS = ((0.5, north(0)), (0.2, north(700)))
@@ -251,11 +230,7 @@ PAIRS = ((0.5, north(0)), (0.2, north(700)))
 def test_before_an_evaluation_the_place_is_given_and_nothing_is_claimed_of_it() -> None:
     for known in (None, calibration(None)):
         reported = answer(known, *PAIRS)
-        assert (reported.in_map, reported.confidence, reported.calibration) == (
-            None,
-            None,
-            "uncalibrated",
-        )
+        assert (reported.in_map, reported.confidence, reported.calibration_source) == (None,) * 3
         assert reported.latitude == pytest.approx(45.0)
         assert reported.radius_m == RADIUS_M
 
@@ -266,14 +241,6 @@ def test_support_over_the_threshold_is_in_the_map_and_under_it_is_not() -> None:
     assert inside.latitude is not None
     assert (outside.latitude, outside.longitude, outside.radius_m, outside.place) == (None,) * 4
     assert outside.reason.startswith("Probably not in this map")
-
-
-def test_labelled_queries_give_a_confidence() -> None:
-    learnt = fit_confidence(labelled(500))
-    reported = answer(calibration(0.1, learnt), *PAIRS)
-    assert learnt is not None
-    assert reported.calibration == "calibrated"
-    assert reported.confidence == pytest.approx(learnt.probability(PlaceEvidence(0.3, 0.5)))
 
 
 def test_an_empty_ranking_gives_no_estimate() -> None:

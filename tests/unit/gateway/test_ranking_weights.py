@@ -24,8 +24,6 @@ def calibration(threshold: float) -> Calibration:
         radius_m=25.0,
         support_threshold=threshold,
         impostors=100,
-        labelled_queries=0,
-        confidence=None,
     )
 
 

@@ -23,7 +23,6 @@ export function verdict(found, measurement) {
     source(estimate),
     h("details", {}, h("summary", {}, "Details"),
       h("dl", { class: "facts" },
-        estimate.confidence !== null && [h("dt", {}, "Confidence"), h("dd", {}, percent(estimate.confidence))],
         bars && kind !== "unknown" && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
         h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
