@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
+.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -46,8 +46,11 @@ run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under
 test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
+test-lab: $(INSTALLED) ## tests of the lab (part of `make test`)
+	$(BIN)/python -m pytest tests/lab --numprocesses auto --dist loadfile --no-loadscope-reorder
+
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
-	$(BIN)/python -m pytest tests/unit tests/contract -m "not servers" --numprocesses logical --dist loadfile
+	$(BIN)/python -m pytest tests/unit tests/contract tests/lab/unit tests/lab/contract -m "not servers" --numprocesses logical --dist loadfile
 
 # ARM ignores the names of x86's instructions and cores.
 test-numerics: $(INSTALLED) ## tests whose outcome depends on rounding, with the sums of another processor
@@ -89,7 +92,7 @@ bench: $(INSTALLED) ## benchmark upload, description and search
 	$(BIN)/placewise bench spine
 
 demo: $(INSTALLED) ## generate a city, index it, fit a vocabulary, search, print recall, write docs/demo.jpg
-	$(BIN)/python -m benchmarks.demo --picture docs/demo.jpg
+	$(BIN)/python -m lab.benchmarks.demo --picture docs/demo.jpg
 
 env: ## write .env for docker compose with new secrets (an existing one is kept)
 	@test ! -e .env || { echo ".env exists already"; exit 1; }

@@ -113,7 +113,8 @@ def _needs_server(item: pytest.Item) -> bool:
 
 
 def _kind(item: pytest.Item) -> str:
-    return item.path.relative_to(TESTS).parts[0]
+    kind, below, *_ = item.path.relative_to(TESTS).parts
+    return below if kind == "lab" else kind
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

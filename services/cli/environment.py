@@ -79,12 +79,21 @@ def require_packages(*names: str) -> None:
         names: Import names; by default those of evaluation, `faiss` and `torch`.
 
     Raises:
-        Misconfigured: `trainer_missing` if one of them is not installed.
+        Misconfigured: `lab_missing` if one of them is not installed.
     """
     missing = [name for name in names or ("faiss", "torch") if find_spec(name) is None]
     if missing:
         raise Misconfigured(
-            "trainer_missing",
+            "lab_missing",
             f"This command requires {', '.join(missing)}. "
-            "Run `make setup`, or in the repository: uv pip install '.[trainer]'.",
+            "Run `make setup`, or in the repository: uv pip install '.[lab]'.",
         )
+
+
+def lab_missing(what: str) -> Misconfigured:
+    """Return the error `lab_missing` for a command or option of the lab, which is not installed."""
+    return Misconfigured(
+        "lab_missing",
+        f"{what} is part of the lab, which this installation does not contain. Run it from a clone "
+        "of the repository, after `make setup`, or after: uv pip install '.[lab]'.",
+    )

@@ -34,12 +34,7 @@ PANELS = {
         "pca": ("descriptors.pca", "app"),
         "models": ("descriptors.models", "app"),
         "describe": ("descriptors.describe", "describe"),
-        "evaluate": ("evaluation.commands", "evaluate"),
-        "compare": ("evaluation.commands", "compare"),
-        "train": ("training.commands", "train"),
-        "grid": ("training.commands", "grid"),
-        "datasets": ("datasets.commands", "app"),
-        "bench": ("bench", "app"),
+        "evaluate": ("evaluation.command", "evaluate"),
     },
     "Services": {
         "serve": ("operations.servers", "serve"),
@@ -60,11 +55,38 @@ PANELS = {
         "rebuild-catalog": ("operations.backup", "rebuild_catalog"),
     },
 }
-COMMANDS = {
-    name: (panel, module, attribute)
-    for panel, commands in PANELS.items()
-    for name, (module, attribute) in commands.items()
+# The lab's commands, as above, below lab.cli. They exist where `lab` stands beside `services`: in a
+# clone of the repository, but in no image. Its `evaluate` replaces that of the service.
+LAB_PANEL = "Descriptors and accuracy"
+LAB_COMMANDS = {
+    "evaluate": ("evaluation.commands", "evaluate"),
+    "compare": ("evaluation.commands", "compare"),
+    "train": ("training.commands", "train"),
+    "grid": ("training.commands", "grid"),
+    "datasets": ("datasets.commands", "app"),
+    "bench": ("bench", "app"),
 }
+ROOT = Path(__file__).parents[2]
+
+
+def list_commands(root: Path = ROOT) -> dict[str, tuple[str, str, str]]:
+    """Return the panel, the module and the attribute of each command that is installed.
+
+    Args:
+        root: Folder of the packages `services` and, where it is installed, `lab`.
+    """
+    has_lab = (root / "lab" / "cli" / "__init__.py").is_file()
+    found: dict[str, tuple[str, str, str]] = {}
+    for panel, commands in PANELS.items():
+        for name, (module, attribute) in commands.items():
+            found[name] = (panel, f"services.cli.{module}", attribute)
+        if has_lab and panel == LAB_PANEL:
+            for name, (module, attribute) in LAB_COMMANDS.items():
+                found[name] = (panel, f"lab.cli.{module}", attribute)
+    return found
+
+
+COMMANDS = list_commands()
 
 
 class _PlacewiseGroup(TyperGroup):
@@ -76,6 +98,14 @@ class _PlacewiseGroup(TyperGroup):
 
             prepare_help(self)
         return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name = _use_hyphens(args[0])
+        if name in LAB_COMMANDS and self.get_command(ctx, name) is None:
+            from services.cli.environment import lab_missing
+
+            raise lab_missing(f"`placewise {name}`")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -93,7 +123,7 @@ def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     app = _new_app()
     for name in names:
         panel, module, attribute = COMMANDS[name]
-        command = getattr(importlib.import_module(f"services.cli.{module}"), attribute)
+        command = getattr(importlib.import_module(module), attribute)
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name, rich_help_panel=panel)
         else:
@@ -110,7 +140,7 @@ def _build_overview() -> typer.Typer:
     """
     app = _new_app()
     for name, (panel, module, attribute) in COMMANDS.items():
-        path = Path(__file__).parent / f"{module.replace('.', '/')}.py"
+        path = ROOT / f"{module.replace('.', '/')}.py"
         for node in ast.parse(path.read_bytes()).body:
             if isinstance(node, ast.FunctionDef) and node.name == attribute:
                 text = ast.get_docstring(node)

@@ -157,7 +157,7 @@ def choose_precision(
     """Return the precision of a new generation; `requested` is the setting PRECISION.
 
     `auto` is bfloat16 for DINOv2 on CUDA, else float32: EfficientNet-Lite0 is fast anyway, and in
-    bfloat16 its sums from block to block lose too much accuracy (`benchmarks/RESULTS.md`);
+    bfloat16 its sums from block to block lose too much accuracy (`lab/benchmarks/RESULTS.md`);
     bfloat16 is not measured for torch.hub entries.
     """
     if requested != "auto":

@@ -27,7 +27,7 @@ The score:
 
 Mutual neighbours with a spatial check are the usual way to rerank (Hausler et al., CVPR 2021,
 "Patch-NetVLAD", section 3.4, checks displacements, too). Unlike there, the vote is smooth over
-several scales and is added to the similarity; `benchmarks/RESULTS.md` has measurements.
+several scales and is added to the similarity; `lab/benchmarks/RESULTS.md` has measurements.
 """
 
 from __future__ import annotations

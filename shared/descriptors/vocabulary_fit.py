@@ -3,7 +3,7 @@
 1. k-means++ on the first patches, which are a uniform sample, as the photos come in random order.
 2. Mini-batch passes, each over all patches in batches of another order. The counts restart with
    each pass, so that centres do not keep the weight of early assignments: ten such passes describe
-   patches as well as a hundred of Lloyd's (`benchmarks/RESULTS.md`).
+   patches as well as a hundred of Lloyd's (`lab/benchmarks/RESULTS.md`).
 3. Lloyd's passes, until the centres converge: each is then the mean of its patches.
 
 Memory holds one block of points, the sample for k-means++, and a few arrays of the centres' size. A

@@ -4,21 +4,14 @@ Queries of one street or one drive are correlated; treating them as independent 
 too narrow. The bootstrap therefore resamples whole clusters with replacement, as many as there are,
 and averages over their queries (cluster bootstrap, Davison and Hinkley 1997, 3.8; percentile
 intervals). Two runs are compared by the differences of their queries, on the same resamples.
-
-A cluster is the queries of one sequence, of one place, or of one square of 50 m.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from shared.datasets.open_dataset import DatasetPhoto
-from shared.geodesy import EARTH_RADIUS_M
 
 RESAMPLES = 2000
 CONFIDENCE_LEVEL = 0.95
@@ -130,58 +123,3 @@ def paired_differences(
         )
         for index, column in enumerate(difference.T)
     ]
-
-
-GRID_CELL_M = 50.0  # twice the usual positive radius: queries in a cell share most positives
-
-
-@dataclass(frozen=True, slots=True)
-class QueryClusters:
-    """Assignment of queries to bootstrap clusters."""
-
-    labels: NDArray[np.int64]
-    """(queries,) cluster label of each query"""
-    kind: str
-    """`sequences`, `places`, `squares of 50 m` or `queries`"""
-
-    @property
-    def count(self) -> int:
-        return len(np.unique(self.labels))
-
-
-def cluster_queries(queries: Sequence[DatasetPhoto]) -> QueryClusters:
-    """Cluster queries by sequence, by place or by position.
-
-    Uses the first of these that is known for every query and gives `MIN_CLUSTERS` clusters or
-    more. If there is none, each query is a cluster.
-    """
-    for kind, keys in (
-        ("sequences", [photo.sequence for photo in queries]),
-        ("places", [photo.place for photo in queries]),
-        (f"squares of {GRID_CELL_M:g} m", [_grid_cell(photo) for photo in queries]),
-    ):
-        if None not in keys and len(set(keys)) >= MIN_CLUSTERS:
-            return QueryClusters(_number_labels(keys), kind)
-    return singleton_clusters(len(queries))
-
-
-def singleton_clusters(queries: int) -> QueryClusters:
-    """Make each query a cluster of its own, for queries without metadata."""
-    return QueryClusters(np.arange(queries), "queries")
-
-
-def _grid_cell(photo: DatasetPhoto) -> tuple[str | None, int, int] | None:
-    if photo.easting is not None and photo.northing is not None:
-        return photo.zone, int(photo.easting // GRID_CELL_M), int(photo.northing // GRID_CELL_M)
-    if photo.latitude is None or photo.longitude is None:
-        return None
-    metres_per_degree = math.radians(EARTH_RADIUS_M)
-    row = int(photo.latitude * metres_per_degree // GRID_CELL_M)
-    # One factor for the whole row, so that its cells line up.
-    scale = math.cos(math.radians(row * GRID_CELL_M / metres_per_degree))
-    return "degrees", row, int(photo.longitude * metres_per_degree * scale // GRID_CELL_M)
-
-
-def _number_labels(keys: Sequence[Hashable]) -> NDArray[np.int64]:
-    numbers: dict[Hashable, int] = {}
-    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.int64)

@@ -23,7 +23,7 @@ from shared.errors import Misconfigured
 from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-OWN_LOGGERS = ("services", "shared")
+OWN_LOGGERS = ("lab", "services", "shared")
 # Third-party loggers, limited to warnings.
 QUIET_LOGGERS = (
     "alembic",

@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from shared.datasets.utm_filenames import upload_fields_of_file_name
-from shared.synthetic_city.plan import CityOptions, make_plan
-from shared.synthetic_city.write import write_city
+from lab.city.plan import CityOptions, make_plan
+from lab.city.write import write_city
+from shared.utm_filenames import upload_fields_of_file_name
 from tests.support.server import ServerProcess
 
 PLACES = 24

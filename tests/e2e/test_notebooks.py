@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from nbclient import NotebookClient
 
+from tests.lab.training_runs import write_tiny_places
 from tests.support.processes import forked_program
-from tests.support.training_runs import write_tiny_places
 
 REPOSITORY = Path(__file__).parents[2]
 CELL_SECONDS = 850  # of a busy machine

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.chaos import run_chaos
-from benchmarks.chaos.faults import all_faults
+from lab.benchmarks.chaos import run_chaos
+from lab.benchmarks.chaos.faults import all_faults
 
 # What no other test does to a whole deployment. `placewise bench chaos` injects all faults; those
 # on one component are also in the other modules of this folder, in tests/contract/storage (a store

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet import start_servers
-from benchmarks.rolling import restart_under_load
+from lab.benchmarks.fleet import start_servers
+from lab.benchmarks.rolling import restart_under_load
 
 ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "steward-0")
 

@@ -38,7 +38,7 @@ MODULES = (
     "services.steward.batches.worker",
     "services.steward.evaluation_worker",
     "services.steward.scheduler",
-    "services.trainer.run",
+    "lab.training.run",
     "shared.jobs.celery_wakeups",
     "shared.storage.open_store",
     "shared.descriptors.extractor",

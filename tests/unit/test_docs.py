@@ -10,7 +10,7 @@ import pytest
 from tools.make_api_page import PAGE, openapi_description, render_page
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks/RESULTS.md"])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "lab/benchmarks/RESULTS.md"])
 # What the API page says in short: `/jobs/{id}/events`, `/retry`.
 SHORT = (ROOT / "docs" / "api.md").read_text()
 

@@ -153,7 +153,7 @@ def _hdf5_names(photos: Sequence[Path], out: Path, root: Path | None) -> list[st
 
     Raises:
         InvalidRequest: `options_contradict`; `bad_names` for photos outside `root` and duplicates.
-        Misconfigured: `trainer_missing` if h5py is not installed.
+        Misconfigured: `lab_missing` if h5py is not installed.
     """
     if out.suffix not in (".h5", ".hdf5"):
         if root is not None:

@@ -227,7 +227,7 @@ def _open_descriptor_writer(
         )
         yield lambda rows: file.write(np.ascontiguousarray(rows, "<f4").tobytes())
         return
-    import h5py  # part of the extra `trainer`
+    import h5py  # part of the extra `lab`
 
     remaining_names = iter(names)
     with h5py.File(file, "w") as features:

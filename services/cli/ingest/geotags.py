@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from services.cli.output import utf8_path
-from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 from shared.imaging.photo_header import read_photo_header
@@ -23,6 +22,7 @@ from shared.ingest.photo_metadata import (
     read_csv_manifest,
     read_jsonl_manifest,
 )
+from shared.utm_filenames import upload_fields_of_file_name
 
 
 @dataclass(frozen=True, slots=True)

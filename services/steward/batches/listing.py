@@ -12,7 +12,6 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from services.steward.archives.archive import Archive, ArchiveMember, MemberKind
-from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, Unprocessable, UnsupportedMedia
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 from shared.ingest.photo_metadata import (
@@ -25,6 +24,7 @@ from shared.ingest.photo_metadata import (
 )
 from shared.jobs import JobState
 from shared.storage import ObjectStore
+from shared.utm_filenames import upload_fields_of_file_name
 
 TABLE_NAME, MANIFEST_NAME = "photos.csv", "manifest.jsonl"
 # Suffixes of nested archives, which are not unpacked.

@@ -101,7 +101,7 @@ def _is_busy(session: Session, map_id: UUID) -> bool:
 
 
 def _has_own_vocabulary(session: Session, generation: Generation) -> bool:
-    """Weights for a foreign vocabulary never improved recall (benchmarks/RESULTS.md)."""
+    """Weights for a foreign vocabulary never improved recall (lab/benchmarks/RESULTS.md)."""
     return (
         vocabulary_standing(session, generation) == "own"
         and word_weights_unavailable_reason(session, generation) is None

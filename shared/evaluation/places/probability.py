@@ -2,8 +2,8 @@
 
 Each is a logistic regression on the features of the ranking (`level_features`). `fit` fits
 them to a map; without a fit, the coefficients are those of generated maps
-(`tools/make_place_prior.py`), which order the levels of any map, but are far too certain in a map
-of few photos. `thresholds` decides which level is the answer.
+(`lab/benchmarks/places/place_prior.py`), which order the levels of any map, but are far too certain
+in a map of few photos. `thresholds` decides which level is the answer.
 """
 
 from __future__ import annotations

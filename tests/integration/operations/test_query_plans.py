@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy.engine import make_url
 
-from benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
-from benchmarks.catalog.explain import Explainer
-from benchmarks.catalog.fill import SyntheticCatalog, fill_catalog
+from lab.benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
+from lab.benchmarks.catalog.explain import Explainer
+from lab.benchmarks.catalog.fill import SyntheticCatalog, fill_catalog
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from tests.support.servers import PostgresServer
 

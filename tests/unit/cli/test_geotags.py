@@ -15,8 +15,8 @@ from services.cli.ingest.geotags import (
     find_photos,
     has_coordinates,
 )
-from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest
+from shared.utm_filenames import upload_fields_of_file_name
 from tests.support.photos import photo_bytes
 
 # The Mole Antonelliana in Turin, zone 32T.

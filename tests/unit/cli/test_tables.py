@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from rich.progress_bar import ProgressBar
 
+from lab.cli.training.commands import _TerminalDisplay
 from services.cli.output import Table, print_message, print_table, progress_bar
-from services.cli.training.commands import _TerminalDisplay
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
 MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"

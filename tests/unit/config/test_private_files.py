@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.evaluation.descriptor_cache import CachedDescriber
 from services.cli.operations.installation_checks import check_permissions
 from services.search.chunk_loader import MappedFileCache
 from shared.backup.folder import BackedUpObject, BackupFolder, dump_rows
@@ -21,7 +22,6 @@ from shared.config.embedded_home import announce_server, lock_home
 from shared.config.private_files import create_private_file, make_private_folder
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.evaluation.descriptor_cache import CachedDescriber
 from shared.storage import FolderStore
 from shared.storage.open_store import resolve_upload_dir
 

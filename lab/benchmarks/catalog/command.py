@@ -1,0 +1,332 @@
+"""Makes every catalog call of the services on a filled database, and explains its statements."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import UUID
+
+import psycopg
+from PIL import Image
+from psycopg.sql import SQL, Identifier
+from sqlalchemy import select
+from sqlalchemy.engine import URL, make_url
+from starlette.testclient import TestClient
+
+from lab.benchmarks.catalog.explain import Explainer
+from lab.benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog, fill_catalog
+from lab.benchmarks.report import Report
+from services.cli.environment import read_settings
+from services.cli.output import Table
+from services.gateway.app import create_app
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.search.catalog_sync import read_generation_versions
+from services.steward.evaluation_search import read_geotagged_photos
+from services.steward.scheduler import Scheduler
+from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
+from shared.catalog.database.schema import migrate
+from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.jobs import STEWARD_JOBS
+from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
+from shared.catalog.processes import upsert_search_worker
+from shared.config.settings import Settings
+from shared.config.shards import SINGLE_SHARD
+from shared.errors import Misconfigured, PlacewiseError
+from shared.ids import new_id
+from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
+from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.transitions import release_job
+from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
+from shared.storage import FolderStore
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+# Calls that may read a whole map: a periodic count, an evaluation, and substrings of file names
+# that are too short for an index.
+KNOWN_FULL_SCANS = (
+    "steward: count large maps",
+    "evaluation: located photos",
+    "GET /search?filename=zq",
+)
+
+
+class _FakeSearch:
+    """Search client that returns the same photos for each query: only the catalog join counts."""
+
+    def __init__(self, photo_ids: list[UUID]) -> None:
+        self._hits = tuple(SearchHit(photo_id=photo_id, score=0.5) for photo_id in photo_ids)
+
+    def search(self, request: SearchRequest) -> SearchResponse:
+        return SearchResponse(
+            hits=self._hits[: request.k],
+            certificate="exhaustive",
+            rows_scanned=0,
+            rows_reranked=0,
+            snapshot_version=request.min_version,
+            missing=(),
+        )
+
+    def status(self) -> SearchStatus:
+        return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())
+
+
+def run_all_calls(
+    catalog: Catalog,
+    filled: SyntheticCatalog,
+    explainer: Explainer,
+    folder: Path,
+    name_part: str = "",
+) -> Iterator[str]:
+    """Make every call whose name contains `name_part` once on the largest map.
+
+    Yields the name of each call before it is made.
+    """
+    for name, do in _all_calls(catalog, filled, folder):
+        if name_part in name:
+            yield name
+            with explainer.call(name):
+                do()
+
+
+def _all_calls(
+    catalog: Catalog, filled: SyntheticCatalog, folder: Path
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    settings = Settings(_env_file=None).model_copy(update={"auto_evaluate_photos": 20})
+    store = FolderStore(folder / "objects")
+    with catalog.read() as session:
+        described = session.scalars(
+            select(Descriptor.photo_id)
+            .where(Descriptor.generation_id == filled.generation)
+            .order_by(Descriptor.photo_id)
+            .limit(200)
+        ).all()
+    ids = list(described)
+    client = TestClient(
+        create_app(
+            GatewayContext(
+                catalog,
+                store,
+                InProcessWakeups(),
+                _FakeSearch(ids),
+                settings,
+                LocalhostAuthenticator(),
+            )
+        ),
+        base_url="http://localhost",
+    )
+    steward = Scheduler(catalog, store, InProcessWakeups(), settings)
+    # First, because requests read its counts.
+    for task in sorted(steward.tasks, key=lambda task: task.name != "count large maps"):
+        yield f"steward: {task.name}", task.run
+    yield from _gateway_requests(client, catalog, filled, ids)
+    yield from _extractor_calls(catalog)
+    yield from _search_calls(catalog, filled)
+
+
+def _gateway_requests(
+    client: TestClient, catalog: Catalog, filled: SyntheticCatalog, ids: list[UUID]
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    with catalog.read() as session:
+        photo = session.get_one(Photo, ids[50])
+        jobs = {
+            state: session.scalars(
+                select(Job.id).where(Job.map_id == filled.big, Job.state == state).limit(1)
+            ).one()
+            for state in (JobState.QUEUED, JobState.FAILED)
+        }
+    days_ago = {n: (datetime.now(UTC) - timedelta(days=n)).isoformat() for n in (1, 29)}
+    near = f"{photo.latitude},{photo.longitude}"
+
+    def request(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
+        own_params = options.pop("params", {})
+        params = own_params if path.startswith("/maps") else {"map": LARGEST_MAP, **own_params}
+        query = "&".join(f"{name}={str(value)[:40]}" for name, value in own_params.items())
+        label = f"{method} {_path_template(path)}{'?' if query else ''}{query}"
+
+        def call() -> None:
+            answer = client.request(method, f"/api/v1{path}", params=params, **options)
+            if answer.status_code >= 400:
+                raise PlacewiseError("bad_answer", f"{label}: {answer.text}")
+
+        return label, call
+
+    for found in (
+        {},
+        {"limit": 1000},
+        {"filename": photo.filename[6:14]},
+        {"filename": "street-"},
+        {"filename": "no-such-photo"},
+        {"filename": "zq"},
+        {"upload_after": days_ago[1]},
+        {"upload_before": days_ago[29]},
+        {"min_file_size": 3_199_000},
+        {"min_file_size": 1_000_000, "max_file_size": 1_000_500},
+        {"near": f"{near},50"},
+        {"near": f"{near},2000"},
+        {"near": f"{near},200000"},
+        {"box": "45.05,7.65,45.051,7.651"},
+        {"box": "44,7,46,8"},
+        {"place": "place-100"},
+        {"tags": "night"},
+        {"tags": "tag-100"},
+        {"tags": "night,tag-100"},
+        {"captured_after": days_ago[1]},
+        {"captured_before": days_ago[29]},
+        {"ids": ",".join(str(i) for i in ids[:100])},
+        {"role": "query"},
+        {"place": "place-100", "tags": "night", "near": f"{near},2000"},
+    ):
+        yield request("GET", "/search", params=found)
+    one = f"/uploads/{photo.id}"
+    for path in ("/maps", f"/maps/{LARGEST_MAP}", "/database/stats", one, "/generations"):
+        yield request("GET", path)
+    for found in (
+        {},
+        {"state": "failed"},
+        {"state": "queued"},
+        {"kind": "evaluate"},
+        {"kind": "index", "state": "failed"},
+        {"cursor": str(jobs[JobState.FAILED])},
+    ):
+        yield request("GET", "/jobs", params=found)
+    yield request("GET", "/searches")
+    yield request("GET", "/evaluations")
+    yield request("GET", "/vocabularies")
+    yield request("GET", f"/jobs/{jobs[JobState.QUEUED]}")
+    yield request("POST", f"/jobs/{jobs[JobState.QUEUED]}/cancel")
+    yield request("POST", f"/jobs/{jobs[JobState.FAILED]}/retry")
+    yield request("POST", f"/similarity/{photo.id}", params={"top_k": 10})
+    yield request("PATCH", one, json={"place": "elsewhere"})
+    yield request("DELETE", f"/uploads/{ids[60]}")
+    buffer = io.BytesIO()
+    Image.new("RGB", (64, 48), "gray").save(buffer, "JPEG")
+    yield request("POST", "/upload", files={"file": ("a.jpg", buffer.getvalue())})
+    yield request("POST", "/evaluations", json={})
+
+
+def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
+    claimed: list[Job] = []
+
+    def claim_batch() -> None:
+        with catalog.write() as session:
+            claimed[:] = claim_jobs(
+                session, worker="bench", limit=16, lease_seconds=60, started=False
+            )
+
+    def extend() -> None:
+        token = claimed[0].lease_token
+        assert token is not None
+        with catalog.write() as session:
+            mark_started(session, token, len(claimed))
+            extend_lease(session, token, 60)
+
+    def release() -> None:
+        token = claimed[0].lease_token
+        assert token is not None
+        with catalog.write() as session:
+            for job in lock_leased_jobs(session, token, claimed):
+                release_job(job)
+
+    def claim_queries() -> None:
+        with catalog.write() as session:
+            claim_jobs(session, worker="bench", limit=16, lease_seconds=60, min_priority=100)
+
+    def claim_evaluations() -> None:
+        with catalog.write() as session:
+            claim_jobs(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
+
+    yield "extractor: claim a batch", claim_batch
+    yield "extractor: hold the lease", extend
+    yield "extractor: give back", release
+    yield "extractor: claim queries", claim_queries
+    yield "evaluator: claim", claim_evaluations
+
+
+def _search_calls(
+    catalog: Catalog, filled: SyntheticCatalog
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    def sync() -> None:
+        versions = read_generation_versions(catalog)
+        assert filled.generation in versions
+        with catalog.read() as session:
+            chunks = list_live_chunks(session, filled.generation)
+            list_live_filter_values(session, chunks[0].id)
+            list_photos_changed_since(session, filled.big, filled.photos - 100)
+
+    def register() -> None:
+        with catalog.write() as session:
+            upsert_search_worker(session, new_id(), "bench", None, SINGLE_SHARD, {})
+
+    def evaluate() -> None:
+        with catalog.read() as session:
+            read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.QUERY)
+            read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.DATABASE)
+
+    yield "search: follow", sync
+    yield "search: register", register
+    yield "evaluation: located photos", evaluate
+
+
+def _path_template(path: str) -> str:
+    return "/".join("{id}" if len(part) == 36 else part for part in path.split("/"))
+
+
+def measure(progress: Progress, *, photos: int) -> Report:
+    """Fill a temporary database on the server of DATABASE_URL, and explain all statements.
+
+    Raises:
+        Misconfigured: `postgres_missing`, if DATABASE_URL is not a PostgreSQL.
+    """
+    url = make_url(read_settings().catalog_url())
+    if url.get_backend_name() != "postgresql":
+        raise Misconfigured("postgres_missing", "Set DATABASE_URL to a PostgreSQL to fill.")
+    bar = progress.add_task("filling the catalog", total=None)
+    with _create_database(url) as own, tempfile.TemporaryDirectory() as folder:
+        catalog = Catalog(own, PoolConfig(name="placewise-bench"), TransactionTimeouts(3600, 3600))
+        try:
+            migrate(catalog)
+            filled = fill_catalog(catalog, photos)
+            explainer = Explainer(catalog)
+            for name in run_all_calls(catalog, filled, explainer, Path(folder)):
+                progress.update(bar, description=name)
+        finally:
+            catalog.close()
+    faulty = [e for e in explainer.plans if e.faults() and e.call not in KNOWN_FULL_SCANS]
+    report = Report(f"Statements of the services, {photos:,} photos")
+    table = Table("call", "ms", "rows read", "rows returned", "scans")
+    for e in explainer.plans:
+        cells = (e.call, f"{e.milliseconds:.1f}", f"{e.read:,}", f"{e.returned:,}")
+        table.add_row(*cells, ", ".join(e.scans), style="red" if e in faulty else None)
+    report.tables.append(table)
+    for name, size_bytes in sorted(filled.tables.items(), key=lambda item: -item[1]):
+        report.add(f"{name}: bytes per photo", size_bytes / photos, "B")
+    for e in faulty:
+        report.add(f"{e.call}: {'; '.join(e.faults())}: {e.sql}", 1, at_most=0)
+    report.details = {
+        "photos": photos,
+        "tables": filled.tables,
+        "statements": [{**asdict(e), "faults": e.faults()} for e in explainer.plans],
+    }
+    return report
+
+
+@contextlib.contextmanager
+def _create_database(url: URL) -> Iterator[str]:
+    """Create a database on the same server and return its URL."""
+    name = f"placewise_bench_{new_id().hex}"
+    admin = url.set(drivername="postgresql").render_as_string(hide_password=False)
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(SQL("CREATE DATABASE {}").format(Identifier(name)))
+    try:
+        yield url.set(database=name).render_as_string(hide_password=False)
+    finally:
+        with psycopg.connect(admin, autocommit=True) as connection:
+            connection.execute(SQL("DROP DATABASE {} WITH (FORCE)").format(Identifier(name)))

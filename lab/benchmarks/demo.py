@@ -1,0 +1,274 @@
+"""`make demo`: indexes a generated city, fits, evaluates, queries, and draws a picture.
+
+    python -m lab.benchmarks.demo [--places 300] [--picture docs/demo.jpg]
+
+Half of the city's queries are uploaded as labelled queries, with which the map's confidence is
+calibrated. The other half is held out and queried as a user's photos; the printed results are those
+that a user would get. All metrics are of a generated city and are not comparable with published
+results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from PIL import Image, ImageDraw, ImageFont
+
+from lab.benchmarks.generated_city import generate_city
+from lab.city.plan import CityOptions
+from lab.city.write import NOT_COMPARABLE
+from placewise.answers import Estimate
+from placewise.client import Client
+from services.cli.client import connect, wait_for_job
+from services.cli.ingest.geotags import LocalPhoto, find_photos
+from services.cli.ingest.upload import switch_off_fits, upload_photos
+from services.cli.output import progress_bar
+from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
+from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+CORRECT_WITHIN_M = 25.0
+
+
+@dataclass(frozen=True, slots=True)
+class QueryOutcome:
+    """A query photo with its ground truth and its result."""
+
+    query: Path
+    in_map: bool
+    best: str
+    """File name of the most similar photo."""
+    best_is_correct: bool
+    estimate: Estimate
+    error_m: float | None
+    """Distance of the estimate from the ground truth; None without an estimated location."""
+
+    @property
+    def right(self) -> bool:
+        """Whether the estimated location is within CORRECT_WITHIN_M of the ground truth."""
+        return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
+
+
+def _query_with_photo(
+    client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
+) -> QueryOutcome:
+    """Query with a photo that is not stored, and compare the result with its ground truth."""
+    truth = _location(query.fields)
+    answer = client.similar(query.path, top_k=1)
+    best, estimate = answer.similar_images[0], answer.estimate
+    return QueryOutcome(
+        query=query.path,
+        in_map=any(_is_near(truth, _location(photo.fields)) for photo in database),
+        best=best.original_filename,
+        best_is_correct=_is_near(truth, _location(dict(best))),
+        estimate=estimate,
+        error_m=distance_between_m(truth, _location(dict(estimate))),
+    )
+
+
+def _summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
+    """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
+    inside = [a for a in outcomes if a.in_map]
+    outside = [a for a in outcomes if not a.in_map]
+    accepted = [a for a in outcomes if a.estimate.in_map]
+    errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
+    confidences = [a.estimate.confidence for a in outcomes if a.estimate.confidence is not None]
+    # Without an estimated location, the best photo decides whether the result is correct.
+    right = [a.right or (a.estimate.in_map is False and a.best_is_correct) for a in outcomes]
+    is_calibrated = len(confidences) == len(outcomes)
+    return {
+        "queries": len(outcomes),
+        "out_of_map": len(outside),
+        "R@1": _ratio(sum(a.best_is_correct for a in inside), len(inside)),
+        "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
+        "accepted_in_map": _ratio(sum(bool(a.estimate.in_map) for a in inside), len(inside)),
+        "false_accepts": _ratio(sum(bool(a.estimate.in_map) for a in outside), len(outside)),
+        "median_error_m": median(errors) if errors else None,
+        "calibration_error": (
+            expected_calibration_error(confidences, right) if is_calibrated else None
+        ),
+        "auroc": auroc(confidences, right) if is_calibrated else None,
+        "recall_at_99_precision": (
+            recall_at_precision(confidences, right, len(inside)) if is_calibrated else None
+        ),
+    }
+
+
+def _location(fields: Mapping[str, Any]) -> PhotoLocation:
+    latitude, longitude = fields.get("latitude"), fields.get("longitude")
+    if latitude is None or longitude is None:
+        return PhotoLocation(None, None, None)
+    return PhotoLocation(float(latitude), float(longitude), None)
+
+
+def _is_near(a: PhotoLocation, b: PhotoLocation) -> bool:
+    distance = distance_between_m(a, b)
+    return distance is not None and distance <= CORRECT_WITHIN_M
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+COLUMNS = 6
+CELL = (240, 180)
+CAPTION = 22
+EDGE = 4
+GAP = 16
+CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), (150, 150, 150)
+
+
+def _draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
+    """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
+
+    The frame is green for a correct match, red for a wrong one, grey for "not in this map".
+    """
+    chosen = _choose_outcomes(outcomes)
+    width = COLUMNS * (CELL[0] + GAP) + GAP
+    block = 2 * CELL[1] + 2 * CAPTION + 2 * GAP
+    rows = -(-len(chosen) // COLUMNS)
+    sheet = Image.new("RGB", (width, rows * block + GAP), "white")
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=14)
+    for number, outcome in enumerate(chosen):
+        left = GAP + number % COLUMNS * (CELL[0] + GAP)
+        top = GAP + number // COLUMNS * block
+        frame = OUT_OF_MAP_COLOUR if outcome.estimate.in_map is False else WRONG_COLOUR
+        frame = CORRECT_COLOUR if outcome.best_is_correct and frame == WRONG_COLOUR else frame
+        _paste(sheet, outcome.query, left, top)
+        pen.text((left, top + CELL[1] + 2), "query", fill="black", font=font)
+        below = top + CELL[1] + CAPTION
+        right, bottom = left + CELL[0], below + CELL[1]
+        pen.rectangle((left - EDGE, below - EDGE, right + EDGE, bottom + EDGE), frame)
+        _paste(sheet, database / outcome.best, left, below)
+        pen.text((left, below + CELL[1] + EDGE), _caption(outcome), fill=frame, font=font)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(target, quality=85)
+
+
+def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
+    """Choose two rows: mostly accepted and correct, then wrong, then rejected queries."""
+    accepted = [a for a in outcomes if a.estimate.in_map]
+    rejected = [a for a in outcomes if a.estimate.in_map is False]
+    groups = (
+        ([a for a in accepted if a.best_is_correct], COLUMNS + 1),
+        ([a for a in accepted if not a.best_is_correct], 1),
+        ([a for a in rejected if a.in_map], 1),
+        ([a for a in rejected if not a.in_map], 3),
+    )
+    chosen = [group[:: max(1, len(group) // count)][:count] for group, count in groups]
+    return [outcome for group in chosen for outcome in group][: 2 * COLUMNS]
+
+
+def _caption(outcome: QueryOutcome) -> str:
+    if outcome.estimate.in_map is False:
+        return "not in this map" + (" (it is)" if outcome.in_map else "")
+    confidence = outcome.estimate.confidence
+    error = f"{outcome.error_m:.0f} m off" if outcome.error_m is not None else "no place"
+    return error if confidence is None else f"{error}, {confidence:.0%} sure"
+
+
+def _paste(sheet: Image.Image, path: Path, left: int, top: int) -> None:
+    with Image.open(path) as photo:
+        sheet.paste(photo.convert("RGB").resize(CELL, Image.Resampling.BICUBIC), (left, top))
+
+
+def main() -> None:
+    # As the command does before torch is loaded; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    options = _parse_arguments()
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
+        os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
+        os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
+        city = Path(folder, "city")
+        generate_city(
+            CityOptions(
+                options.places,
+                options.views,
+                options.queries,
+                options.seed,
+                0,
+                options.out_of_map,
+                320,
+                240,
+                train=False,
+            ),
+            city,
+            progress,
+        )
+        with connect(None, None) as client:
+            outcomes = _run_demo(client, city, progress)
+        _print_outcomes(outcomes)
+        if options.picture:
+            _draw_outcomes(outcomes, city / "database", options.picture)
+            print(f"Queries and their matches: {options.picture}")
+
+
+def _parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Index and query a generated city.")
+    parser.add_argument("--places", type=int, default=300)
+    parser.add_argument("--views", type=int, default=3, help="database photos per place")
+    parser.add_argument(
+        "--queries", type=int, default=400, help="number of queries, half of them labelled"
+    )
+    parser.add_argument(
+        "--out-of-map", type=float, default=0.2, help="share of queries outside the map"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, help="JPEG file of queries and matches to write")
+    return parser.parse_args()
+
+
+def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
+    """Index, evaluate, fit, evaluate again, query; prints recall before and after the fit."""
+    database = find_photos(city / "database", None, None)
+    queries = find_photos(city / "queries", None, None)
+    labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]
+    switch_off_fits(client)
+    indexed = upload_photos(client, database + labelled, progress)
+    print(NOT_COMPARABLE)
+    print(f"{indexed['searchable']} photos indexed; R@1 / R@5 / R@10 of the labelled queries:")
+    for vocabulary in ("foreign", "own"):
+        if vocabulary == "own":
+            wait_for_job(client, client.fit_vocabulary(), progress, "vocabulary")
+        job = wait_for_job(client, client.evaluate(), progress, "evaluating")
+        metrics = (job.result or {})["labelled_queries"]
+        shares = " / ".join(f"{metrics[f'R@{k}']:.1%}" for k in (1, 5, 10))
+        print(f"  {vocabulary:7s} vocabulary  {shares}  ({metrics['queries']} queries)")
+    bar = progress.add_task("querying", total=len(queries[1::2]))
+    outcomes = []
+    for query in queries[1::2]:
+        outcomes.append(_query_with_photo(client, query, database))
+        progress.advance(bar)
+    return outcomes
+
+
+def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
+    summary = _summarise_outcomes(outcomes)
+    print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
+    for name, label, style in (
+        ("R@1", "R@1 of queries in the map", ".1%"),
+        ("right_of_accepted", "precision of the accepted estimates", ".1%"),
+        ("accepted_in_map", "accepted queries in the map", ".1%"),
+        ("false_accepts", "false accepts from outside the map", ".1%"),
+        ("median_error_m", "median error of the correct estimates, m", ".1f"),
+        ("calibration_error", "calibration error (ECE)", ".3f"),
+        ("auroc", "AUROC", ".3f"),
+        ("recall_at_99_precision", "recall at 99 % precision", ".1%"),
+    ):
+        value = summary[name]
+        print(f"  {label:42s}{'-' if value is None else format(value, style)}")
+
+
+if __name__ == "__main__":
+    main()

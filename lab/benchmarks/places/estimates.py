@@ -1,0 +1,341 @@
+"""Place estimates: how many queries are answered, how many answers are right, how well calibrated.
+
+    placewise bench estimates [FOLDER...] [--splits 5]
+
+Each folder is an evaluation set with coordinates or place labels; labels with a slash are paths.
+Without one, it is the folder `tower` of PLACEWISE_TEST_DATA. It is described by the default
+extractor, with a vocabulary fitted on its database photos. The place model is fitted on the
+database photos only, as that of a live map is, and judged
+
+- on the set's queries;
+- on random splits: of all photos, as many as the set has queries become queries, so that a query
+  has the same neighbours as a photo of the map;
+- on a random half of the set's queries, with the other half as labelled queries, as often;
+- on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
+  four times: how many of the photos of these labels get an answer.
+
+Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.benchmarks.report import Report
+from lab.datasets.dataset import DatasetPhoto
+from lab.datasets.open_dataset import open_evaluation_set
+from lab.evaluation.query_clusters import cluster_queries
+from services.cli.environment import read_settings
+from services.cli.output import Table
+from shared.errors import Misconfigured
+from shared.evaluation.bootstrap import bootstrap_intervals
+from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import PlaceSample, fit_place_model
+from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.place_paths import label_levels
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+CERTAINTY = 0.95
+LEFT_OUT_GROUPS = 4
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescribedPhotos:
+    """All photos of a set with their descriptors."""
+
+    name: str
+    rows: NDArray[np.float32]
+    """(n, D)"""
+    locations: Sequence[PhotoLocation]
+    captured_at: Sequence[datetime | None]
+    is_query: Mask
+    """(n,) which photos are queries in the published split"""
+    clusters: NDArray[np.int64]
+    """(n,) clusters of the bootstrap"""
+    scheme: LevelScheme
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """An estimate and whether each of its levels is right; None where the truth does not say."""
+
+    estimate: PlaceEstimate
+    is_right: Sequence[bool | None]
+    cluster: int
+    """of the bootstrap"""
+
+    @property
+    def is_finest(self) -> bool:
+        return self.estimate.answer == 0
+
+    @property
+    def is_answer_right(self) -> bool | None:
+        return None if self.estimate.answer is None else self.is_right[self.estimate.answer]
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A share of estimates, with its target in %."""
+
+    name: str
+    judged: Sequence[Judged]
+    counts: Callable[[Judged], bool]
+    at_least: float | None = None
+    at_most: float | None = None
+
+
+def measure(progress: Progress, *, folders: Sequence[Path] | None, splits: int) -> Report:
+    """Measure the estimates of evaluation sets, by default of the tower in PLACEWISE_TEST_DATA."""
+    report = Report(f"estimates at certainty {CERTAINTY}")
+    for folder in folders or [_tower()]:
+        photos = describe_set(folder, progress)
+        bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
+        published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
+        add_answers(report, f"{photos.name}, its queries", published)
+        add_reliability(report, f"{photos.name}, its queries", published)
+        progress.advance(bar)
+        drawn: list[Judged] = []
+        refined: list[Judged] = []
+        for seed in range(splits):
+            everything = np.ones(len(photos.rows), dtype=bool)
+            chosen = draw(everything, int(photos.is_query.sum()), seed)
+            drawn += fit_and_judge(photos, ~chosen, chosen)
+            labelled = draw(photos.is_query, int(photos.is_query.sum()) // 2, seed)
+            unlabelled = photos.is_query & ~labelled
+            refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
+            progress.advance(bar)
+        for what, judged in (
+            (f"{photos.name}, {splits} random splits", drawn),
+            (f"{photos.name}, half of its queries labelled", refined),
+        ):
+            if judged:
+                add_answers(report, what, judged)
+                add_reliability(report, what, judged)
+        left_out = []
+        for missing in left_out_labels(photos):
+            in_map = ~photos.is_query & ~missing
+            left_out += fit_and_judge(photos, in_map, missing)
+            progress.advance(bar)
+        if left_out:
+            add_left_out(report, f"{photos.name}, labels left out", left_out)
+    return report
+
+
+def describe_set(folder: Path, progress: Progress, name: str | None = None) -> DescribedPhotos:
+    """Describe an evaluation set, which `name` selects among several, as a new map would be."""
+    # Decoder processes import the program, and their memory limit leaves no room for torch.
+    from lab.cli.evaluation.describers import extractor_describer
+    from lab.evaluation.ranking import describe_to_matrix
+
+    settings = read_settings()
+    dataset = open_evaluation_set(folder, name)
+    photos = [*dataset.database, *dataset.queries]
+    describer = extractor_describer(
+        settings.new_map_extractor, None, dataset, settings, progress, fit=True
+    )
+    with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
+        matrix = np.array(rows)
+    return _described_photos(dataset.name, photos, matrix, len(dataset.database))
+
+
+def _described_photos(
+    name: str, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32], database: int
+) -> DescribedPhotos:
+    """Join photos, of which the first `database` are no queries, with their descriptors."""
+    settings = read_settings()
+    is_path = any("/" in (photo.place or "") for photo in photos)
+    return DescribedPhotos(
+        name,
+        rows,
+        [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
+        [photo.captured_at for photo in photos],
+        np.arange(len(photos)) >= database,
+        cluster_queries(photos).labels,
+        LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
+        settings.estimate_radius_m,
+    )
+
+
+class TrialMap:
+    """A map of some of the photos of a set, searched in memory.
+
+    Args:
+        photos: The set.
+        in_map: (n,) which of its photos are in the map.
+    """
+
+    def __init__(self, photos: DescribedPhotos, in_map: Mask) -> None:
+        self.members = np.flatnonzero(in_map).tolist()
+        self.photos = photos
+        self._rows = photos.rows[self.members]
+        scores = self._rows @ self._rows.T
+        self.locations = [photos.locations[index] for index in self.members]
+        self.own_photos = OwnPhotoSampler(
+            self.locations,
+            [photos.captured_at[index] for index in self.members],
+            photos.scheme,
+            photos.radius_m,
+            lambda photo: _rank(scores[photo], without=photo),
+        )
+
+    def own_samples(self) -> tuple[list[PlaceSample], float]:
+        """Return the samples of the map's photos, and their unit of score differences."""
+        own = range(len(self.members))
+        spread = self.own_photos.spread(own)
+        return list(self.own_photos.samples(own, spread)), spread
+
+    def fit(self, labelled: Sequence[int] = ()) -> PlaceModel:
+        """Fit the place model on the map's photos, and on photos of the set as labelled queries."""
+        samples, spread = self.own_samples()
+        labels = [sample for q in labelled if (sample := self.query_sample(q, spread)).levels]
+        return fit_place_model(samples, labels, self.photos.scheme, spread).model
+
+    def estimate(self, query: int, model: PlaceModel) -> PlaceEstimate | None:
+        """Estimate the place of a photo of the set; None without similar photos of known place."""
+        scheme, radius_m = self.photos.scheme, self.photos.radius_m
+        return model.estimate(*self.search(query), scheme, CERTAINTY, radius_m)
+
+    def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
+        """Return the ranking of a photo of the set, and that of the best photo in it."""
+        found, scores = _rank(self._rows @ self.photos.rows[query])
+        ranking = [
+            RankedPhoto(score, self.locations[index], index)
+            for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
+        ]
+        return ranking, self.own_photos.neighbours(int(found[0]))
+
+    def query_sample(self, query: int, spread: float) -> PlaceSample:
+        """Return the sample of a photo of the set."""
+        truth = self.photos.locations[query]
+        levels = candidate_levels(
+            *self.search(query), self.photos.scheme, spread, self.photos.radius_m
+        )
+        return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
+
+
+def draw(among: Mask, count: int, seed: int) -> Mask:
+    """Return the (n,) mask of `count` photos, drawn at random among some."""
+    drawn = np.zeros(len(among), dtype=bool)
+    drawn[np.random.default_rng(seed).choice(np.flatnonzero(among), count, replace=False)] = True
+    return drawn
+
+
+def fit_and_judge(
+    photos: DescribedPhotos, in_map: Mask, queries: Mask, labelled: Mask | None = None
+) -> list[Judged]:
+    """Fit the model of a map of some of the photos, and estimate the places of others.
+
+    Args:
+        photos: The set.
+        in_map: (n,) which of its photos are in the map.
+        queries: (n,) which are estimated.
+        labelled: (n,) which are labelled queries; none by default.
+    """
+    trial = TrialMap(photos, in_map)
+    model = trial.fit(np.flatnonzero(labelled).tolist() if labelled is not None else [])
+    judged = []
+    for query in np.flatnonzero(queries).tolist():
+        estimate = trial.estimate(query, model)
+        if estimate is not None:
+            truth = photos.locations[query]
+            right = [level.is_right(truth) for level in estimate.levels]
+            judged.append(Judged(estimate, right, int(photos.clusters[query])))
+    return judged
+
+
+def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
+    """Yield the (n,) masks of the photos of each group of second coarsest labels."""
+    paths = [label_levels(p.place, photos.scheme.labels_are_paths) for p in photos.locations]
+    labels = np.array([path[-2] if len(path) > 1 else "" for path in paths])
+    names = sorted({*labels.tolist()} - {""})
+    for group in range(LEFT_OUT_GROUPS if len(names) > LEFT_OUT_GROUPS else 0):
+        yield np.isin(labels, names[group::LEFT_OUT_GROUPS])
+
+
+def add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the shares of answers, and of right ones among them, in %."""
+    known = [j for j in judged if j.is_answer_right is not None]
+    finest = [j for j in known if j.is_finest]
+    precision = 100 * CERTAINTY
+    _add_shares(
+        report,
+        what,
+        Share("answered", judged, lambda j: j.estimate.answer is not None, at_least=60),
+        Share("right", known, lambda j: j.is_answer_right is True, at_least=precision),
+        Share("answered at the finest level", judged, lambda j: j.is_finest, at_least=40),
+        Share("right there", finest, lambda j: j.is_answer_right is True, at_least=precision),
+    )
+
+
+def add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the ECE of each level, and show the mean of stated and of observed probabilities."""
+    table = Table("level", "stated", "observed", "ECE", title=what)
+    for position in range(max(len(j.is_right) for j in judged)):
+        known = [
+            (j.estimate.probabilities[position], right)
+            for j in judged
+            if position < len(j.is_right) and (right := j.is_right[position]) is not None
+        ]
+        stated, observed = [p for p, _ in known], [right for _, right in known]
+        error = expected_calibration_error(stated, observed)
+        means = (float(np.mean(stated)), float(np.mean(observed)), error)
+        table.add_row(str(position), *(f"{value:.3f}" for value in means))
+        report.add(f"{what}: ECE of level {position}", error, at_most=0.05)
+    report.tables.append(table)
+
+
+def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the shares of photos that get an answer although their label is not in the map."""
+    most = 100 * (1 - CERTAINTY)
+    _add_shares(
+        report,
+        what,
+        Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=most),
+        Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
+    )
+
+
+def _tower() -> Path:
+    if "PLACEWISE_TEST_DATA" not in os.environ:
+        raise Misconfigured(
+            "no_data_set",
+            "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA.",
+        )
+    return Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"
+
+
+def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanking:
+    order = np.argsort(-scores, kind="stable")
+    order = order[order != without] if without is not None else order
+    return order, scores[order].astype(np.float64)
+
+
+def _add_shares(report: Report, what: str, *shares: Share) -> None:
+    """Report shares in %, 100 % of no estimates, and show them with their intervals."""
+    table = Table("share", "%", "95 % interval", title=what)
+    for share in shares:
+        values = np.array([100.0 * share.counts(j) for j in share.judged])[:, None]
+        mean = float(values.mean()) if len(values) else 100.0
+        report.add(
+            f"{what}: {share.name}", mean, "%", at_most=share.at_most, at_least=share.at_least
+        )
+        clusters = np.array([j.cluster for j in share.judged], dtype=np.int64)
+        intervals = bootstrap_intervals(values, clusters)
+        bounds = f"{intervals[0].low:.1f} to {intervals[0].high:.1f}" if intervals else ""
+        table.add_row(share.name, f"{mean:.1f}", bounds)
+    report.tables.append(table)

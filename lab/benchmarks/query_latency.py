@@ -1,0 +1,209 @@
+"""Latency of queries by new photos while thousands of uploads wait to be described.
+
+    placewise bench query-latency [--backlog 5000] [--seconds 60] [--milliseconds 50] [--batch 16]
+
+A batch that runs on the model cannot be interrupted. A query may therefore wait for one batch, but
+not for two. Reported: the time of a batch; p50, p95 and maximum of a query; and of its three stages
+(waiting for a worker, at the worker, and the rest: gateway, store and search).
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import statistics
+import time
+from collections.abc import Sequence
+from datetime import datetime
+from typing import TYPE_CHECKING
+from uuid import UUID
+
+from sqlalchemy import func, insert, select
+
+from lab.benchmarks.chaos.run import count_unfinished_jobs
+from lab.benchmarks.fleet import Fleet, open_fleet
+from lab.benchmarks.fleet.load_generator import (
+    HttpCaller,
+    make_jpegs,
+    multipart_form,
+    multipart_forms,
+    upload_all,
+    wait_for_jobs,
+)
+from lab.benchmarks.report import Report
+from shared.catalog.chunks import Chunk
+from shared.catalog.photos import Photo
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, JobState, Priority
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+TARGET_MS_ABOVE_BATCH = 100.0
+SIZE, SIZE_BYTES = (1024, 768), 100_000
+DESCRIPTOR_DIMENSION = 7168
+TEXTURES = 64  # distinct photos, so that few of the retrieved rows are equal
+TIMEOUT_SECONDS = 120.0
+SEED = 20_261_121
+
+
+def measure(
+    progress: Progress, *, backlog: int, seconds: float, milliseconds: int, batch: int
+) -> Report:
+    """Send queries at random moments for `seconds` while a backlog of photos is being described.
+
+    The extractor takes `batch` photos at a time and `milliseconds` per photo.
+    """
+    report = Report(f"Query photos while {backlog:,} uploads wait")
+    photos = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
+    with (
+        open_fleet(
+            extractor=f"test-slow-avg:milliseconds={milliseconds},width={DESCRIPTOR_DIMENSION}",
+            batch_photos=batch,
+        ) as fleet,
+        HttpCaller(fleet.gateway_urls[0]) as caller,
+    ):
+        fleet.start()
+        first = upload_all(caller.url, multipart_forms(photos, TEXTURES), 4)
+        wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
+        _time_query(caller, photos[0])  # opens connections and loads what only queries need
+        _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
+        since = _wait_for_chunks(fleet, 3)
+        bar = progress.add_task("searching", total=seconds)
+        rng = random.Random(SEED)
+        pause = 2 * milliseconds * batch / 1000
+        latencies: list[float] = []
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            progress.update(bar, completed=seconds - left)
+            time.sleep(rng.uniform(0, pause))
+            latencies.append(_time_query(caller, rng.choice(photos)))
+        stages = _stage_seconds(fleet, latencies)
+        periods = _batch_seconds(fleet, since, batch)
+        report.add(
+            "uploads still waiting at the end",
+            count_unfinished_jobs(fleet.catalog, photos=True),
+            at_least=1,
+        )
+        report.add("services that crashed", len(fleet.crashed), at_most=0)
+    batch_ms = 1000 * statistics.median(periods)
+    report.add("queries", len(latencies))
+    report.add("a batch, p50", batch_ms, "ms")
+    report.add_latency("query", latencies, worst_at_most_ms=batch_ms + TARGET_MS_ABOVE_BATCH)
+    for stage, durations in stages.items():
+        report.add_latency(stage, durations)
+    report.details = {"seconds": latencies, "stages": stages, "batch_seconds": periods}
+    return report
+
+
+def _time_query(caller: HttpCaller, photo: bytes) -> float:
+    """Return the seconds until the response; AssertionError if there is none."""
+    form = multipart_form(photo)
+    sent_at = time.perf_counter()
+    answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
+    seconds = time.perf_counter() - sent_at
+    assert answer.status == 200, answer.body
+    return seconds
+
+
+def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
+    """Insert uploads directly into the catalog, because sending thousands of photos takes long."""
+    with fleet.catalog.write() as session:
+        known = [session.get_one(Photo, photo_id) for photo_id in photo_ids]
+        shared = [
+            {
+                column: getattr(photo, column)
+                for column in ("map_id", "object_key", "filename", "media_type", "size_bytes")
+            }
+            for photo in known
+        ]
+        ids = [(new_id(), new_id()) for _ in range(count)]
+        session.execute(
+            insert(Photo),
+            [
+                {
+                    **shared[number % len(shared)],
+                    "id": photo,
+                    "job_id": job,
+                    "sha256": f"{number:064d}",
+                    "width": SIZE[0],
+                    "height": SIZE[1],
+                }
+                for number, (photo, job) in enumerate(ids)
+            ],
+        )
+        session.execute(
+            insert(Job),
+            [
+                {
+                    "id": job,
+                    "map_id": known[0].map_id,
+                    "kind": JobKind.INDEX,
+                    "priority": Priority.UPLOAD,
+                    "photo_id": photo,
+                }
+                for photo, job in ids
+            ],
+        )
+
+
+def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
+    """Wait until the extractor has reached its steady state; return the database's time."""
+    deadline = time.monotonic() + TIMEOUT_SECONDS
+    with fleet.catalog.read() as session:
+        before = session.scalar(select(func.count()).select_from(Chunk)) or 0
+    while True:
+        with fleet.catalog.read() as session:
+            chunks = session.scalar(select(func.count()).select_from(Chunk)) or 0
+            newest = session.scalars(select(Chunk.created_at).order_by(Chunk.id.desc())).first()
+        if chunks >= before + count and newest is not None:
+            return newest
+        assert time.monotonic() < deadline, f"no batch is described: {fleet.logs()}"
+        time.sleep(0.1)
+
+
+def _batch_seconds(fleet: Fleet, since: datetime, batch: int) -> list[float]:
+    """Return the time between commits of consecutive batches without a query between them."""
+    with fleet.catalog.read() as session:
+        commits = session.scalars(
+            select(Chunk.created_at)
+            .where(Chunk.created_at >= since, Chunk.rows == batch)  # merged chunks have more
+            .order_by(Chunk.created_at)
+        ).all()
+        queries = session.scalars(
+            select(Job.finished_at).where(
+                Job.kind == JobKind.DESCRIBE, Job.state == JobState.SUCCEEDED
+            )
+        ).all()
+    durations = [
+        (after - before).total_seconds()
+        for before, after in itertools.pairwise(commits)
+        if not any(at is not None and before < at < after for at in queries)
+    ]
+    assert durations, "no batch came without a query between: query less often"
+    return durations
+
+
+def _stage_seconds(fleet: Fleet, latencies: Sequence[float]) -> dict[str, list[float]]:
+    """Return the time of each query by stage, from the job table."""
+    with fleet.catalog.read() as session:
+        jobs = session.scalars(
+            select(Job)
+            .where(Job.kind == JobKind.DESCRIBE)
+            .order_by(Job.id.desc())
+            .limit(len(latencies))
+        ).all()
+    by_stage: dict[str, list[float]] = {
+        "waiting for a worker": [],
+        "at the worker": [],
+        "gateway, store and search": [],
+    }
+    for job, seconds in zip(reversed(jobs), latencies, strict=True):
+        assert job.started_at is not None
+        assert job.finished_at is not None
+        waited = (job.started_at - job.created_at).total_seconds()
+        worked = (job.finished_at - job.started_at).total_seconds()
+        by_stage["waiting for a worker"].append(waited)
+        by_stage["at the worker"].append(worked)
+        by_stage["gateway, store and search"].append(seconds - waited - worked)
+    return by_stage

@@ -1,0 +1,1 @@
+"""Commands of the lab, which `services.cli.main` registers where the lab is installed."""

@@ -1,0 +1,347 @@
+"""Dataset checks: what a folder contains, undecodable photos, and suspect ground truth labels.
+
+`inspect_dataset` opens every set in a folder and collects problems, for `placewise datasets check`.
+
+`_find_undecodable` decodes every photo completely, on all cores.
+
+`find_suspect_labels` lists confident first matches that the ground truth counts as wrong although
+they are close: a match 30 m away, or at the right position with another heading, often shows the
+place. Such labels should be reviewed; in published sets they have invalidated whole results.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet, Indices, TrainingSet
+from lab.datasets.ground_truth import (
+    PositiveRule,
+    find_positives,
+    heading_differences,
+    parse_rule,
+)
+from lab.datasets.open_dataset import (
+    find_evaluation_sets,
+    find_training_layout,
+    open_evaluation_set,
+    open_training_set,
+)
+from lab.datasets.utm_coordinates import has_position, pairwise_distances_m
+from shared.errors import InvalidRequest, NotFound, PlacewiseError, Unprocessable
+from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
+from shared.imaging.file_structure import open_photo
+
+MAX_DECODED_PIXELS = 100_000_000
+"""Maximum of width x height of a decoded photo; larger ones would exhaust memory."""
+PHOTOS_PER_TASK = 1024
+
+
+def _find_undecodable(
+    paths: Sequence[Path], on_progress: Callable[[int], None] = lambda count: None
+) -> list[tuple[Path, str]]:
+    """Return the photos that can't be decoded, with the reason.
+
+    `on_progress` is called with 1 after each photo.
+    """
+    broken = []
+    # Threads suffice, because Pillow releases the GIL while decoding. Its warnings about unusual
+    # EXIF are ignored around all threads, because warning filters are process-wide.
+    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        warnings.simplefilter("ignore")
+        for start in range(0, len(paths), PHOTOS_PER_TASK):
+            chunk = paths[start : start + PHOTOS_PER_TASK]
+            for path, reason in zip(chunk, pool.map(_decode_error, chunk), strict=True):
+                on_progress(1)
+                if reason is not None:
+                    broken.append((path, reason))
+    return broken
+
+
+def _decode_error(path: Path) -> str | None:
+    try:
+        with path.open("rb") as file, open_photo(file) as image:
+            check_pixel_count(image.width, image.height, MAX_DECODED_PIXELS)
+            image.load()
+    except Unprocessable as error:
+        return error.detail
+    except PHOTO_READ_ERRORS as error:
+        return str(error) or type(error).__name__
+    return None
+
+
+MAX_EXAMPLES = 5
+RADIUS_RULE = PositiveRule("radius")
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetProblem:
+    """A problem of a dataset, with the number of its occurrences."""
+
+    code: str
+    count: int
+    detail: str
+    examples: tuple[str, ...] = ()
+    """At most MAX_EXAMPLES"""
+
+
+@dataclass(frozen=True)
+class DatasetReport:
+    """The sets at or below a folder; sets that can't be opened are listed as problems."""
+
+    root: Path
+    training: TrainingSet | None
+    evaluation: tuple[EvaluationSet, ...]
+    layouts: tuple[str, ...]
+    """Layout names: of the training set, if there is one, then of each evaluation set"""
+    problems: tuple[DatasetProblem, ...]
+
+    def photos(self) -> tuple[Path, ...]:
+        """Return all photos of all sets, in order and without duplicates."""
+        return tuple(dict.fromkeys(_photos(self.training, self.evaluation)))
+
+
+def inspect_dataset(
+    root: Path, *, protocol: str | None = None, rule: str | None = None, min_photos: int = 2
+) -> DatasetReport:
+    """Open all sets at or below a folder and collect their problems.
+
+    Args:
+        protocol: Protocol of the evaluation sets; None for their default.
+        rule: Positive-match criterion of the evaluation sets; None for their own.
+        min_photos: Training places with fewer photos are left out.
+
+    Raises:
+        NotFound: `no_data_set` if there is no set.
+    """
+    discovered = find_evaluation_sets(root)
+    layout = find_training_layout(root)
+    if not discovered and layout is None:
+        raise NotFound(
+            "no_data_set",
+            f"No dataset was recognised in {root}. See docs/how-to/data-sets.md for all layouts.",
+        )
+    problems: list[DatasetProblem] = []
+    training: TrainingSet | None = None
+    layouts: list[str] = []
+    if layout is not None:
+        layouts.append(layout[0].name)
+        try:
+            training = open_training_set(root, min_photos=min_photos)
+        except PlacewiseError as error:
+            problems.append(DatasetProblem(error.code, 1, error.detail))
+    evaluation = []
+    for candidate in discovered:
+        layouts.append(candidate.layout.name)
+        try:
+            opened = open_evaluation_set(root, candidate.name, protocol=protocol, rule=rule)
+        except PlacewiseError as error:
+            problems.append(DatasetProblem(error.code, 1, f"{candidate.name}: {error.detail}"))
+        else:
+            evaluation.append(opened)
+            problems += _find_problems(opened)
+    report = DatasetReport(root, training, tuple(evaluation), tuple(layouts), tuple(problems))
+    return _add_missing_files(report)
+
+
+def find_undecodable_photos(
+    report: DatasetReport, on_progress: Callable[[int], None] = lambda count: None
+) -> list[DatasetProblem]:
+    """Decode every photo of a report completely and return the problem, if there is one.
+
+    `on_progress` is called with the number of photos done since the last call.
+    """
+    photos = report.photos()
+    existing = [path for path in photos if path.is_file()]
+    on_progress(len(photos) - len(existing))  # missing photos are reported already
+    broken = [f"{path}: {reason}" for path, reason in _find_undecodable(existing, on_progress)]
+    return [_problem("undecodable_photo", broken, "photos can't be decoded")] if broken else []
+
+
+def _add_missing_files(report: DatasetReport) -> DatasetReport:
+    missing = [str(path) for path in report.photos() if not path.is_file()]
+    if not missing:
+        return report
+    problem = _problem("missing_photo", missing, "listed photos do not exist")
+    return replace(report, problems=(*report.problems, problem))
+
+
+def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
+    name = evaluation.name
+    for role, photos in (("database", evaluation.database), ("queries", evaluation.queries)):
+        counts = Counter(photo.name for photo in photos)
+        duplicates = [name for name, count in counts.items() if count > 1]
+        if duplicates:
+            yield _problem(
+                "listed_twice", duplicates, f"photos are listed twice in {name}'s {role}"
+            )
+    database_paths = {photo.path for photo in evaluation.database}
+    shared = [photo.name for photo in evaluation.queries if photo.path in database_paths]
+    if shared:
+        yield _problem("query_in_database", shared, f"queries of {name} are also database photos")
+    differing = _differing_positives(evaluation)
+    if differing:
+        yield _problem(
+            "ground_truth_differs",
+            differing,
+            f"of {len(evaluation.queries)} queries of {name} have other positives by "
+            f"{RADIUS_RULE} than in the ground truth of the set",
+        )
+
+
+def _differing_positives(evaluation: EvaluationSet) -> list[str]:
+    """Return the queries whose given positives differ from those within 25 m, if both exist."""
+    photos = (*evaluation.queries, *evaluation.database)
+    if not evaluation.rule.startswith("given ") or not all(has_position(photo) for photo in photos):
+        return []
+    computed = find_positives(RADIUS_RULE, evaluation.queries, evaluation.database)
+    return [
+        query.name
+        for query, given, within_radius in zip(
+            evaluation.queries, evaluation.positives, computed, strict=True
+        )
+        if given.tolist() != within_radius.tolist()
+    ]
+
+
+def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:
+    return DatasetProblem(
+        code, len(examples), f"{len(examples)} {what}.", tuple(examples[:MAX_EXAMPLES])
+    )
+
+
+def _photos(training: TrainingSet | None, evaluation: Iterable[EvaluationSet]) -> Iterator[Path]:
+    for place in training.places if training else ():
+        yield from place.photos
+    for opened in evaluation:
+        for photo in (*opened.database, *opened.queries):
+            yield photo.path
+
+
+MAX_RULE_MULTIPLE = 4.0
+"""Matches within this multiple of the rule's distance count as suspect."""
+
+
+@dataclass(frozen=True, slots=True)
+class SuspectLabel:
+    """A query whose confident first match is not a positive."""
+
+    query: int
+    """Index of the query"""
+    database: int
+    """Index of the match"""
+    query_name: str
+    database_name: str
+    score: float | None
+    metres: float | None
+    """Distance of query and match; None if one has no position"""
+    degrees: float | None
+    """Difference of their headings, 0 to 180; None if one has no heading"""
+
+
+def find_suspect_labels(
+    evaluation: EvaluationSet,
+    ranked: Indices,
+    scores: NDArray[np.float32] | None = None,
+    *,
+    min_score: float | None = None,
+) -> list[SuspectLabel]:
+    """Find confident first matches that are not positives but lie just outside the set's rule.
+
+    "Just outside" means within MAX_RULE_MULTIPLE times the metres or frames of the rule, for any
+    heading; 25 m if the rule is unknown or `place-label`.
+
+    Args:
+        ranked: (queries, k) database indices, best first.
+        scores: (queries, k) scores, higher is better; None treats every first match as confident.
+        min_score: Minimum score of a confident match; None for the median score of the first
+            matches that are positives.
+
+    Returns:
+        Suspects, most confident first.
+
+    Raises:
+        InvalidRequest: `predictions_of_other_queries`.
+    """
+    if len(ranked) != len(evaluation.queries) or (
+        scores is not None and len(scores) != len(ranked)
+    ):
+        raise InvalidRequest(
+            "predictions_of_other_queries",
+            f"There are {len(ranked)} predictions for {len(evaluation.queries)} queries"
+            + ("." if scores is None else f", with {len(scores)} rows of scores."),
+        )
+    if not ranked.size:
+        return []
+    first = ranked[:, 0]
+    correct = np.array(
+        [match in positives for match, positives in zip(first, evaluation.positives, strict=True)],
+        dtype=bool,
+    )
+    confident = ~correct
+    if scores is not None:
+        if min_score is None:
+            min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
+        confident &= scores[:, 0] >= min_score
+    suspects = _just_outside(evaluation, first, np.flatnonzero(confident), scores)
+    return sorted(suspects, key=lambda suspect: (-(suspect.score or 0.0), suspect.query))
+
+
+def _just_outside(
+    evaluation: EvaluationSet,
+    first: Indices,
+    candidates: Indices,
+    scores: NDArray[np.float32] | None,
+) -> list[SuspectLabel]:
+    queries = [evaluation.queries[number] for number in candidates]
+    matches = [evaluation.database[number] for number in first[candidates]]
+    rule = _rule_of(evaluation)
+    metres = pairwise_distances_m(queries, matches)
+    suspects = []
+    for number, query, match, distance in zip(
+        candidates.tolist(), queries, matches, metres, strict=True
+    ):
+        if _is_just_outside(rule, query, match, float(distance)):
+            suspects.append(
+                SuspectLabel(
+                    number,
+                    int(first[number]),
+                    query.name,
+                    match.name,
+                    None if scores is None else float(scores[number, 0]),
+                    None if np.isnan(distance) else float(distance),
+                    _degrees(query, match),
+                )
+            )
+    return suspects
+
+
+def _is_just_outside(
+    rule: PositiveRule, query: DatasetPhoto, match: DatasetPhoto, metres: float
+) -> bool:
+    if rule.kind == "frames":
+        if query.frame is None or match.frame is None:
+            return False
+        return abs(query.frame - match.frame) <= MAX_RULE_MULTIPLE * max(rule.frames, 1)
+    return metres <= MAX_RULE_MULTIPLE * rule.radius_m  # False for NaN
+
+
+def _rule_of(evaluation: EvaluationSet) -> PositiveRule:
+    try:
+        return parse_rule(evaluation.rule)
+    except InvalidRequest:  # a ground truth file without a known rule
+        return PositiveRule("radius")
+
+
+def _degrees(query: DatasetPhoto, match: DatasetPhoto) -> float | None:
+    if query.heading is None or match.heading is None:
+        return None
+    return float(heading_differences(np.array([match.heading]), query.heading)[0])

@@ -1,0 +1,139 @@
+"""Folder layout: `database/` and `queries/`, also in each of `train/`, `val/` and `test/`.
+
+Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Beside `database/`,
+`rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
+as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
+2013): the first is the database, and photos of about the same number show the same place. In
+`database/` and `queries/` with as many photos each, without positions, labels and numbers in file
+names, photos are numbered as well, for the rule `frames 10`.
+
+Positions come from `@UTM@` file names, or from EXIF if no name has one. Subfolders of `database/`
+and `queries/` are place labels. An optional list `NAME_images_paths.txt` beside a folder `NAME`,
+one path per line relative to the dataset, defines the set and its order. (VPR-methods-evaluation,
+deep-visual-geo-localization-benchmark)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from lab.datasets.dataset import DatasetPhoto
+from lab.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
+from lab.datasets.photo_lists import add_exif_positions, photo_from_filename
+from lab.datasets.utm_coordinates import add_utm_positions
+from shared.errors import InvalidRequest
+
+SPLITS = ("train", "val", "test")
+RIDES = "rides"
+SEASONS = ("summer", "spring", "fall", "autumn", "winter")
+"""Names of folders of one season each; the database is the first one that exists"""
+SAME_INDEX_RULE = "frames 10"
+VME_PROTOCOL = "vme"
+"""Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
+
+
+class FolderPairs:
+    """Evaluation sets as pairs of folders, named by dataset folder, split and query version."""
+
+    name = "database and queries folders"
+    protocols = (PLACEWISE_PROTOCOL, VME_PROTOCOL)
+
+    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
+        homes = {prefix: base, **{f"{prefix}_{split}": base / split for split in SPLITS}}
+        pairs = {
+            f"{name}{queries.name.removeprefix('queries')}": queries.relative_to(base).as_posix()
+            for name, home in homes.items()
+            if (home / "database").is_dir()
+            for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
+            if queries.is_dir()
+        }
+        rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
+        seasons = [season for season in SEASONS if (base / season).is_dir()]
+        return {**pairs, **rides, **{f"{prefix}_{season}": season for season in seasons[1:]}}
+
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        if key == RIDES:
+            photos = _read_photos(base / "database", base)
+            return ListedSet(photos, _read_rides(base), _default_rule(photos))
+        if key in SEASONS:
+            first = next(season for season in SEASONS if (base / season).is_dir())
+            before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
+            return ListedSet(before, after, SAME_INDEX_RULE)
+        folder = base / key
+        database, queries = (
+            _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
+        )
+        if len(database) == len(queries) and not any(map(_is_placed, database + queries)):
+            database, queries = _number(database), _number(queries)
+        if protocol == VME_PROTOCOL:
+            database, queries = (
+                tuple(replace(photo, zone=None) for photo in photos)
+                for photos in (database, queries)
+            )
+        return ListedSet(database, queries, _default_rule(database + queries))
+
+
+def _is_placed(photo: DatasetPhoto) -> bool:
+    """Whether a photo has a position, a label, or a number in its file name."""
+    return any(value is not None for value in (photo.easting, photo.place, photo.frame))
+
+
+def _has_rides(folder: Path) -> bool:
+    return (folder / "database").is_dir() and (folder / RIDES).is_dir()
+
+
+def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
+    """Read the folders of rides: frames in the order of capture time, or else of name."""
+    frames: list[DatasetPhoto] = []
+    for folder in sorted(path for path in (base / RIDES).iterdir() if path.is_dir()):
+        photos = [replace(photo, place=None) for photo in _read_photos(folder, base)]
+        if all(photo.captured_at is not None for photo in photos):
+            photos.sort(key=lambda photo: str(photo.captured_at))
+        frames += [replace(photo, sequence=folder.name) for photo in _number(photos)]
+    return tuple(frames)
+
+
+def _number(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    return tuple(replace(photo, frame=number) for number, photo in enumerate(photos))
+
+
+def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:
+    """Use place labels if no photo has a position but some have a label."""
+    if all(photo.easting is None for photo in photos) and any(photo.place for photo in photos):
+        return "place-label"
+    return DEFAULT_RULE
+
+
+def _read_photos(folder: Path, base: Path) -> tuple[DatasetPhoto, ...]:
+    photos = [
+        photo_from_filename(path, path.relative_to(base).as_posix(), _place(path, folder))
+        for path in _paths(folder)
+    ]
+    if any(photo.easting is not None for photo in photos):
+        return tuple(photos)
+    return add_utm_positions(add_exif_positions(photos))
+
+
+def _place(path: Path, folder: Path) -> str | None:
+    place = path.parent.relative_to(folder).as_posix()
+    return None if place == "." else place
+
+
+def _paths(folder: Path) -> list[Path]:
+    listing = folder.with_name(f"{folder.name}_images_paths.txt")
+    if not listing.is_file():
+        return photos_below(folder)
+    lines = [line.strip() for line in listing.read_text(encoding="utf-8").splitlines()]
+    roots = (folder.parent, folder, folder.parent.parent)
+    paths = [line for line in lines if line]
+    for root in roots:
+        if paths and (root / paths[0]).exists():
+            return [root / line for line in paths]
+    raise InvalidRequest(
+        "bad_list",
+        f"{listing}: its first path, {paths[0] if paths else 'nothing'}, is in none of "
+        f"{', '.join(map(str, roots))}. Correct the list, or remove it to use all photos of "
+        f"{folder}.",
+    )

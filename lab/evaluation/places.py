@@ -1,0 +1,146 @@
+"""Probabilities of the levels on a data set: fitted on database photos, measured on queries.
+
+The place model is fitted as that of a live map is, on the map's own photos only, so that the
+queries measure what a new map answers before it has labelled queries.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
+from lab.datasets.utm_coordinates import parse_utm_grid, utm_to_degrees
+from lab.evaluation.exact_knn import Rankings, Rows, exact_knn
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.figures import (
+    REPORTED_CERTAINTIES,
+    answer_figures,
+    reliability_figures,
+)
+from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.thresholds import HeldOutEstimate
+
+SAMPLED_PHOTOS = 1000
+"""Database photos that the model is fitted on; as many as an evaluation of a live map draws"""
+RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
+SEED = 0
+
+
+class _RowRanker:
+    """Ranks database photos by their similarity to one of them.
+
+    Photos without a ranking are collected and searched together: each search reads all rows.
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        self._rows = rows
+        self._rankings: dict[int, IndexRanking] = {}
+        self._requested: set[int] = set()
+
+    def __call__(self, photo: int) -> IndexRanking | None:
+        if photo not in self._rankings:
+            self._requested.add(photo)
+        return self._rankings.get(photo)
+
+    def search_requested(self) -> bool:
+        """Search all photos that had no ranking when they were requested; False if none."""
+        photos = sorted(self._requested)
+        self._requested.clear()
+        if photos:
+            found = exact_knn(self._rows[photos], self._rows, RANKS + 1)
+            for photo, indices, scores in zip(photos, found.indices, found.scores, strict=True):
+                others = indices != photo
+                self._rankings[photo] = indices[others], scores[others].astype(np.float64)
+        return bool(photos)
+
+
+def measure_places(
+    evaluation_set: EvaluationSet,
+    database: Rows,
+    ranked: Rankings,
+    scheme: LevelScheme,
+    position_radius_m: float,
+) -> dict[str, Any] | None:
+    """Fit the place model on the database photos and measure its answers to the queries.
+
+    Args:
+        evaluation_set: The data set.
+        database: (m, D) float32 unit descriptors of the database photos.
+        ranked: Database photos by query, best first, `EVIDENCE_DEPTH` of them if there are as many.
+        scheme: The levels.
+        position_radius_m: Radius of a place in metres.
+
+    Returns:
+        `source` of the model, number of `own_photos` and of queries (`samples`), `answers` at each
+        certainty (`answer_figures`) and reliability of the `levels` (`reliability_figures`).
+        `outside_at_finest_level` is the share of the queries without positives that are answered at
+        the finest level. None if no query has an estimate and a known location.
+    """
+    locations = [_photo_location(photo) for photo in evaluation_set.database]
+    known = np.flatnonzero([location.is_known for location in locations])
+    size = min(SAMPLED_PHOTOS, len(known))
+    sample = np.sort(np.random.default_rng(SEED).choice(known, size, replace=False)).tolist()
+    captured_at = [photo.captured_at for photo in evaluation_set.database]
+    best = [
+        next((index for index in indices if locations[index].is_known), indices[0])
+        for indices in ranked.indices[:, :EVIDENCE_DEPTH].tolist()
+    ]
+    ranker = _RowRanker(database)
+    while True:
+        own_photos = OwnPhotoSampler(locations, captured_at, scheme, position_radius_m, ranker)
+        spread = own_photos.spread(sample)
+        samples = list(own_photos.samples(sample, spread))
+        neighbours = {photo: own_photos.neighbours(photo) for photo in set(best)}
+        if not ranker.search_requested():
+            break
+    model = fit_place_model(samples, (), scheme, spread).model
+    estimates, outside = [], []
+    for number, query in enumerate(evaluation_set.queries):
+        truth = _photo_location(query)
+        indices, scores = (
+            each[number, :EVIDENCE_DEPTH].tolist() for each in (ranked.indices, ranked.scores)
+        )
+        ranking = [
+            RankedPhoto(score, locations[index], index)
+            for index, score in zip(indices, scores, strict=True)
+            if locations[index].is_known
+        ]
+        unit, around = model.unit(ranking), neighbours[best[number]]
+        levels = candidate_levels(ranking, around, scheme, unit, position_radius_m)
+        if not levels or not truth.is_known:
+            continue
+        right = [level.is_right(truth) for level in levels]
+        estimates.append(HeldOutEstimate(*model.probabilities(levels), right, None, 1.0))
+        if not len(evaluation_set.positives[number]):
+            outside.append(estimates[-1])
+    if not estimates:
+        return None
+    positions = range(max(len(estimate.probabilities) for estimate in estimates))
+    return {
+        "source": model.source,
+        "own_photos": model.own_photos,
+        "samples": len(estimates),
+        "answers": [
+            {
+                **answer_figures(model, estimates, certainty),
+                "outside_at_finest_level": answer_figures(model, outside, certainty)[
+                    "answered_at_finest_level"
+                ]["mean"],
+            }
+            for certainty in REPORTED_CERTAINTIES
+        ],
+        "levels": [reliability_figures(estimates, position) for position in positions],
+    }
+
+
+def _photo_location(photo: DatasetPhoto) -> PhotoLocation:
+    latitude, longitude = photo.latitude, photo.longitude
+    if latitude is None and None not in (photo.easting, photo.northing, photo.zone):
+        grid = parse_utm_grid(str(photo.zone), photo.name)
+        metres = np.array([photo.easting, photo.northing], dtype=np.float64)
+        latitude, longitude = utm_to_degrees(grid, metres)
+    return PhotoLocation(latitude, longitude, photo.place)

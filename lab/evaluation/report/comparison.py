@@ -1,0 +1,155 @@
+"""HTML comparison of several descriptors: table of recalls, Pareto charts of recall and cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+from lab.datasets.open_dataset import EvaluationSet
+from lab.evaluation.report.charts import GREY, STYLE, percent_chart, render_chart
+from lab.evaluation.retrieval_metrics import RetrievalMetrics
+from shared.evaluation.bootstrap import PairedDifference
+
+
+def pareto_front(costs: Sequence[float], values: Sequence[float]) -> list[bool]:
+    """Return whether each point is Pareto-optimal: no other is as cheap and as good, and better.
+
+    A point whose cost is NaN (not measured) is never on the front.
+    """
+    points = list(zip(costs, values, strict=True))
+    return [
+        not math.isnan(cost)
+        and not any(
+            other_cost <= cost
+            and other_value >= value
+            and (other_cost < cost or other_value > value)
+            for other_cost, other_value in points
+        )
+        for cost, value in points
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedExtractor:
+    """Metrics and costs of one extractor of a comparison."""
+
+    name: str
+    measured: RetrievalMetrics
+    difference: PairedDifference | None
+    """R@1 of this extractor minus R@1 of the first; None for the first"""
+    dimension: int
+    bytes_a_photo: int
+    milliseconds_a_photo: float | None
+    """None if not measured"""
+    fingerprint: str
+    device: str
+
+    @property
+    def recall_at_1(self) -> float:
+        return self.measured.recalls.recall_all[1]
+
+    @property
+    def milliseconds(self) -> float:
+        """Time per photo; NaN if not measured."""
+        return math.nan if self.milliseconds_a_photo is None else self.milliseconds_a_photo
+
+    def against_first(self) -> str:
+        """Format the difference from the first extractor in percentage points, with interval."""
+        if self.difference is None:
+            return ""
+        mean = f"{100 * self.difference.mean:+.1f}"
+        interval = self.difference.interval_in_points()
+        return mean if interval is None else f"{mean} ({interval})"
+
+    def as_json(self) -> dict[str, Any]:
+        metrics = self.measured.as_json()
+        names = ("recall", "recall_interval", "recall_findable", "mean_average_precision")
+        return {
+            "extractor": self.name,
+            "fingerprint": self.fingerprint,
+            "device": self.device,
+            "dimension": self.dimension,
+            "bytes_a_photo": self.bytes_a_photo,
+            "milliseconds_a_photo": self.milliseconds_a_photo,
+            **{name: metrics[name] for name in (*names, "intervals")},
+            "against_first": self.difference.as_json() if self.difference else None,
+        }
+
+
+def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> str:
+    """Render the HTML page that compares extractors on one evaluation set."""
+    ks = list(compared[0].measured.recalls.recall_all)
+    heads = [
+        "",
+        *(f"R@{k}" for k in ks),
+        "R@1, 95 % interval",
+        "CPU ms per photo",
+        "bytes per photo",
+        "R@1 minus the first extractor's",
+    ]
+    rows = "".join(_table_row(each) for each in compared)
+    charts = [
+        _cost_chart(
+            "Recall and size", "bytes per photo", compared, [c.bytes_a_photo for c in compared]
+        ),
+        _cost_chart(
+            "Recall and time", "CPU ms per photo", compared, [c.milliseconds for c in compared]
+        ),
+    ]
+    figures = "".join(f"<figure>{chart}</figure>" for chart in charts if chart)
+    clusters = compared[0].measured.clusters
+    title = f"Descriptors on {evaluation_set.name}"
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
+        f"<h1>{escape(title)}</h1><p>{len(evaluation_set.database)} database photos, "
+        f"{len(evaluation_set.queries)} "
+        f"queries; positive-match criterion: {escape(evaluation_set.rule)}; protocol "
+        f"{escape(evaluation_set.protocol)}; fingerprint "
+        f"<code>{evaluation_set.fingerprint}</code>.</p>"
+        f"<div class='wide'><table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{rows}</table>"
+        f'</div><p class="note">Intervals: bootstrap over {clusters.count} {clusters.kind}; '
+        "differences are paired by query. Time: CPU time of network and aggregation (on a GPU, "
+        "its time), measured when the descriptors were computed. Size: as a map stores it.</p>"
+        f'<div class="charts">{figures}</div></body></html>\n'
+    )
+
+
+def _table_row(extractor: ComparedExtractor) -> str:
+    values = [f"{100 * recall:.1f}" for recall in extractor.measured.recalls.recall_all.values()]
+    interval = extractor.measured.recall_intervals
+    values.append(interval[0].as_percent() if interval else "-")
+    milliseconds = extractor.milliseconds_a_photo
+    values += [
+        "-" if milliseconds is None else f"{milliseconds:.1f}",
+        f"{extractor.bytes_a_photo:,}",
+        extractor.against_first(),
+    ]
+    cells = "".join(f'<td class="n">{escape(text)}</td>' for text in values)
+    return f"<tr><th>{escape(extractor.name)}</th>{cells}</tr>"
+
+
+def _cost_chart(
+    title: str, label: str, compared: Sequence[ComparedExtractor], costs: Sequence[float]
+) -> str | None:
+    """Render R@1 over a cost, with the Pareto front as a line; None if no cost is known."""
+    recalls = [each.recall_at_1 for each in compared]
+    known = [cost for cost in costs if cost > 0]  # excludes NaN
+    if not known:
+        return None
+    decades = range(
+        math.floor(math.log10(min(known))), math.ceil(math.log10(max(known) * 1.0001)) + 1
+    )
+    figure, axes = percent_chart(label, "R@1", x_ticks=[10.0**n for n in decades], log=True)
+    is_optimal = pareto_front(costs, recalls)
+    front = sorted((c, r) for c, r, on in zip(costs, recalls, is_optimal, strict=True) if on)
+    axes.plot(*zip(*front, strict=True), ".-", color=GREY, label="Pareto front")
+    for each, cost, recall in zip(compared, costs, recalls, strict=True):
+        if cost > 0:
+            axes.plot(cost, recall, "o", label=each.name)
+    axes.legend(fontsize="small")
+    return render_chart(figure, title)

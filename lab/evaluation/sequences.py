@@ -1,0 +1,344 @@
+"""Evaluation of tracks on data sets with sequences: single frames, SeqSLAM and the filter.
+
+A frame is right if the photo that it is matched to is a positive of the set's rule. Frames without
+positives were taken outside the map; there every answer is wrong. All methods use the same
+descriptors; the filter searches with the earlier frames as the background, as the API does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
+from lab.datasets.ground_truth import parse_rule
+from lab.evaluation.seqslam import seqslam_matches
+from shared.evaluation.calibration import expected_calibration_error, recall_at_precision
+from shared.evaluation.places.levels import LevelScheme
+from shared.search_api.background import background_frames, subtract_background
+from shared.tracks.belief import Belief, TrackStatus
+from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
+from shared.tracks.filter import TrackFilter
+from shared.tracks.motion import MotionModel
+from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+
+Rows = NDArray[np.float32]
+
+COARSE_RADII_M = (100.0, 500.0, 2000.0)
+JUMP_M = 100.0
+"""between two frames, from which on the camera was carried away"""
+NOTICE_FRAMES = 20
+"""frames after which a track outside the map must be lost"""
+KIDNAPS = 6
+"""of a sequence"""
+FOUND_FRAMES = 40
+"""frames after which a track that was carried away must be right again"""
+SEQSLAM_CELL_M = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """What the methods answer for a frame."""
+
+    query: int
+    """index in the evaluation set"""
+    has_positive: bool
+    is_start: bool
+    """whether the track begins here: first frame, back in the map, or carried away"""
+    single_is_right: bool
+    seqslam_is_right: bool
+    filter_is_right: bool
+    smoothed_is_right: bool
+    single_score: float
+    probability: float
+    status: TrackStatus
+
+
+@dataclass(frozen=True)
+class SequenceMap:
+    """The map of a set: its photos, as the filter needs them, with descriptors."""
+
+    photos: Sequence[DatasetPhoto]
+    rows: Rows
+    """(n, D), of unit length"""
+    graph: ArrayPhotoGraph
+    scheme: LevelScheme
+
+
+def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) -> SequenceMap:
+    """Build the photo graph.
+
+    Args:
+        evaluation_set: The set; its rule is the tolerance.
+        rows: (n, D) descriptors of its database photos, of unit length.
+        motion: For the distance between photos without coordinates.
+    """
+    photos = evaluation_set.database
+    rule = parse_rule(evaluation_set.rule.removesuffix(" m"))
+    finest = (rule.frames + 0.5) * motion.typical_speed_mps
+    if rule.kind != "frames":
+        finest = rule.radius_m
+    coarser = tuple(radius for radius in COARSE_RADII_M if radius > finest)
+    scheme = LevelScheme(labels_are_paths=False, radii_m=(finest, *coarser))
+    table = PhotoTable.of_rows(
+        (
+            str(number),
+            photo.latitude,
+            photo.longitude,
+            photo.heading,
+            photo.place,
+            None if photo.frame is None else photo.sequence or "",
+            None if photo.frame is None else float(photo.frame),
+        )
+        for number, photo in enumerate(photos)
+    )
+    return SequenceMap(photos, rows, ArrayPhotoGraph(table), scheme)
+
+
+def split_sequences(queries: Sequence[DatasetPhoto]) -> list[list[int]]:
+    """Return the query indices of each sequence, in the order of frames."""
+    sequences: dict[str | None, list[int]] = {}
+    for index, photo in enumerate(queries):
+        if photo.frame is not None:
+            sequences.setdefault(photo.sequence, []).append(index)
+    for members in sequences.values():
+        members.sort(key=lambda index: queries[index].frame or 0)
+    return list(sequences.values())
+
+
+def evaluate_sequence(
+    map_: SequenceMap,
+    evaluation_set: EvaluationSet,
+    members: Sequence[int],
+    rows: Rows,
+    motion: MotionModel,
+) -> tuple[list[FrameResult], float]:
+    """Follow one sequence.
+
+    Args:
+        members: Query indices in the order of frames.
+        rows: (len(members), D) descriptors of these queries, of unit length.
+
+    Returns:
+        The frames, and the CPU seconds of the filter per frame.
+    """
+    queries = [evaluation_set.queries[index] for index in members]
+    scores = rows @ map_.rows.T
+    evidence = _frames_of(map_, _times(queries), rows)
+    track_filter = TrackFilter(map_.graph, motion, map_.scheme)
+    belief: Belief | None = None
+    states = []
+    started = time.process_time()
+    for frame in evidence:
+        belief = track_filter.advance(belief, frame)
+        states.append(track_filter.state(belief))
+    seconds = (time.process_time() - started) / max(len(evidence), 1)
+    smoothed = track_filter.smoothed_states(evidence)
+    sequence_matches = _seqslam(map_, scores, motion)
+    results = []
+    for number, index in enumerate(members):
+        positives = set(evaluation_set.positives[index].tolist())
+        results.append(
+            FrameResult(
+                query=index,
+                has_positive=bool(positives),
+                is_start=bool(positives) and _is_start(evaluation_set, members, number),
+                single_is_right=int(scores[number].argmax()) in positives,
+                seqslam_is_right=int(sequence_matches[number]) in positives,
+                filter_is_right=_photo(states[number].photo) in positives,
+                smoothed_is_right=_photo(smoothed[number].photo) in positives,
+                single_score=float(scores[number].max()),
+                probability=states[number].probability,
+                status=states[number].status,
+            )
+        )
+    return results, seconds
+
+
+def evaluate_kidnapped(
+    map_: SequenceMap,
+    evaluation_set: EvaluationSet,
+    members: Sequence[int],
+    rows: Rows,
+    motion: MotionModel,
+    every: int,
+) -> list[int | None]:
+    """Evaluate relocalisation after jumps of the camera to random frames of its sequence.
+
+    Frames outside the map are left out. After its last frame, the sequence begins again.
+
+    Args:
+        members: Query indices in the order of frames.
+        rows: (len(members), D) descriptors of these queries, of unit length.
+        every: Number of frames between two jumps.
+
+    Returns:
+        For each of KIDNAPS jumps, the number of frames until the track has the status `tracking` at
+        a correct photo; None if that does not happen before the next jump.
+    """
+    inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
+    if len(inside) < 2:
+        return []
+    starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
+    frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
+    times = _times([evaluation_set.queries[index] for index in members])
+    interval = (times[-1] - times[0]) / (len(times) - 1)
+    evidence = _frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
+    track_filter = TrackFilter(map_.graph, motion, map_.scheme)
+    belief: Belief | None = None
+    found: list[int | None] = [None] * (KIDNAPS + 1)
+    for number, frame in enumerate(evidence):
+        belief = track_filter.advance(belief, frame)
+        segment, since = divmod(number, every)
+        if found[segment] is None and belief.status == "tracking":
+            photo = _photo(track_filter.state(belief).photo)
+            if photo in evaluation_set.positives[members[frames[number]]]:
+                found[segment] = since
+    return found[1:]  # before the first jump
+
+
+def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
+    """Return the evidence of the frames of a sequence.
+
+    Args:
+        times: (n,) when the frames were taken.
+        rows: (n, D) their descriptors, of unit length.
+    """
+    centred = np.stack(
+        [
+            subtract_background(row, rows[background_frames(number)])
+            for number, row in enumerate(rows)
+        ]
+    )
+    count = min(HITS, len(map_.rows))
+    frames = []
+    for time_, scores in zip(times, centred @ map_.rows.T, strict=True):
+        order = np.argsort(-scores, kind="stable")[:count]
+        found = scores[order].astype(np.float64).tolist()
+        frames.append(frame_evidence(time_, [str(photo) for photo in order], found, len(scores)))
+    return frames
+
+
+def _times(queries: Sequence[DatasetPhoto]) -> list[datetime]:
+    """Return capture times; without them, frame numbers count seconds."""
+    captured = [photo.captured_at for photo in queries if photo.captured_at is not None]
+    if len(captured) == len(queries):
+        return captured
+    start = datetime(2000, 1, 1, tzinfo=UTC)
+    return [start + timedelta(seconds=photo.frame or 0) for photo in queries]
+
+
+def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int) -> bool:
+    if number == 0 or not len(evaluation_set.positives[members[number - 1]]):
+        return True
+    pair = members[number - 1 : number + 1]
+    metres = np.array(
+        [(photo.easting, photo.northing) for photo in (evaluation_set.queries[n] for n in pair)],
+        dtype=np.float64,
+    )
+    return bool(np.hypot(*(metres[1] - metres[0])) > JUMP_M)  # not for unknown ones, NaN
+
+
+def _seqslam(map_: SequenceMap, scores: Rows, motion: MotionModel) -> NDArray[np.int64]:
+    eastings = np.array([photo.easting for photo in map_.photos], dtype=np.float64)
+    northings = np.array([photo.northing for photo in map_.photos], dtype=np.float64)
+    if not np.isnan(eastings).any():
+        positions = np.stack([eastings, northings], axis=1)
+        return seqslam_matches(scores, positions, motion.typical_speed_mps, SEQSLAM_CELL_M)
+    order = np.arange(len(map_.photos), dtype=np.float64)[:, None]
+    return seqslam_matches(scores, order, 1.0, 1.0)
+
+
+def _photo(photo: str | None) -> int:
+    return -1 if photo is None else int(photo)
+
+
+def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, Any]:
+    """Compute the figures of the frames of all sequences.
+
+    Recall is over frames with positives; `calibration_error` over all frames.
+    """
+    frames = [frame for sequence in sequences for frame in sequence]
+    inside = [frame for frame in frames if frame.has_positive]
+    tracked = [frame for frame in frames if frame.status == "tracking"]
+    localised, noticed, claimed = [], [], []
+    for sequence in sequences:
+        for start, frame in enumerate(sequence):
+            if frame.is_start:
+                localised.append(_frames_until_right(sequence, start))
+            elif start and not frame.has_positive and sequence[start - 1].has_positive:
+                later = sequence[start : start + NOTICE_FRAMES + 1]
+                noticed.append(next((n for n, f in enumerate(later) if f.status == "lost"), None))
+        outside = _frames_outside(sequence)
+        claimed += [sequence[n].status == "tracking" for n, o in outside if o >= NOTICE_FRAMES]
+    return {
+        "frames": len(frames),
+        "frames_outside": len(frames) - len(inside),
+        "recall": {
+            name: _share([getattr(frame, f"{name}_is_right") for frame in inside])
+            for name in ("single", "seqslam", "filter", "smoothed")
+        },
+        "recall_at_99_precision": {
+            "single": recall_at_precision(
+                [frame.single_score for frame in frames],
+                [frame.single_is_right for frame in frames],
+                len(inside),
+            )
+            if inside
+            else None,
+            "filter": recall_at_precision(
+                [frame.probability for frame in frames],
+                [frame.filter_is_right for frame in frames],
+                len(inside),
+            )
+            if inside
+            else None,
+        },
+        "tracking": _share([frame.status == "tracking" for frame in inside]),
+        "tracking_precision": _share([frame.filter_is_right for frame in tracked]),
+        "calibration_error": expected_calibration_error(
+            [frame.probability for frame in frames], [frame.filter_is_right for frame in frames]
+        ),
+        "frames_to_localise": localised,
+        "frames_to_notice_lost": noticed,
+        "claimed_outside": _share(claimed),
+    }
+
+
+def kidnapping_figures(found: Sequence[int | None]) -> dict[str, Any]:
+    """Compute the figures of kidnappings from the frames until each was found."""
+    return {
+        "kidnapped": len(found),
+        "found_within_40_frames": _share([n is not None and n <= FOUND_FRAMES for n in found]),
+        "frames_until_found": list(found),
+    }
+
+
+def _frames_until_right(sequence: Sequence[FrameResult], start: int) -> int | None:
+    """Return the frames until the place is tracked and right; None if the camera leaves before."""
+    for number, frame in enumerate(sequence[start:]):
+        if number and (frame.is_start or not frame.has_positive):
+            return None
+        if frame.status == "tracking" and frame.filter_is_right:
+            return number
+    return None
+
+
+def _frames_outside(sequence: Sequence[FrameResult]) -> list[tuple[int, int]]:
+    """Return the number of each frame outside the map, with how long it has been outside."""
+    found, since = [], 0
+    for number, frame in enumerate(sequence):
+        since = 0 if frame.has_positive else since + 1
+        if since:
+            found.append((number, since - 1))
+    return found
+
+
+def _share(values: Sequence[bool]) -> float | None:
+    return float(np.mean(values)) if len(values) else None

@@ -1,0 +1,183 @@
+"""`placewise datasets synth`: a city on disk, in the layouts of the field."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from shared.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
+from tests.support.server import environment, run_command
+
+SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")
+TINY = ("--places", "3", "--queries", "8", "--size", "64x64")
+NOTE = "generated: not comparable with published figures"
+
+
+class Command:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.environment = environment(folder / "home")
+
+    def __call__(self, *arguments: str | Path, code: int = 0) -> Any:
+        run = run_command("datasets", "synth", *arguments, env=self.environment, cwd=self.folder)
+        assert run.returncode == code, run.stderr + run.stdout
+        assert "Traceback" not in run.stderr
+        return run
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory: pytest.TempPathFactory) -> Command:
+    return Command(tmp_path_factory.mktemp("city"))
+
+
+@pytest.fixture(scope="module")
+def city(command: Command) -> dict[str, Any]:
+    """A small city and the output of the command."""
+    answer: dict[str, Any] = json.loads(command("out", *SMALL, "--no-ladder", "--json").stdout)
+    return answer
+
+
+@pytest.fixture
+def out(command: Command, city: dict[str, Any]) -> Path:
+    assert city["out"] == "out"
+    return command.folder / "out"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_answer_counts_what_lies_on_disk(city: dict[str, Any], out: Path) -> None:
+    assert city["counts"] == {"database": 48, "query": 10, "train": 48}
+    assert city["query_kinds"] == {"in_map": 8, "other_way": 1, "out_of_map": 1}
+    assert city["note"] == NOTE
+    assert city["ladder"] == []
+    assert city["drawing"]["photos_per_second"] > 0
+    assert len(list((out / "database").iterdir())) == 48
+    assert len(list((out / "queries").iterdir())) == 10
+
+
+def test_every_photo_has_a_name_of_the_convention_and_the_requested_size(out: Path) -> None:
+    photos = list(out.rglob("*.jpg"))
+    assert len(photos) == 48 + 10 + 48
+    for path in photos:
+        assert utm_position_of_file_name(path.name) is not None
+        fields = upload_fields_of_file_name(path.name, None)
+        assert set(fields) == {"latitude", "longitude", "heading", "captured_at"}
+        with Image.open(path) as image:
+            assert image.size == (96, 72)
+            assert image.format == "JPEG"
+
+
+def test_city_json_has_every_argument_and_the_kind_of_each_query(out: Path) -> None:
+    about = json.loads((out / "city.json").read_text())
+    assert about["note"] == NOTE
+    assert about["arguments"] == {
+        "places": 12,
+        "views": 4,
+        "queries": 10,
+        "seed": 0,
+        "catalogue_seed": 0,
+        "out_of_map": 0.1,
+        "width": 96,
+        "height": 72,
+        "train": True,
+        "ride_frames": 0,
+    }
+    assert set(about["queries"]) == {path.name for path in (out / "queries").iterdir()}
+    kinds = [query["kind"] for query in about["queries"].values()]
+    assert sorted(kinds) == ["in_map"] * 8 + ["other_way", "out_of_map"]
+
+
+def test_gsv_xs_table_names_its_photos_by_place(out: Path) -> None:
+    (table,) = (out / "gsv_xs" / "dataframes").iterdir()
+    assert table.name == "synth0x0.csv"
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["place_id", "class_name", "UTMx", "UTMy", "filename"]
+    assert {row["class_name"] for row in rows} == {"synth0x0"}
+    photos = out / "gsv_xs" / "train" / "synth0x0"
+    assert {row["filename"] for row in rows} == {path.name for path in photos.iterdir()}
+    for row in rows:
+        # As the field's own tools read it: the place stands before the `_` of the note.
+        assert int(row["filename"].split("@")[-2].split("_")[0]) == int(row["place_id"])
+        assert utm_position_of_file_name(row["filename"]) == (
+            float(row["UTMx"]),
+            float(row["UTMy"]),
+        )
+    assert min([row["place_id"] for row in rows].count(str(p)) for p in range(12)) >= 4
+
+
+def test_same_arguments_give_the_same_bytes(command: Command, out: Path) -> None:
+    command("again", *SMALL, "--no-ladder")
+    assert contents(command.folder / "again") == contents(out)
+
+
+@pytest.mark.parametrize("option", ["--seed", "--catalogue-seed"])
+def test_another_seed_gives_other_pictures(command: Command, out: Path, option: str) -> None:
+    other = command.folder / f"other{option}"
+    command(other, *TINY, "--no-ladder", option, "7")
+    assert not set(contents(other).values()) & set(contents(out).values())
+
+
+def test_ladder_has_six_rungs_with_recalls_that_grow_with_k(command: Command) -> None:
+    run = command("rungs", *TINY, "--ladder", "--json")
+    rungs = json.loads(run.stdout)["ladder"]
+    assert [rung["rung"] for rung in rungs] == [
+        "average colour",
+        "colour histogram",
+        "thumbnail 16x16",
+        "untrained network",
+        "efficientnet-lite0-vlad128, shipped vocabulary",
+        "efficientnet-lite0-vlad128, fitted vocabulary",
+    ]
+    for rung in rungs:
+        for kind in ("recall", "recall_in_map", "recall_other_way"):
+            shares = rung[kind]
+            assert 0 <= shares["1"] <= shares["5"] <= shares["10"] <= 1
+
+
+def test_folder_that_holds_anything_is_refused_and_left_alone(command: Command, out: Path) -> None:
+    before = contents(out)
+    run = command(out, *SMALL, "--no-ladder", "--json", code=1)
+    problem = json.loads(run.stdout)
+    assert problem["code"] == "out_not_empty"
+    assert "empty" in problem["detail"]
+    assert contents(out) == before
+
+
+def test_folder_that_cannot_be_made_is_an_error_that_names_it(command: Command, out: Path) -> None:
+    run = command(out / "city.json" / "in", *TINY, "--no-ladder", "--json", code=1)
+    problem = json.loads(run.stdout)
+    assert problem["code"] == "out_unwritable"
+    assert "city.json" in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ("--places", "0"),
+        ("--views", "0"),
+        ("--queries", "0"),
+        ("--out-of-map", "1.5"),
+        ("--seed", "-1"),
+        ("--size", "320"),
+        ("--size", "9999x10"),
+    ],
+)
+def test_impossible_numbers_are_refused_before_anything_is_written(
+    command: Command, wrong: tuple[str, str]
+) -> None:
+    run = command("never", *wrong, "--no-ladder", code=2)
+    assert wrong[0].lstrip("-") in run.stderr or "WxH" in run.stderr
+    assert not (command.folder / "never").exists()

@@ -1,0 +1,319 @@
+"""Whole training runs on places drawn in a moment, on the processor."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from lab.training import run
+from lab.training.arguments import build_arguments, load_yaml
+from lab.training.run_control import NullDisplay, RunStopped, StopRequest
+from services.cli.main import build_app
+from shared.descriptors.backbones.trained import TrainedBackbone
+from shared.descriptors.vpr_models.aggregators import AGGREGATORS
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.descriptors.vpr_models.config import STAGES
+from shared.errors import (
+    InvalidRequest,
+    PlacewiseError,
+    Unprocessable,
+)
+from tests.lab.training_runs import (
+    CITY,
+    StopAfter,
+    assert_same_weights,
+    run_arguments,
+    train,
+    weights,
+)
+
+Json = dict[str, Any]
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+OWN_CODE = """
+import torch
+from shared.descriptors.vpr_models.aggregators.base import Aggregator, normalise_rows
+
+def network(pretrained):
+    return torch.nn.Conv2d(3, 8, kernel_size=8, stride=8)
+
+class Strongest(Aggregator):
+    inferred = {"in_channels": "channels"}
+
+    def __init__(self, in_channels: int):
+        super().__init__(in_channels)
+
+    def forward(self, maps):
+        return normalise_rows(maps.amax((-2, -1)))
+"""
+
+
+def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Path, Json]) -> None:
+    folder, report = whole
+    assert json.loads((folder / "metrics.json").read_text()) == report
+    assert [epoch["step"] for epoch in report["epochs"]] == [3, 6]
+    recalls = {name.rpartition("/")[2] for name in report["epochs"][0]["figures"]}
+    assert recalls == {"R1", "R5", "R10", "R15", "R20"}
+    assert report["training_set"]["places"] == 6
+    assert report["training_set"]["cities"] == [CITY]
+    (name,) = report["sets"]
+    assert report["monitor"] == f"{name}/R1"
+    assert report["images"] == 2 * 6 * 3
+    assert 0 <= report["share_waiting_for_data"] <= 1
+    assert build_arguments(load_yaml(folder / "config.yaml")).cities == (CITY,)
+    assert list((folder / "csv").rglob("metrics.csv"))
+    assert list((folder / "tensorboard").glob("events*"))
+
+
+def test_checkpoint_names_carry_the_figures_of_their_epoch(whole: tuple[Path, Json]) -> None:
+    folder, report = whole
+    monitor = report["monitor"]
+    for epoch in report["epochs"]:
+        figure = f"R1[{epoch['figures'][monitor]:.4f}]"
+        (found,) = (folder / "checkpoints").glob(f"*epoch({epoch['number']:02d})*.ckpt")
+        assert figure in found.name
+
+
+def test_the_best_checkpoint_is_what_was_tested(whole: tuple[Path, Json]) -> None:
+    _, report = whole
+    best = max(report["epochs"], key=lambda each: each["figures"][report["monitor"]])
+    assert f"epoch({best['number']:02d})" in report["best"]["path"]
+    (name,) = report["test"]
+    # Tested at the size of training, on the set that it was validated on: the same figures.
+    for k, share in report["test"][name]["recall"].items():
+        assert share == best["figures"][f"{name}/R{k}"]
+    assert (
+        load_checkpoint(Path(report["best"]["path"])).fingerprint == report["best"]["fingerprint"]
+    )
+
+
+def test_best_checkpoints_hold_weights_and_the_last_one_everything(
+    whole: tuple[Path, Json],
+) -> None:
+    folder, report = whole
+    best = torch.load(report["best"]["path"], weights_only=True)
+    last = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert "optimizer_states" not in best
+    assert last["optimizer_states"]
+
+
+def test_the_same_run_twice_gives_the_same_weights(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    folder, report = whole
+    again = train(run_arguments(places, tmp_path))
+    assert [epoch["loss"] for epoch in again["epochs"]] == [
+        epoch["loss"] for epoch in report["epochs"]
+    ]
+    assert_same_weights(folder / "checkpoints/last.ckpt", Path(again["last"]))
+
+
+def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
+    places: Path, tmp_path: Path
+) -> None:
+    report = train(
+        run_arguments(places, tmp_path, experiment_phase="all", save_val_predictions=True)
+    )
+    (name,) = report["predictions"]
+    folder = tmp_path / "run"
+    files = [folder / f"predictions_{name}.npy"]
+    files += [folder / f"predictions/epoch{n:02d}/predictions_{name}.npy" for n in (0, 1)]
+    recalls = [report["test"][name]["recall"]]
+    recalls += [
+        {k: epoch["figures"][f"{name}/R{k}"] for k in ("1", "5", "10", "20")}
+        for epoch in report["epochs"]
+    ]
+    for file, recall in zip(files, recalls, strict=True):
+        command = ["evaluate", "--predictions", str(file), "--data", str(places), "--set", name]
+        answer = CliRunner().invoke(build_app(["evaluate"]), [*command, "--json"])
+        assert answer.exit_code == 0, answer.output
+        evaluated = json.loads(answer.stdout)
+        assert evaluated["recall"] == {k: recall[k] for k in evaluated["recall"]}
+    assert f"--data {places} --set {name}" in report["next"][0]
+
+
+def test_a_compiled_network_learns_the_same_and_leaves_an_ordinary_checkpoint(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[torch.nn.Module] = []
+    real = torch.compile
+
+    def compile_without_code(module: torch.nn.Module, **options: Any) -> Any:
+        compiled.append(module)
+        return real(module, **{**options, "backend": "eager"})  # the compiler takes a minute
+
+    monkeypatch.setattr(torch, "compile", compile_without_code)
+    report = train(run_arguments(places, tmp_path, compile=True))
+    assert compiled
+    assert_same_weights(whole[0] / "checkpoints/last.ckpt", Path(report["last"]))
+    assert load_checkpoint(Path(report["best"]["path"])).fingerprint
+
+
+def test_the_trained_model_keeps_the_size_and_the_interpolation_of_its_validation(
+    places: Path, tmp_path: Path
+) -> None:
+    fields = run_arguments(
+        places, tmp_path, val_image_size=[48, 64], interpolation="bicubic",
+        randaugment_magnitude=5, max_steps=1, experiment_phase="all"
+    )  # fmt: skip
+    best = Path(train(fields)["best"]["path"])
+    config = load_checkpoint(best).config
+    assert (config.image_size, config.interpolation) == ((48, 64), "bicubic")
+    served = TrainedBackbone.from_checkpoint("gsv:walks", best, torch.device("cpu"))
+    assert served.preprocessing.name == "resize48x64-bicubic"
+
+
+def test_own_code_is_trained_stopped_resumed_and_tested_by_its_name(
+    places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_walks.py").write_text(OWN_CODE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    backbone, aggregator = "own_walks:network", "own_walks:Strongest"
+    own: Json = {
+        "backbone_arch": backbone,
+        "layers_to_crop": [],
+        "agg_arch": aggregator,
+        "loss_name": "pytorch_metric_learning.losses:ContrastiveLoss",
+        "miner_name": "pytorch_metric_learning.miners:BatchHardMiner",
+        "experiment_phase": "all",
+    }
+    fields = run_arguments(places, tmp_path, **own)
+    stop = StopRequest()
+    with pytest.raises(RunStopped):
+        run.run(build_arguments(fields), StopAfter(stop, "epoch 1", 2), stop)
+    monkeypatch.delitem(AGGREGATORS, aggregator)  # as in another process
+    report = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
+    assert not [line for line in report["next"] if "models add" in line]
+    tested = train(
+        {**fields, "experiment_phase": "test", "run_name": "t", "model_path": report["last"]}
+    )
+    assert tested["test"].keys() == report["test"].keys()
+    del AGGREGATORS[aggregator], STAGES[backbone]
+
+
+def test_frozen_layers_keep_their_weights_and_the_others_learn(
+    places: Path, tmp_path: Path
+) -> None:
+    display = NullDisplay()
+    fields = run_arguments(places, tmp_path, layers_to_freeze=0, max_steps=2)
+    report = train(fields, display)
+    begun = train(
+        run_arguments(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0")
+    )
+    before, after = weights(Path(begun["last"])), weights(Path(report["last"]))
+    changed = {name for name in before if not torch.allclose(before[name], after[name])}
+    assert changed
+    assert not [name for name in changed if "stem" in name]
+    assert any("stem" in name for name in before)
+    assert any("never learn" in line for line in display.messages)
+
+
+def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_path: Path) -> None:
+    mine = Path(shutil.copytree(places, tmp_path / "places"))
+    broken = sorted((mine / "gsv_xs" / "train" / CITY).iterdir())[0]
+    broken.write_bytes(broken.read_bytes()[:100])
+    display = NullDisplay()
+    fields = run_arguments(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
+    report = train(fields, display)
+    assert list(report["bad_photos"]) == [str(broken)]
+    assert report["images"] == 17
+    assert any(broken.name in line for line in display.messages)
+    with pytest.raises(Unprocessable, match=broken.name[:20]) as caught:
+        train({**fields, "on_bad_image": "error", "run_name": "strict"})
+    assert caught.value.code == "undecodable_photo"
+
+
+def test_a_checkpoint_alone_is_tested(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    _, trained = whole
+    fields = {
+        **run_arguments(
+            places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]
+        ),
+    }
+    del fields["image_size"]  # the checkpoint knows it
+    report = train(fields)
+    assert report["test"] == trained["test"]
+    assert all(Path(file).is_file() for file in report["predictions"].values())
+    native = train({**fields, "test_image_size": "native", "run_name": "native"})
+    assert native["test"].keys() == trained["test"].keys()
+    with pytest.raises(InvalidRequest, match="--model_path"):
+        train({**fields, "model_path": "", "run_name": "none"})
+
+
+def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
+    train(run_arguments(places, tmp_path / "out", fast_dev_run=True, num_sanity_val_steps=1))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("others", "code", "expected"),
+    [
+        ({"data_root": None}, "data_root_missing", "--data-root DIR"),
+        ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
+        ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
+        ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),
+        ({"agg_arch": "mean"}, "unknown_aggregator", "CosPlace"),
+        ({"loss_name": "TripleLoss"}, "unknown_loss", "TripletMarginLoss"),
+        ({"miner_name": "BestMiner"}, "unknown_miner", "BatchHardMiner"),
+        ({"monitor": "other/R1"}, "unknown_metric", "known: "),
+        ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
+        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "(--weights)"),
+    ],
+)
+def test_what_is_not_there_is_named_with_what_is_known(
+    others: Json, code: str, expected: str, places: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(PlacewiseError) as caught:
+        train(run_arguments(places, tmp_path, **others))
+    assert caught.value.code == code
+    assert expected in caught.value.detail
+
+
+def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_path: Path) -> None:
+    fields = run_arguments(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
+    with pytest.raises(Unprocessable) as caught:
+        train(fields)
+    assert caught.value.code in ("loss_not_finite", "features_not_finite")
+
+
+def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_others(
+    places: Path, tmp_path: Path
+) -> None:
+    fields = run_arguments(places, tmp_path, max_epochs=1)
+    del fields["default_root_dir"], fields["run_name"], fields["agg_arch"]
+    file = tmp_path / "grid.yaml"
+    mixvpr = {"agg_arch": "MixVPR", "agg_config": {"nonsense": 1}}
+    file.write_text(
+        json.dumps({"base": fields, "grid": {"agg": [{"agg_arch": "AVG"}, {"agg_arch": "GeM"}]},
+                    "runs": [{"name": "wrong", **mixvpr}]})
+    )  # fmt: skip
+    out = tmp_path / "grid"
+    command = ["grid", str(file), "--out", str(out)]
+    dry = CliRunner().invoke(build_app(["grid"]), [*command, "--dry-run", "--json"])
+    assert dry.exit_code == 1, dry.output
+    assert "wrong can't start: bad_agg_config" in dry.stderr
+    assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
+        ("AVG", "waiting"),
+        ("GeM", "waiting"),
+        ("wrong", "waiting"),
+    ]
+    assert not out.exists()
+    answer = CliRunner().invoke(build_app(["grid"]), [*command, "--json"])
+    assert answer.exit_code == 1, answer.output
+    states = {each["run"]["name"]: each["state"] for each in json.loads(answer.stdout)}
+    assert states == {"AVG": "finished", "GeM": "finished", "wrong": "failed"}
+    assert "wrong failed: bad_agg_config" in answer.stderr.replace("\n", " ")
+    table = (out / "leaderboard.md").read_text()
+    assert table.index("AVG") < table.index("wrong")
+    assert "failed: bad_agg_config" in table

@@ -1,0 +1,103 @@
+"""The benchmark of place estimates, on a map whose photos are points around their places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from lab.benchmarks.places import estimates
+from lab.benchmarks.places.estimates import (
+    DescribedPhotos,
+    add_answers,
+    add_left_out,
+    add_reliability,
+    draw,
+    fit_and_judge,
+    left_out_labels,
+)
+from lab.benchmarks.report import Report
+from shared.errors import Misconfigured
+from shared.evaluation.places.evidence import PhotoLocation
+from shared.evaluation.places.fit import MIN_LABELLED_QUERIES
+from shared.evaluation.places.levels import LevelScheme
+
+PLACES, PER_PLACE, FLOORS = 24, 6, 8
+
+
+def described() -> DescribedPhotos:
+    rng = np.random.default_rng(0)
+    rows = np.repeat(rng.normal(size=(PLACES, 16)), PER_PLACE, 0)
+    rows += 0.3 * rng.normal(size=rows.shape)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    places = [f"house/{n % FLOORS}/{n}" for n in range(PLACES) for _ in range(PER_PLACE)]
+    return DescribedPhotos(
+        "house",
+        rows.astype(np.float32),
+        [PhotoLocation(None, None, place) for place in places],
+        [None] * len(places),
+        np.arange(len(places)) % PER_PLACE == 0,
+        np.arange(len(places)) // PER_PLACE,
+        LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
+        25.0,
+    )
+
+
+def test_queries_of_clear_places_are_answered_rightly() -> None:
+    photos = described()
+    judged = fit_and_judge(photos, ~photos.is_query, photos.is_query)
+    assert len(judged) == PLACES
+    report = Report("estimates")
+    add_answers(report, "house", judged)
+    add_reliability(report, "house", judged)
+    measured = {figure.what: figure.measured for figure in report.figures}
+    assert measured["house: answered"] > 80
+    assert measured["house: right"] == 100
+    assert measured["house: ECE of level 0"] < 0.2
+
+
+def test_labelled_queries_calibrate_the_estimates_of_the_others() -> None:
+    photos = described()
+    labelled = draw(np.arange(len(photos.rows)) % PER_PLACE > 3, MIN_LABELLED_QUERIES, seed=0)
+    assert labelled.sum() == MIN_LABELLED_QUERIES
+    in_map = ~photos.is_query & ~labelled
+    judged = fit_and_judge(photos, in_map, photos.is_query, labelled)
+    assert [j.cluster for j in judged] == list(range(PLACES))
+    without = fit_and_judge(photos, in_map, photos.is_query)
+    assert judged[0].estimate.probabilities != without[0].estimate.probabilities
+
+
+def test_without_a_folder_the_tower_of_the_test_data_is_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    described_folders = []
+
+    def describe(folder: Path, _: Progress) -> DescribedPhotos:
+        described_folders.append(folder)
+        return described()
+
+    monkeypatch.setattr(estimates, "describe_set", describe)
+    monkeypatch.setenv("PLACEWISE_TEST_DATA", str(tmp_path))
+    report = estimates.measure(Progress(), folders=None, splits=1)
+    assert described_folders == [tmp_path / "tower"]
+    titles = [table.title for table in report.tables]
+    assert "house, half of its queries labelled" in titles
+    shares = report.tables[0].columns
+    assert [column.header for column in shares] == ["share", "%", "95 % interval"]
+    monkeypatch.delenv("PLACEWISE_TEST_DATA")
+    with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
+        estimates.measure(Progress(), folders=None, splits=1)
+
+
+def test_each_floor_is_left_out_once_and_its_photos_get_few_fine_answers() -> None:
+    photos = described()
+    groups = list(left_out_labels(photos))
+    assert np.sum(groups, axis=0).tolist() == [1] * len(photos.rows)
+    missing = groups[0]
+    judged = fit_and_judge(photos, ~photos.is_query & ~missing, missing)
+    report = Report("estimates")
+    add_left_out(report, "house", judged)
+    assert next(figure.measured for figure in report.figures) <= 20
+    assert all(j.is_right[0] is False for j in judged)

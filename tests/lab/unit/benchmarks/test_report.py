@@ -1,0 +1,69 @@
+"""What `placewise bench` says of its figures, and where it can't run."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from lab.benchmarks.report import LatencySummary, Report
+from services.cli.main import build_app
+
+runner = CliRunner()
+app = build_app(["bench"])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "missed"),
+    [
+        ({}, False),
+        ({"at_most": 10.0}, False),
+        ({"at_most": 9.9}, True),
+        ({"at_least": 10.0}, False),
+        ({"at_least": 10.1}, True),
+    ],
+)
+def test_figure_is_missed_beyond_its_bound(bounds: dict[str, float], missed: bool) -> None:
+    report = Report("anything")
+    report.add("something", 10.0, "ms", **bounds)
+    assert report.missed == missed
+    assert report.as_json()["figures"][0]["missed"] == missed
+
+
+@pytest.mark.parametrize("missed", [True, False])
+def test_missed_figure_is_exit_code_1(monkeypatch: pytest.MonkeyPatch, missed: bool) -> None:
+    report = Report("anything")
+    report.add("requests failed", int(missed), at_most=0)
+
+    class Program:
+        @staticmethod
+        def measure(progress: Any) -> Report:
+            return report
+
+    monkeypatch.setattr(importlib, "import_module", lambda name: Program)
+    ended = runner.invoke(app, ["bench", "rolling"])
+    assert ended.exit_code == missed
+    assert ("missed" in ended.output) == missed
+
+
+def test_without_a_checkout_it_says_what_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise ModuleNotFoundError("No module named 'lab.benchmarks'", name="lab.benchmarks")
+
+    monkeypatch.setattr(importlib, "import_module", fail)
+    ended = runner.invoke(app, ["bench", "rolling", "--json"])
+    assert ended.exit_code == 1
+    assert '"code": "no_benchmarks"' in ended.output
+    assert "make setup" in ended.output
+
+
+@pytest.mark.parametrize("workers", ["", "1,x", "0,1"])
+def test_numbers_that_are_none_are_refused(workers: str) -> None:
+    assert runner.invoke(app, ["bench", "scaling", "--workers", workers]).exit_code == 2
+
+
+def test_spread_is_of_the_slowest_too() -> None:
+    found = LatencySummary.of([float(number) for number in range(100, 0, -1)])
+    assert (found.median, found.p95, found.worst) == (50.5, 96.0, 100.0)

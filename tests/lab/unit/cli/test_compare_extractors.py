@@ -1,0 +1,56 @@
+"""What `placewise compare --extractors` means, and which descriptors are worth their price."""
+
+from __future__ import annotations
+
+import base64
+import math
+
+import pytest
+
+from lab.cli.evaluation.compare_extractors import ComparisonEntry, parse_entries
+from lab.evaluation.report.charts import percent_chart, render_chart
+from lab.evaluation.report.comparison import pareto_front
+from shared.errors import InvalidRequest
+
+
+def test_commas_separate_extractors_and_their_options() -> None:
+    read = parse_entries("a,b:layer=9,facet=key+pca512, c+fit,runs/last.ckpt+pca64")
+    assert read == [
+        ComparisonEntry("a", "a"),
+        ComparisonEntry("b:layer=9,facet=key+pca512", "b:layer=9,facet=key", pca=512),
+        ComparisonEntry("c+fit", "c", fit=True),
+        ComparisonEntry("runs/last.ckpt+pca64", "runs/last.ckpt", pca=64),
+    ]
+
+
+@pytest.mark.parametrize("text", ["", "a,,b", "+fit", "a+pca0", "a+pca", "a+pca512x", "a+other"])
+def test_what_means_no_extractor_is_refused(text: str) -> None:
+    with pytest.raises(InvalidRequest) as refused:
+        parse_entries(text)
+    assert refused.value.code == "bad_extractors"
+
+
+def test_front_holds_what_nothing_beats_in_price_and_worth() -> None:
+    prices = [1.0, 2.0, 2.0, 3.0, 4.0, math.nan]
+    worths = [0.5, 0.7, 0.6, 0.7, 0.9, 1.0]
+    # dearer and worse than the second; as good and dearer; not measured
+    assert pareto_front(prices, worths) == [True, True, False, False, True, False]
+
+
+def test_equal_ones_are_both_on_the_front() -> None:
+    assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True]
+
+
+def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:
+    def chart() -> str:
+        figure, axes = percent_chart("metres", "recall", x_ticks=(1, 10), log=True)
+        axes.plot([1, 10], [0.2, 0.8], label="all queries")
+        axes.legend()
+        return render_chart(figure, "Recall & more")
+
+    one = chart()
+    assert chart() == one
+    assert one.endswith('alt="Recall &amp; more">')
+    svg = base64.b64decode(one.partition("base64,")[2].partition('"')[0]).decode()
+    assert "all queries" in svg
+    assert "dc:date" not in svg

@@ -1,0 +1,76 @@
+"""Small data sets that tests write: real photos of a few pixels under the names of the field."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lab.datasets.open_dataset import EvaluationSet
+from shared.errors import PlacewiseError
+from shared.utm_filenames import UtmFileName
+
+
+def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:
+    """A file name at a place in UTM zone 32T, metres."""
+    return UtmFileName(east, north, 32, "T", note=note, heading=heading).file_name()
+
+
+def write_photo(path: Path, number: int = 0) -> Path:
+    """A photo of 8 x 6 pixels, another for each number."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    Image.new("RGB", (8, 6), (number % 256, number // 256, 7)).save(buffer, "JPEG")
+    path.write_bytes(buffer.getvalue())
+    return path
+
+
+def write_photos(folder: Path, names: Iterable[str]) -> list[Path]:
+    return [write_photo(folder / name, number) for number, name in enumerate(names)]
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+    return path
+
+
+def save_names(path: Path, names: Sequence[str]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.array(names))
+    return path
+
+
+def save_lists(path: Path, rows: Sequence[Sequence[int]]) -> Path:
+    """An object array of Python lists, as the ground truths of sf_xs are."""
+    lists = np.empty(len(rows), object)
+    for number, row in enumerate(rows):
+        lists[number] = list(row)
+    np.save(path, lists, allow_pickle=True)
+    return path
+
+
+def pair(base: Path, database: list[float], queries: list[float]) -> None:
+    """Photos along one street, at these metres."""
+    for name, spots in (("database", database), ("queries", queries)):
+        write_photos(base / name, [utm_name(480_000 + m, 4_880_000) for m in spots])
+
+
+def rows(opened: EvaluationSet) -> list[list[int]]:
+    return [found.tolist() for found in opened.positives]
+
+
+def names(opened: EvaluationSet) -> tuple[list[str], list[str]]:
+    return [s.name for s in opened.database], [s.name for s in opened.queries]
+
+
+def code_of(caught: pytest.ExceptionInfo[PlacewiseError]) -> str:
+    return caught.value.code

@@ -1,0 +1,249 @@
+"""Which photos make up which batch, and what they go through."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lab.datasets.dataset import TrainingPlace
+from lab.training.data import (
+    Batch,
+    PhotoTransform,
+    PlaceBatchSampler,
+    PlaceDataset,
+    PlaceSample,
+    _init_worker,
+    load_batches,
+    to_tensor,
+)
+from shared.errors import Unprocessable
+from shared.imaging.decode import decode_resized
+
+
+def places_of(**counts: int) -> list[TrainingPlace]:
+    """So many places of each city, of four to six photos."""
+    found = []
+    for number, (city, count) in enumerate(counts.items()):
+        for place in range(count):
+            photos = tuple(Path(f"{city}/{place}_{photo}.jpg") for photo in range(4 + place % 3))
+            found.append(TrainingPlace(number * 10**5 + place, city, photos))
+    return found
+
+
+PLAN = PlaceBatchSampler(
+    places_of(oslo=10, rome=7),
+    places_per_batch=4,
+    photos_per_place=3,
+    shuffle_all=False,
+    random_photos=True,
+    reshuffle_every_epochs=1,
+    seed=1,
+)
+
+
+def cities(plan: PlaceBatchSampler, epoch: int = 0) -> list[str]:
+    return [plan.places[draw.place].city for batch in plan.batches(epoch) for draw in batch]
+
+
+def test_an_epoch_takes_every_place_once_and_ends_with_a_smaller_batch() -> None:
+    batches = list(PLAN.batches(0))
+    assert [len(batch) for batch in batches] == [4, 4, 4, 4, 1]
+    assert len(PLAN) == 5
+    assert sorted(draw.place for batch in batches for draw in batch) == list(range(17))
+
+
+def test_a_places_photos_are_drawn_without_replacement() -> None:
+    for draw in itertools.chain.from_iterable(PLAN.batches(0)):
+        assert len(set(draw.photos)) == 3
+        assert max(draw.photos) < len(PLAN.places[draw.place].photos)
+
+
+def test_cities_keep_their_order_and_their_places_are_shuffled() -> None:
+    assert cities(PLAN) == ["oslo"] * 10 + ["rome"] * 7
+    order = PLAN.order(0).tolist()
+    assert order[:10] != sorted(order[:10])
+
+
+def test_shuffle_all_mixes_the_cities() -> None:
+    mixed = cities(replace(PLAN, shuffle_all=True))
+    assert Counter(mixed) == {"oslo": 10, "rome": 7}
+    assert mixed != cities(PLAN)
+
+
+def test_places_are_shuffled_anew_every_so_many_epochs() -> None:
+    every_second = replace(PLAN, reshuffle_every_epochs=2)
+    orders = [every_second.order(epoch).tolist() for epoch in range(4)]
+    assert orders[0] == orders[1] != orders[2] == orders[3]
+    once = replace(PLAN, reshuffle_every_epochs=0)
+    assert once.order(0).tolist() == once.order(7).tolist()
+    # The photos of a place are other ones nevertheless.
+    assert list(once.batches(0)) != list(once.batches(7))
+
+
+def test_first_photos_are_taken_without_random_sampling() -> None:
+    first = replace(PLAN, random_photos=False)
+    assert {draw.photos for batch in first.batches(3) for draw in batch} == {(0, 1, 2)}
+
+
+def test_the_same_seed_draws_the_same_and_another_does_not() -> None:
+    assert list(PLAN.batches(2)) == list(replace(PLAN).batches(2))
+    assert list(PLAN.batches(2)) != list(replace(PLAN, seed=2).batches(2))
+
+
+def test_a_plan_that_begins_in_the_middle_draws_what_it_would_have_drawn() -> None:
+    assert list(PLAN.batches(1, start=3)) == list(PLAN.batches(1))[3:]
+
+
+@pytest.fixture
+def photos_on_disk(tmp_path: Path) -> list[TrainingPlace]:
+    found = []
+    for place in range(4):
+        paths = []
+        for photo in range(2):
+            path = tmp_path / f"{place}_{photo}.jpg"
+            noise = np.random.default_rng((place, photo)).integers(0, 255, (40, 60, 3))
+            Image.fromarray(noise.astype(np.uint8)).save(path)
+            paths.append(path)
+        found.append(TrainingPlace(place, "oslo", tuple(paths)))
+    return found
+
+
+def batches_of(
+    places: list[TrainingPlace],
+    epoch: int = 0,
+    start: int = 0,
+    *,
+    num_workers: int = 0,
+    bad_is_error: bool = False,
+) -> Iterator[Batch]:
+    plan = PlaceBatchSampler(places, 2, 2, False, True, 1, 7)
+    photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=bad_is_error)
+    return load_batches(plan, photos, epoch, start, num_workers=num_workers, pin_memory=False)
+
+
+def test_a_batch_holds_each_places_photos_with_its_id(photos_on_disk: list[TrainingPlace]) -> None:
+    batches = list(batches_of(photos_on_disk))
+    assert [tuple(batch.photos.shape) for batch in batches] == [(4, 3, 32, 48)] * 2
+    labels = torch.cat([batch.labels for batch in batches])
+    assert labels.dtype == torch.int64
+    assert labels[0::2].tolist() == labels[1::2].tolist()
+    assert sorted(labels.tolist()) == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_workers_read_what_one_process_reads(photos_on_disk: list[TrainingPlace]) -> None:
+    alone = list(batches_of(photos_on_disk))
+    shared = list(batches_of(photos_on_disk, num_workers=1))
+    for one, other in zip(alone, shared, strict=True):
+        assert torch.equal(one.photos, other.photos)
+
+
+def test_workers_leave_ctrl_c_and_sigterm_to_the_run_that_saves_itself() -> None:
+    endings = {ending: signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)}
+    threads = torch.get_num_threads()
+    try:
+        _init_worker(0)
+        assert {signal.getsignal(ending) for ending in endings} == {signal.SIG_IGN}
+    finally:
+        torch.set_num_threads(threads)
+        for ending, handler in endings.items():
+            signal.signal(ending, handler)
+
+
+def test_batches_go_on_behind_those_that_were_given(photos_on_disk: list[TrainingPlace]) -> None:
+    _, second = batches_of(photos_on_disk, epoch=3)
+    (rest,) = batches_of(photos_on_disk, epoch=3, start=1)
+    assert torch.equal(rest.photos, second.photos)
+
+
+def test_reading_ahead_leaves_the_steps_own_random_numbers_alone(
+    photos_on_disk: list[TrainingPlace],
+) -> None:
+    before = torch.get_rng_state()
+    list(batches_of(photos_on_disk))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_photo_that_does_not_decode_is_left_out_and_named(
+    photos_on_disk: list[TrainingPlace],
+) -> None:
+    broken = photos_on_disk[2].photos[1]
+    broken.write_bytes(broken.read_bytes()[:200])
+    batches = list(batches_of(photos_on_disk))
+    assert [path for batch in batches for path, _ in batch.undecodable] == [str(broken)]
+    assert sum(len(batch.photos) for batch in batches) == 7
+    assert sorted(torch.cat([batch.labels for batch in batches]).tolist()).count(2) == 1
+
+
+def test_a_photo_that_does_not_decode_is_an_error_in_strict_mode(
+    photos_on_disk: list[TrainingPlace],
+) -> None:
+    broken = photos_on_disk[2].photos[1]
+    broken.write_bytes(b"")
+    with pytest.raises(Unprocessable, match=broken.name) as caught:
+        list(batches_of(photos_on_disk, bad_is_error=True))
+    assert caught.value.code == "undecodable_photo"
+
+
+def test_augmentation_is_decided_by_its_seed() -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (32, 32, 3)).astype(np.uint8)
+    image = Image.fromarray(pixels)
+    usual, strong = PhotoTransform((32, 32)), PhotoTransform((32, 32), magnitude=30)
+    first, again, other = (np.asarray(usual.augment(image, seed)) for seed in (5, 5, 6))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(first, np.asarray(strong.augment(image, 5)))
+
+
+def test_photos_are_resized_bicubically_on_request_and_not_augmented_without_a_magnitude(
+    photos_on_disk: list[TrainingPlace],
+) -> None:
+    path = photos_on_disk[0].photos[0]
+    transform = PhotoTransform((50, 70), "bicubic", magnitude=None)
+    with Image.open(path) as image:
+        expected = image.convert("RGB").resize((70, 50), Image.Resampling.BICUBIC)
+    assert np.array_equal(np.asarray(transform.load(path, seed=1)), np.asarray(expected))
+
+
+def test_pixels_are_normalised_by_the_means_and_deviations_of_imagenet() -> None:
+    image = Image.new("RGB", (4, 2), (255, 0, 51))
+    tensor = to_tensor(image)
+    assert tuple(tensor.shape) == (3, 2, 4)
+    # (1 - 0.485) / 0.229, (0 - 0.456) / 0.224, (0.2 - 0.406) / 0.225
+    expected = torch.tensor([2.2489083, -2.0357143, -0.9155556])
+    assert torch.allclose(tensor[:, 0, 0], expected, atol=1e-6)
+
+
+def test_a_large_jpeg_decoded_small_is_nearly_the_full_decoding(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    coarse = Image.fromarray(rng.integers(0, 255, (12, 16, 3)).astype(np.uint8))
+    full = coarse.resize((1280, 960), Image.Resampling.BICUBIC)
+    full.save(tmp_path / "large.jpg", quality=95)
+    small = np.asarray(decode_resized(tmp_path / "large.jpg", (120, 160)), dtype=float)
+    expected = np.asarray(full.resize((160, 120), Image.Resampling.BILINEAR), dtype=float)
+    assert small.shape == (120, 160, 3)
+    assert np.abs(small - expected).mean() < 2
+
+
+def test_a_photo_on_its_side_comes_out_upright(tmp_path: Path) -> None:
+    image = Image.new("RGB", (640, 320))
+    image.paste((255, 255, 255), (0, 0, 320, 320))  # the left half
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned clockwise: the left becomes the top
+    image.save(tmp_path / "side.jpg", exif=exif)
+    upright = np.asarray(decode_resized(tmp_path / "side.jpg", (64, 32)))
+    assert upright.shape == (64, 32, 3)
+    assert upright[:24].mean() > 250
+    assert upright[-24:].mean() < 5
+
+
+def test_a_draw_is_plain_enough_to_cross_processes() -> None:
+    assert PlaceSample(1, (0, 1), 5) == PlaceSample(1, (0, 1), 5)
