@@ -1,1 +1,1 @@
-"""The trainer: metric-learning training of place descriptors on GSV-Cities, and validation."""
+"""Metric-learning training of place descriptors on GSV-Cities, and validation."""

@@ -417,7 +417,7 @@ def load_mapping(path: Path) -> dict[str, Any]:
         NotFound: `config_not_found`.
         InvalidRequest: `bad_config` if the file is not a mapping.
     """
-    import yaml  # part of the extra `trainer`; `--help` must work without it
+    import yaml  # part of the extra `lab`; `--help` must work without it
 
     try:
         loaded = yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -129,7 +129,7 @@ def _next_commands(arguments: TrainingArguments, sets: EvaluationSets, report: J
         for name, predictions in list(report["predictions"].items())[:1]
     ]
     if is_own_module(arguments.backbone_arch) or is_own_module(arguments.agg_arch):
-        return show_predictions  # only the trainer imports the network's code
+        return show_predictions  # only training imports the network's code
     return [
         *show_predictions,
         command_line("evaluate", "--data", root, "--checkpoint", best),

@@ -69,14 +69,18 @@ LAB_COMMANDS = {
 ROOT = Path(__file__).parents[2]
 
 
-def list_commands(root: Path = ROOT) -> dict[str, tuple[str, str, str]]:
-    """Return the panel, the module and the attribute of each command that is installed.
+Commands = dict[str, tuple[str, str, str]]
+"""Name of a command -> its panel, module and attribute"""
+
+
+def list_commands(root: Path = ROOT) -> Commands:
+    """List the commands that are installed.
 
     Args:
         root: Folder of the packages `services` and, where it is installed, `lab`.
     """
     has_lab = (root / "lab" / "cli" / "__init__.py").is_file()
-    found: dict[str, tuple[str, str, str]] = {}
+    found: Commands = {}
     for panel, commands in PANELS.items():
         for name, (module, attribute) in commands.items():
             found[name] = (panel, f"services.cli.{module}", attribute)
@@ -118,11 +122,11 @@ class _PlacewiseGroup(TyperGroup):
             raise
 
 
-def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
-    """Build the application with the named commands, importing only their modules."""
+def build_app(names: Collection[str] | None = None, commands: Commands = COMMANDS) -> typer.Typer:
+    """Build the application with the named commands, or all, importing only their modules."""
     app = _new_app()
-    for name in names:
-        panel, module, attribute = COMMANDS[name]
+    for name in commands if names is None else names:
+        panel, module, attribute = commands[name]
         command = getattr(importlib.import_module(module), attribute)
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name, rich_help_panel=panel)
@@ -166,7 +170,7 @@ def run() -> None:
 
         # The suggestion of a similar name, for a typo, needs every command.
         with collection_paused():
-            app = build_app(names if names[0] in COMMANDS else COMMANDS.keys())
+            app = build_app(names if names[0] in COMMANDS else None)
     app()
 
 

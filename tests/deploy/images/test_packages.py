@@ -34,6 +34,7 @@ COMMAND = [
     "shared.catalog.database.postgres",
     "shared.storage.s3",
 ]
+LAB_COMMAND = "import sys; sys.argv = ['placewise', 'train', '--help']; main()"
 IMPORT = """
 import importlib, sys
 for module in sys.argv[1:]:
@@ -72,3 +73,20 @@ def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:
     assert {"pytest", "moto"} <= tools
     for service in MODULES:
         assert not image(service).packages() & tools, service
+
+
+@pytest.mark.parametrize("service", [name for name in MODULES if name != "flower"])
+def test_no_image_holds_the_lab_and_its_commands_say_so(
+    service: str, image: BuildImage, tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [image(service).python, "-c", f"from services.cli import main; {LAB_COMMAND}"],
+        cwd=tmp_path,
+        env=image(service).environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1, done.stderr[-1500:]
+    said = " ".join(done.stderr.split())
+    assert "lab_missing: `placewise train` is part of the lab" in said
