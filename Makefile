@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
+.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint size types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -80,10 +80,14 @@ client: $(INSTALLED) ## generate the synchronous client from the asynchronous on
 api-page: $(INSTALLED) ## generate docs/api-calls.md from the OpenAPI description
 	$(BIN)/python -m tools.make_api_page
 
-lint: $(INSTALLED) ## check ruff rules, formatting and import contracts
+lint: $(INSTALLED) ## check ruff rules, formatting, import contracts and sizes
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/python -m tools.size
+
+size: $(INSTALLED) ## print lines, settings, commands and migrations beside their limits
+	$(BIN)/python -m tools.size
 
 types: $(INSTALLED) ## check types with mypy (strict)
 	$(BIN)/mypy

@@ -1,0 +1,100 @@
+"""`make size`: figures of the code beside the limits of docs/architecture.md."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tools import size
+from tools.size import Bound, find_violations, lower_limits, measure, read_bounds
+
+PAGE = """# Architecture
+
+| settings | 1 | 1 |
+
+## Size
+
+| figure | limit | aim |
+|---|---|---|
+| lines of the lab | 1,200 | 900 |
+| files of the lab | - | - |
+
+## Next
+
+| commands | 1 | 1 |
+"""
+
+
+def test_limits_and_aims_are_those_of_the_one_table() -> None:
+    assert read_bounds(PAGE) == {
+        "lines of the lab": Bound(1200, 900),
+        "files of the lab": Bound(None, None),
+    }
+
+
+def test_a_figure_above_its_limit_is_a_violation() -> None:
+    bounds = read_bounds(PAGE)
+    assert find_violations({"lines of the lab": 1200, "files of the lab": 80}, bounds) == []
+    (violation,) = find_violations({"lines of the lab": 1201, "files of the lab": 80}, bounds)
+    assert violation == "lines of the lab: 1,201 is above the limit of 1,200"
+
+
+def test_a_figure_without_a_row_and_a_row_without_a_figure_are_violations() -> None:
+    found = find_violations({"lines of the lab": 1, "settings": 2}, read_bounds(PAGE))
+    assert found == [
+        "the table has no row `settings`",
+        "nothing is counted for the row `files of the lab`",
+    ]
+
+
+def test_limits_are_lowered_and_never_raised() -> None:
+    lower = lower_limits(PAGE, {"lines of the lab": 1100, "files of the lab": 3, "settings": 0})
+    assert lower == PAGE.replace("| 1,200 |", "| 1,100 |")
+    assert lower_limits(PAGE, {"lines of the lab": 1300}) == PAGE
+
+
+def test_tracked_python_files_are_counted_by_room(tmp_path: Path) -> None:
+    for name in ("lab/a.py", "lab/b.py", "lab/c.txt", "services/d.py", "tests/lab/e.py"):
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text('"""One\n\nthree."""\n')
+    subprocess.run(["git", "init", "--quiet"], cwd=tmp_path, check=True)
+    subprocess.run(["git", "add", "."], cwd=tmp_path, check=True)
+    (tmp_path / "lab" / "untracked.py").write_text("\n")
+    figures = measure(tmp_path)
+    assert (figures["files of the lab"], figures["lines of the lab"]) == (2, 6)
+    assert (figures["files of the service"], figures["lines of the service"]) == (1, 3)
+    assert (figures["files of the tests"], figures["lines of the tests"]) == (1, 3)
+    assert figures["migrations"] == 0
+
+
+def test_outside_git_the_error_says_where_the_size_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    with pytest.raises(SystemExit, match="in a clone of the repository"):
+        measure(tmp_path)
+
+
+@pytest.mark.parametrize(("limit", "code"), [("100,000", None), ("1", 1)])
+def test_a_rise_above_the_limit_is_exit_code_1_and_the_output_is_tab_separated(
+    limit: str,
+    code: int | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(size, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(size, "measure", lambda root: {"lines of the lab": 24_000})
+    size.PAGE.write_text(f"# A\n\n## Size\n\n| lines of the lab | {limit} | 900 |\n")
+    ended: int | str | None = None
+    try:
+        size.main([])
+    except SystemExit as error:
+        ended = error.code
+    assert ended == code
+    printed = capsys.readouterr()
+    assert printed.out == f"figure\tnow\tlimit\taim\nlines of the lab\t24,000\t{limit}\t900\n"
+    assert ("above the limit" in printed.err) == (code == 1)
