@@ -106,7 +106,6 @@ class QueryOutcome:
 
     in_map: bool
     """Whether the map has a photo of its place."""
-    evidence: PlaceEvidence | None
     is_correct: bool
     """Whether the estimate shows its place."""
     error_m: float | None
@@ -218,14 +217,12 @@ class MapEvaluation:
         )
         recalls, impostors = self._leave_one_out(sample, own_photos)
         threshold = fit_threshold(impostors)
-        provisional = Calibration(
-            radius_m=self.radius_m,
-            support_threshold=threshold,
-            impostors=len(impostors),
+        calibration = Calibration(
+            radius_m=self.radius_m, support_threshold=threshold, impostors=len(impostors)
         )
-        labelled = self._evaluate_labelled_queries(provisional, rank_photo)
+        labelled = self._evaluate_labelled_queries(calibration, rank_photo)
         places = self._evaluate_places(sample, own_photos, labelled)
-        calibration = provisional.model_copy(update={"places": places.model})
+        calibration = calibration.model_copy(update={"places": places.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
@@ -327,7 +324,6 @@ class MapEvaluation:
             labelled.outcomes.append(
                 QueryOutcome(
                     in_map=in_map,
-                    evidence=evidence,
                     is_correct=is_same_place(query.spot, estimate, self.radius_m),
                     error_m=distance_between_m(query.spot, estimate),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),

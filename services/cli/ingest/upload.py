@@ -158,13 +158,18 @@ def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
         The job as it ended, also if it failed; None if no fit is due.
     """
     deadline = time.monotonic() + FIT_START_SECONDS
+    was_due = False
     while True:
         stats = client.stats()
         job = next(client.jobs(kind="fit", state=["queued", "running"]), None)
         if job is not None:
             break
         if stats.next_fit_photos is None or stats.total_images < stats.next_fit_photos:
-            return None
+            if not was_due:
+                return None
+            job = next(client.jobs(kind="fit"))  # it started and ended between two polls
+            break
+        was_due = True
         if time.monotonic() > deadline:
             print_note("The map is improved later: other photos are still being added to it.")
             return None

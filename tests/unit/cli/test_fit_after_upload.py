@@ -44,6 +44,14 @@ def test_a_map_that_is_not_due_is_not_waited_for(photos: int, next_fit: int | No
     assert wait(jobs(), photos=photos, next_fit=next_fit)[0] is None
 
 
+def test_a_fit_that_starts_and_ends_between_two_looks_is_reported() -> None:
+    ended = {**FIT, "state": "succeeded"}
+    fitted = {**STATS, "total_images": 50, "next_fit_photos": 100}
+    job, _ = wait(jobs(), fitted, jobs(), jobs(ended), ended)
+    assert job is not None
+    assert job.state == "succeeded"
+
+
 def test_a_fit_that_failed_leaves_the_upload_a_success(capsys: pytest.CaptureFixture[str]) -> None:
     error = {"type": "urn:a", "title": "t", "status": 422, "code": "change_loses_photos"}
     failed = {**FIT, "state": "failed", "error": {**error, "detail": "Too many failed."}}
