@@ -94,7 +94,7 @@ def _score_rows(
     for chunk in chunks:
         rows = np.flatnonzero(row_mask[first : first + len(chunk.rows)])
         if len(rows):
-            gather = len(rows) <= GATHER_SHARE * len(chunk.rows)
+            gather = has_float16 or len(rows) <= GATHER_SHARE * len(chunk.rows)
             scores.append(chunk.rows[rows] @ unit if gather else (chunk.rows @ unit)[rows])
         first += len(chunk.rows)
     return selected, np.concatenate(scores), FLOAT32_MARGIN
