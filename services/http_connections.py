@@ -7,8 +7,8 @@ uvicorn has no such limits, and without them a few slow clients can use up all f
 |---|---|---|
 | connections in total | MAX_CONNECTIONS | the longest idle one is closed; 503 if none is idle |
 | connections per address | MAX_CONNECTIONS_PER_ADDRESS | the same, with 429 |
-| request head | REQUEST_HEAD_SECONDS | 408; closed if nothing was received |
-| request body | MIN_BODY_BYTES_PER_SECOND | 408 |
+| request head | HEAD_SECONDS | 408; closed if nothing was received |
+| request body | BODY_BYTES_PER_SECOND | 408 |
 | client does not read the response | STALLED_SECONDS | closed |
 """
 
@@ -43,6 +43,8 @@ from shared.http.problem_details import CLOSED_STATUS_SCOPE_KEY
 
 log = logging.getLogger(__name__)
 
+HEAD_SECONDS = 20.0
+BODY_BYTES_PER_SECOND = 1000
 # Window over which the rate of a body is measured, and so the longest pause of a client. Windows in
 # which the server itself paused reading do not count.
 BODY_WINDOW_SECONDS = 10.0
@@ -70,8 +72,8 @@ class ConnectionLimits:
 
     total: int
     per_address: int
-    head_seconds: float
-    body_bytes_per_second: int
+    head_seconds: float = HEAD_SECONDS
+    body_bytes_per_second: int = BODY_BYTES_PER_SECOND
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
     """Networks whose connections are not limited per address."""
 
@@ -91,9 +93,7 @@ class ConnectionLimits:
         return cls(
             total,
             settings.max_connections_per_address,
-            settings.request_head_seconds,
-            settings.min_body_bytes_per_second,
-            tuple(map(ip_network, settings.proxy_addresses)),
+            trusted_proxies=tuple(map(ip_network, settings.proxy_addresses)),
         )
 
     def of_address(self, address: str) -> int:
@@ -296,7 +296,7 @@ class LimitedProtocol(H11Protocol):
                     RequestTimeout(
                         "request_too_slow",
                         "The head of the request was not received within "
-                        f"{limits.head_seconds:g} seconds (REQUEST_HEAD_SECONDS).",
+                        f"{limits.head_seconds:g} seconds.",
                     )
                 )
             else:
@@ -311,8 +311,8 @@ class LimitedProtocol(H11Protocol):
                         "request_too_slow",
                         "The body was received at "
                         f"{self._window_bytes / (now - self._window_since):.0f} bytes per second; "
-                        f"at least {limits.body_bytes_per_second} are required "
-                        "(MIN_BODY_BYTES_PER_SECOND). Send the request again.",
+                        f"at least {limits.body_bytes_per_second} are required. "
+                        "Send the request again.",
                     )
                 )
             else:

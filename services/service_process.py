@@ -21,6 +21,8 @@ from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
+SCHEMA_WAIT_SECONDS = 60.0  # that a starting service gives the catalog and `placewise migrate`
+
 RunUntilStopped = Callable[[threading.Event], None]
 """Runs until the event is set."""
 
@@ -44,7 +46,7 @@ def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
         configure_tracing(settings, name),
         contextlib.closing(open_catalog(settings, name)) as catalog,
     ):
-        wait_for_schema(catalog, settings.schema_wait_seconds)
+        wait_for_schema(catalog, SCHEMA_WAIT_SECONDS)
         yield catalog
 
 

@@ -39,7 +39,7 @@ from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
 from shared.catalog.database.schema import migrate, sqlite_file
-from shared.catalog.database.session import Catalog, TransactionTimeouts
+from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
@@ -151,11 +151,11 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             with catalog.write() as session:
                 delete_dead_search_workers(session, all_workers=True)
                 delete_processes(session, "extractor")
-            release_expired_leases(catalog, settings.max_attempts, all_leases=True)
+            release_expired_leases(catalog, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
-        requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
+        requests = catalog.with_timeouts(REQUEST_TIMEOUTS)
         authenticator, first_admin_key, local_key = _create_authenticator(settings, host, requests)
         url = reachable_url(host, port)
         stack.enter_context(announce_server(home, url, local_key))

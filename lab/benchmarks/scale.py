@@ -18,6 +18,7 @@ from typing import Any
 
 from lab.benchmarks.search.growth import make_scan
 from services.cli.output import Table
+from services.search.worker import FOLLOW_SECONDS
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.search_api.client import MAX_CONCURRENT_CALLS
@@ -27,7 +28,6 @@ PHOTOS = (10_000, 1_000_000, 100_000_000)
 WIDTHS = (14_336, 98_304)
 WIDTH_INPUTS = ("gpu_photos_per_second", "pipeline_cpu_seconds")
 MEASURED_CODES = 1_000_000  # 512 MB: larger than any CPU cache
-SETTINGS = ("slot_rows", "search_follow_seconds")
 FUNCTIONS = {"__builtins__": {}, "min": min, "max": max, "ceil": math.ceil}
 
 Rows = list[list[str]]
@@ -62,7 +62,8 @@ class Sizing:
     def evaluate(self, photos: int, dimensions: int) -> tuple[dict[str, float], dict[str, float]]:
         """Return the plan by name, and by description the numbers of photos of the limits."""
         values: dict[str, Any] = {**self.inputs, "photos": photos, "dimensions": dimensions}
-        values |= {name: Settings.model_fields[name].default for name in SETTINGS}
+        values["slot_rows"] = Settings.model_fields["slot_rows"].default
+        values["search_follow_seconds"] = FOLLOW_SECONDS
         values["max_concurrent_calls"] = MAX_CONCURRENT_CALLS
         for name in WIDTH_INPUTS:
             values[name] = self.inputs[f"{name}_{dimensions}"]

@@ -49,6 +49,8 @@ from shared.storage.keys import new_model_key
 
 log = logging.getLogger(__name__)
 
+MODEL_CACHE_BYTES = 10_000_000_000
+
 
 class ModelFileCache:
     """Least-recently-used cache of model files on this machine; processes may share its folder."""
@@ -125,9 +127,7 @@ class AddedModelLoader:
 
     def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
-        self._cache = ModelFileCache(
-            store, model_cache_folder(settings), settings.model_cache_bytes
-        )
+        self._cache = ModelFileCache(store, model_cache_folder(settings), MODEL_CACHE_BYTES)
 
     def load(self, name: str, device: torch.device) -> TrainedBackbone:
         """Load the model `name` onto the device.

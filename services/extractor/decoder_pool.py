@@ -34,6 +34,8 @@ POOL_POLL_SECONDS = 1.0  # interval at which a waiting batch checks that the poo
 # a query's photo, which comes from another thread, would wait for the whole batch.
 SCHEDULED_PER_PROCESS = 2
 
+DECODE_TIMEOUT_SECONDS = 30.0
+
 # A process may be killed for other reasons than its photo, so each photo gets a second attempt.
 MAX_DECODE_ATTEMPTS = 2
 
@@ -43,8 +45,10 @@ Decode = Callable[[bytes], DecodedPhoto]
 class DecoderPool:
     """Decodes photos in parallel processes; results are in the order of the photos."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, timeout_seconds: float = DECODE_TIMEOUT_SECONDS) -> None:
+        """Start the processes; a photo that takes longer than the timeout is refused."""
         self._settings = settings
+        self._timeout_seconds = timeout_seconds
         self._restart_lock = threading.Lock()
         self._pool = self._start_pool()
 
@@ -96,8 +100,7 @@ class DecoderPool:
 
     def _schedule(self, data: bytes, decode: Decode) -> ProcessFuture[DecodedPhoto]:
         try:
-            timeout = self._settings.decode_timeout_seconds
-            return self._pool.schedule(decode, args=[data], timeout=timeout)
+            return self._pool.schedule(decode, args=[data], timeout=self._timeout_seconds)
         except RuntimeError as error:  # raised by pebble when the pool is not running
             raise _pool_broken_error() from error
 
@@ -114,8 +117,7 @@ class DecoderPool:
             except TimedOut:
                 return Unprocessable(
                     "undecodable_photo",
-                    "The photo could not be decoded within "
-                    f"{self._settings.decode_timeout_seconds:g} s.",
+                    f"The photo could not be decoded within {self._timeout_seconds:g} s.",
                 )
             except (ProcessExpired, MemoryError) as error:
                 if attempt == MAX_DECODE_ATTEMPTS:

@@ -23,7 +23,12 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
+from shared.jobs.celery_wakeups import (
+    DRAIN_SECONDS,
+    DRAIN_TASK,
+    CeleryWakeups,
+    create_celery_app,
+)
 from shared.jobs.wakeups import WakeupQueue
 from shared.storage import ObjectStore
 from shared.telemetry.heartbeat import Heartbeat
@@ -55,7 +60,7 @@ def _run_celery_worker(
     stop = threading.Event()
 
     def drain() -> dict[str, Any]:
-        result = worker.drain_once(stop, settings.drain_seconds)
+        result = worker.drain_once(stop, DRAIN_SECONDS)
         if result is None:
             result = DrainStats(interrupted=True)
         if result.interrupted and not stop.is_set():

@@ -43,24 +43,21 @@ MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
 MAX_SMOOTHED_TRACKS = 2  # at the same time: each competes with all other requests for the CPU
-MAX_SMOOTHED_TRACKS_PER_CALLER = 1
 SMOOTHING_RETRY_SECONDS = 2
 
 
 class _ConcurrencyLimit:
     """Limits concurrent requests of one kind. Must be used on the event loop only."""
 
-    def __init__(
-        self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
-    ) -> None:
-        """Create the limit for all callers together, and for one API key or client address.
+    def __init__(self, what: str, code: str, *, total: int, retry_after_seconds: int) -> None:
+        """Create the limit for all callers together; one API key or address may use half of it.
 
-        `what` names the requests, and the settings of both limits, in error messages with `code`.
+        `what` names the requests, and the setting of the limit, in error messages with `code`.
         """
         self._what = what
         self._code = code
         self._total = total
-        self._per_caller = per_caller
+        self._per_caller = _half(total)
         self._retry_after_seconds = retry_after_seconds
         self._count_by_caller: Counter[str] = Counter()
         self.count = 0
@@ -98,6 +95,11 @@ class _ConcurrencyLimit:
         )
 
 
+def _half(limit: int) -> int:
+    """The part of a limit that one caller or one map may use."""
+    return math.ceil(limit / 2)
+
+
 def _callers(request: Request) -> list[str]:
     """The request's key and address. ADMIN_KEY has no key id, so it is counted by address only."""
     key_id = get_caller(request).key_id
@@ -128,26 +130,23 @@ class AdmissionControl:
         self._admitted_lock = threading.Lock()
         self._active_uploads = {
             kind: _ConcurrencyLimit(
-                f"{kind} (MAX_CONCURRENT_UPLOADS, MAX_CONCURRENT_UPLOADS_PER_CALLER)",
+                f"{kind} (MAX_CONCURRENT_UPLOADS)",
                 "too_many_uploads",
                 total=settings.max_concurrent_uploads,
-                per_caller=settings.max_concurrent_uploads_per_caller,
                 retry_after_seconds=UPLOAD_RETRY_SECONDS,
             )
             for kind in UploadKind
         }
         self.event_streams = _ConcurrencyLimit(
-            "event streams (MAX_EVENT_STREAMS, MAX_EVENT_STREAMS_PER_CALLER)",
+            "event streams (MAX_EVENT_STREAMS)",
             "too_many_event_streams",
             total=settings.max_event_streams,
-            per_caller=settings.max_event_streams_per_caller,
             retry_after_seconds=STREAM_RETRY_SECONDS,
         )
         self.smoothed_tracks = _ConcurrencyLimit(
             "requests for smoothed tracks",
             "too_many_smoothed_tracks",
             total=MAX_SMOOTHED_TRACKS,
-            per_caller=MAX_SMOOTHED_TRACKS_PER_CALLER,
             retry_after_seconds=SMOOTHING_RETRY_SECONDS,
         )
 
@@ -166,7 +165,7 @@ class AdmissionControl:
                 (
                     f" of the map {map_name!r}",
                     depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
-                    settings.max_queued_jobs_per_map,
+                    _half(settings.max_queued_jobs),
                 ),
             ):
                 if queued >= limit:

@@ -33,6 +33,7 @@ from shared.jobs import Job, Wakeups
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
 
+MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
 CHANGE_POLL_SECONDS = 0.25  # poll interval while a request waits for a change of a job
 POLL_COST_DIVISOR = 10  # polling takes at most one tenth of the time: slow polls become rare
@@ -343,10 +344,10 @@ FrameId = Annotated[UUID, _uuid_or_not_found("frame")]
 WebhookId = Annotated[UUID, _uuid_or_not_found("webhook")]
 
 
-def parse_prefer_wait(request: Request, max_seconds: int) -> float:
-    """Seconds from `Prefer: wait=N` (RFC 7240), at most `max_seconds`; 0 without the header."""
+def parse_prefer_wait(request: Request) -> float:
+    """Seconds from `Prefer: wait=N` (RFC 7240), at most MAX_WAIT_SECONDS; 0 without the header."""
     match = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d+)", request.headers.get("prefer", ""))
-    return min(float(match[1]), max_seconds) if match else 0.0
+    return min(float(match[1]), MAX_WAIT_SECONDS) if match else 0.0
 
 
 def load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job:

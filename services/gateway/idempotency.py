@@ -53,6 +53,7 @@ from shared.storage import ObjectStore
 IDEMPOTENCY_HEADER = "Idempotency-Key"
 REPLAYED_HEADER = "Idempotent-Replayed"
 IDEMPOTENCY_KEY_PATTERN = r"[!-~]{1,255}"
+KEY_SECONDS = 86_400.0  # for which a key is remembered
 LEASE_SECONDS = 30.0  # longer than it takes to execute a received request and commit
 UNSTORED_STATUSES = (401, 403, 408, 429)
 
@@ -146,13 +147,12 @@ class IdempotentRequest:
                 json.dumps(fingerprinted, sort_keys=True).encode()
             ).hexdigest(),
         )
-        life = self._gateway.settings.idempotency_key_seconds
         with self._gateway.catalog.write() as session:
             claimed = claim_idempotency_key(
                 session,
                 identity,
                 lease_seconds=LEASE_SECONDS,
-                life_seconds=min(life, life_seconds or life),
+                life_seconds=min(KEY_SECONDS, life_seconds or KEY_SECONDS),
             )
         if isinstance(claimed, StoredResponse):
             raise IdempotentReplay(claimed)

@@ -41,8 +41,6 @@ class SecurityHeadersMiddleware:
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app = app
         self._headers = dict(SECURITY_HEADERS)
-        if settings.hsts_seconds:
-            self._headers["Strict-Transport-Security"] = f"max-age={settings.hsts_seconds}"
         if settings.allowed_origins:
             # CORS decides which origins may read; this header must not block them earlier.
             self._headers["Cross-Origin-Resource-Policy"] = "cross-origin"

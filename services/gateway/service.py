@@ -11,7 +11,7 @@ from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
 from services.service_process import Announce, service_process
 from shared.catalog.api_keys import has_admin_key
-from shared.catalog.database.session import Catalog, TransactionTimeouts
+from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import open_installation_store
 from shared.catalog.maps import get_or_create_default_map
@@ -44,7 +44,7 @@ def serve_gateway(settings: Settings, announce: Announce) -> None:
                 session, settings.new_map_extractor, RowType(settings.descriptor_rows)
             )
         store = open_installation_store(catalog, settings, exclusive=False)
-        requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
+        requests = catalog.with_timeouts(REQUEST_TIMEOUTS)
         keys = ApiKeyAuthenticator(requests, *admin_key_hashes)
         authenticator = with_proxy_sign_in(keys, settings)
         context = GatewayContext(requests, store, wakeups, search, settings, authenticator)

@@ -145,6 +145,7 @@ def _unreadable_error(object_key: str) -> Unavailable:
     )
 
 
+FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
 FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
@@ -206,7 +207,7 @@ class SearchWorker:
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
                 log.error("sync failed, loaded snapshots go on serving queries: %s", error)
-            poll.wait(stop, self._settings.search_follow_seconds)
+            poll.wait(stop, FOLLOW_SECONDS)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Sync every generation of these states to its map's version; drop deleted generations."""

@@ -128,9 +128,7 @@ class Scheduler:
             PeriodicTask(
                 "free leases",
                 1.0,
-                lambda: metrics.leases_expired.inc(
-                    release_expired_leases(catalog, settings.max_attempts)
-                ),
+                lambda: metrics.leases_expired.inc(release_expired_leases(catalog)),
             ),
             PeriodicTask(
                 "resend hints",
@@ -168,7 +166,7 @@ class Scheduler:
                 "compact",
                 5.0,
                 lambda: metrics.slots_merged.inc(
-                    merge_small_chunks(catalog, store, settings.compact_chunks, merge_retries)
+                    merge_small_chunks(catalog, store, retries=merge_retries)
                 ),
                 own_thread=True,
             ),

@@ -27,7 +27,12 @@ from shared.catalog import (  # noqa: F401
     webhooks,
 )
 from shared.catalog.database.base import Base
-from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.database.session import (
+    BACKGROUND_TIMEOUTS,
+    Catalog,
+    PoolConfig,
+    TransactionTimeouts,
+)
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 
@@ -41,23 +46,18 @@ class SchemaCompatibility(Base):
 
 
 def open_catalog(
-    settings: Settings, service: str, limits: TransactionTimeouts | None = None
+    settings: Settings, service: str, limits: TransactionTimeouts = BACKGROUND_TIMEOUTS
 ) -> Catalog:
     """Open the catalog of the settings.
 
     Args:
         service: Name of the service, for `pg_stat_activity`.
-        limits: Timeouts; by default those of background work.
 
     Raises:
         Misconfigured: `bad_setting`, if DATABASE_URL is malformed.
     """
     try:
-        return Catalog(
-            settings.catalog_url(),
-            PoolConfig.from_settings(settings, service),
-            TransactionTimeouts.for_background(settings) if limits is None else limits,
-        )
+        return Catalog(settings.catalog_url(), PoolConfig.from_settings(settings, service), limits)
     except (ArgumentError, ValueError):  # its text may contain a part of the password
         raise Misconfigured(
             "bad_setting",

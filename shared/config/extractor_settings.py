@@ -67,28 +67,13 @@ class ExtractorSettings(BaseSettings):
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's, downloaded "
         "from the Hugging Face hub",
     )
-    model_cache_bytes: Size = Field(
-        10_000_000_000,
-        ge=0,
-        description="size of an extractor's cache of models fetched from a bucket, under "
-        "PLACEWISE_HOME; the least recently used model is evicted first",
-    )
     batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
     decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
     decode_memory_bytes: Size = Field(
         2_000_000_000, ge=500_000_000, description="memory limit of one decoding process, bytes"
     )
-    decode_timeout_seconds: float = Field(
-        30.0, gt=0, description="timeout for decoding one photo, seconds"
-    )
     batch_ahead_photos: int = Field(
         500, ge=1, description="queued photos at which batch uploads wait for the extractors"
-    )
-    descriptor_cache_bytes: Size = Field(
-        20_000_000_000,
-        ge=0,
-        description="size of the descriptor cache of `evaluate` and `compare`, in "
-        "PLACEWISE_HOME/descriptors",
     )
     pool_without_vocabulary: bool = Field(
         True,

@@ -31,12 +31,6 @@ class GatewaySettings(BaseSettings):
         description="origins whose pages may call the API (CORS), separated by commas: "
         "https://maps.example.com; unset: none",
     )
-    hsts_seconds: int = Field(
-        0,
-        ge=0,
-        description="max-age of Strict-Transport-Security; 0: the header is not sent. Set it only "
-        "for servers that are reached over HTTPS",
-    )
 
     # Limits against slow and against many clients, for every HTTP server of Placewise.
     max_connections: int = Field(
@@ -72,20 +66,11 @@ class GatewaySettings(BaseSettings):
         description="scopes of the groups of signed-in users, separated by commas; `*` is every "
         "user: *:read, editors:write, vpr-admins:admin",
     )
-    request_head_seconds: float = Field(
-        20.0, gt=0, description="timeout for receiving the head of a request"
-    )
-    min_body_bytes_per_second: int = Field(
-        1000,
-        ge=0,
-        description="minimum rate at which a request body must arrive, measured over 10 seconds; "
-        "0: no limit",
-    )
     max_event_streams: int = Field(
-        500, ge=0, description="open event streams (GET /jobs/ID/events) of one gateway"
-    )
-    max_event_streams_per_caller: int = Field(
-        100, ge=0, description="open event streams of one key, and of one address"
+        500,
+        ge=0,
+        description="open event streams (GET /jobs/ID/events) of one gateway; one key or address "
+        "may have half of them",
     )
 
     # Rate limit and quotas of keys that have none of their own. ADMIN_KEY is not limited.
@@ -139,27 +124,19 @@ class GatewaySettings(BaseSettings):
         "imports/",
         description="key prefix of the objects that a batch may import from the object store",
     )
-    max_vocabulary_bytes: Size = Field(
-        64_000_000, gt=0, description="maximum bytes of an imported vocabulary"
-    )
     max_model_bytes: Size = Field(
         2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
     )
     presign_seconds: int = Field(
         900, ge=1, le=604_800, description="time to send and complete a presigned upload, seconds"
     )
-    max_wait_seconds: int = Field(
-        60, ge=0, description="maximum of `Prefer: wait` and `?wait=`, seconds"
-    )
 
     # Backpressure: requests are rejected before a queue or a disk fills up.
     max_queued_jobs: int = Field(
         200_000,
         ge=1,
-        description="queued jobs at which requests that create further jobs are rejected",
-    )
-    max_queued_jobs_per_map: int = Field(
-        100_000, ge=1, description="queued jobs of one map at which such requests are rejected"
+        description="queued jobs at which requests that create further jobs are rejected; one map "
+        "may have half of them",
     )
     max_queued_queries: int = Field(
         1000, ge=1, description="maximum queued query photos; uploads do not count"
@@ -167,20 +144,14 @@ class GatewaySettings(BaseSettings):
     max_concurrent_uploads: int = Field(
         32,
         ge=1,
-        description="files that one gateway receives at the same time; the same number of query "
-        "photos is allowed in addition",
-    )
-    max_concurrent_uploads_per_caller: int = Field(
-        16, ge=1, description="concurrent uploads of one key, and of one address"
+        description="files that one gateway receives at the same time, half of them from one key "
+        "or address; the same number of query photos is allowed in addition",
     )
     min_free_bytes: Size = Field(
         500_000_000,
         ge=0,
         description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads and "
         "tracks are rejected and batches wait; query photos are rejected below a tenth of it",
-    )
-    idempotency_key_seconds: float = Field(
-        86_400.0, gt=0, description="time for which an Idempotency-Key is remembered, seconds"
     )
 
     # Comparison of query and results (`rerank`, `explain`).

@@ -38,9 +38,6 @@ class SearchSettings(BaseSettings):
         description="rank by visual word weights where a map has them, and learn them for maps "
         "with a vocabulary of their own",
     )
-    search_follow_seconds: float = Field(
-        1.0, gt=0, description="interval at which search polls the catalog for changes, seconds"
-    )
     search_wait_seconds: float = Field(
         5.0, gt=0, description="maximum wait for `min_version`, seconds"
     )

@@ -26,7 +26,6 @@ from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
 from shared.config.shards import Shard
 from shared.config.storage_settings import StorageSettings
-from shared.config.values import Size
 from shared.errors import Misconfigured
 
 # Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.
@@ -63,10 +62,6 @@ class ServiceSettings(BaseSettings):
         description="file of the log of one service, beside stderr; services on one machine need "
         "different files; unset: stderr only",
     )
-    log_file_size: Size = Field(
-        10_000_000, gt=0, description="bytes at which LOG_FILE is rotated: renamed to LOG_FILE.1"
-    )
-    log_files: int = Field(5, ge=1, description="rotated log files that are kept")
     metrics_port: int | None = Field(
         None,
         ge=0,
@@ -98,18 +93,6 @@ class JobSettings(BaseSettings):
         60.0,
         gt=0,
         description="time without a renewal after which a job's lease expires, seconds",
-    )
-    drain_seconds: float = Field(
-        10.0, gt=0, description="time that a worker spends on jobs for one notification, seconds"
-    )
-    visibility_seconds: int = Field(
-        900,
-        ge=60,
-        description="Redis visibility timeout: an unacknowledged notification is delivered again "
-        "after this time, seconds",
-    )
-    max_attempts: int = Field(
-        3, ge=1, description="crashes of a job that runs alone before it is failed"
     )
     query_ttl_seconds: float = Field(
         3600.0, gt=0, description="retention of a query photo that is not stored, seconds"

@@ -37,30 +37,6 @@ class StorageSettings(BaseSettings):
     database_pool_size: int = Field(
         10, ge=1, le=1000, description="size of a process's connection pool"
     )
-    database_pool_overflow: int = Field(
-        20, ge=0, le=1000, description="further connections that may be opened under load"
-    )
-    database_pool_wait_seconds: float = Field(
-        3.0, gt=0, description="timeout for a free connection of the pool, seconds"
-    )
-    database_connect_seconds: float = Field(
-        3.0, ge=2, description="connect timeout for each address of the database host, seconds"
-    )
-    database_statement_seconds: float = Field(
-        5.0, gt=0, description="statement timeout of HTTP requests, seconds"
-    )
-    database_lock_seconds: float = Field(
-        3.0, gt=0, description="lock timeout of HTTP requests, seconds"
-    )
-    database_work_seconds: float = Field(
-        60.0, gt=0, description="statement timeout of extractors, search and the steward, seconds"
-    )
-    schema_wait_seconds: float = Field(
-        60.0,
-        ge=0,
-        description="time that a starting service waits for the catalog and for "
-        "`placewise migrate`, seconds",
-    )
 
     # Object store in a bucket of an S3 server instead of PLACEWISE_HOME.
     s3_endpoint: str | None = Field(
@@ -84,15 +60,6 @@ class StorageSettings(BaseSettings):
 
     # Compaction and garbage collection.
     slot_rows: int = Field(1000, ge=2, description="rows of a sealed chunk")
-    compact_chunks: int = Field(
-        8, ge=2, description="new chunks of an open slot that trigger a compaction"
-    )
-    superseded_grace_seconds: float = Field(
-        600.0, ge=0, description="time after which a compacted chunk is deleted, seconds"
-    )
-    retired_grace_seconds: float = Field(
-        3600.0, ge=0, description="time after which a replaced generation is deleted, seconds"
-    )
     orphan_age_seconds: float = Field(
         86_400.0,
         ge=0,

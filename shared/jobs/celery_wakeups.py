@@ -27,6 +27,8 @@ from shared.jobs.wakeups import WakeupQueue
 log = logging.getLogger(__name__)
 
 DRAIN_TASK = "placewise.drain"
+DRAIN_SECONDS = 10.0  # that a worker spends on jobs for one message, beside the last batch
+VISIBILITY_SECONDS = 900  # after which an unacknowledged message is delivered again
 
 # Interval of the search for unacknowledged messages of dead workers; kombu's defaults (10 s, every
 # tenth time) would make it 100 s.
@@ -38,7 +40,7 @@ def create_celery_app(settings: Settings) -> Celery:
     """Create the Celery application for senders and workers.
 
     It uses JSON only and no result backend. A message is acknowledged after its drain, so the
-    message of a killed worker is delivered again after `visibility_seconds`, which is longer than
+    message of a killed worker is delivered again after VISIBILITY_SECONDS, which is longer than
     any drain.
 
     Raises:
@@ -67,7 +69,7 @@ def create_celery_app(settings: Settings) -> Celery:
         task_send_sent_event=False,
         worker_send_task_events=True,  # Flower's view
         worker_cancel_long_running_tasks_on_connection_loss=False,  # drains are short and fenced
-        worker_soft_shutdown_timeout=settings.drain_seconds,
+        worker_soft_shutdown_timeout=DRAIN_SECONDS,
         worker_enable_soft_shutdown_on_idle=True,
         worker_hijack_root_logger=False,
         worker_redirect_stdouts=False,
@@ -76,7 +78,7 @@ def create_celery_app(settings: Settings) -> Celery:
         broker_connection_timeout=BROKER_TIMEOUT_SECONDS,
         broker_pool_acquire_timeout=BROKER_TIMEOUT_SECONDS,
         broker_transport_options={
-            "visibility_timeout": settings.visibility_seconds,
+            "visibility_timeout": VISIBILITY_SECONDS,
             "unacked_restore_interval": UNACKED_RESTORE_SECONDS,
             "unacked_restore_throttle": 1,
             "queue_order_strategy": "priority",  # in the order of `task_queues`: queries first

@@ -50,6 +50,7 @@ from shared.telemetry.tracing import request_id_context, span
 
 log = logging.getLogger(__name__)
 
+MAX_ATTEMPTS = 3  # crashes of a job that runs alone, before it fails
 IDLE_POLL_SECONDS = 0.5  # the delay that a lost wakeup costs
 UNAVAILABLE_RETRY_SECONDS = 2.0  # while the store, the search tier or the catalog is unavailable
 REFUSED_RETRY_SECONDS = 15.0  # retry delay of photos that need an operator (say, missing weights)
@@ -95,7 +96,7 @@ class JobRunner:
 
     Attributes:
         catalog: The catalog.
-        settings: LEASE_SECONDS and MAX_ATTEMPTS.
+        settings: LEASE_SECONDS.
         worker: Name of the worker, stored with its jobs.
         kinds: Kinds of jobs that the worker runs.
         on_outcome: Called with kind, outcome and number of jobs after each step, for metrics.
@@ -233,12 +234,9 @@ class JobRunner:
             except Exception as error:
                 outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
                 log.exception("%s: crashed", jobs)
-                max_attempts = self.settings.max_attempts
                 self._update(
                     claimed,
-                    lambda session, job: _retry_after_crash(
-                        session, job, max_attempts, together, event
-                    ),
+                    lambda session, job: _retry_after_crash(session, job, together, event),
                 )
             self.on_outcome(claimed.kind, outcome, together)
 
@@ -253,13 +251,11 @@ class JobRunner:
         return jobs
 
 
-def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: bool = False) -> int:
-    """Return the jobs of dead workers to the queue, or fail them after `max_attempts`.
+def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> int:
+    """Return the jobs of dead workers to the queue, or fail them after MAX_ATTEMPTS.
 
     Args:
         session: The session of a write transaction.
-        max_attempts: Number of crashes after which a job that ran alone fails. A job that was in a
-            batch of several is marked `alone` instead, because another one may be the cause.
         all_leases: Reclaim also leases that have not expired, for a process that knows that no
             other worker runs.
 
@@ -271,22 +267,20 @@ def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: b
         expired = expired.where(Job.lease_until < db_now())
     jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
     for job in jobs:
-        _retry_after_crash(session, job, max_attempts, job.claimed_together, "died")
+        _retry_after_crash(session, job, job.claimed_together, "died")
     return len(jobs)
 
 
-def _retry_after_crash(
-    session: Session, job: Job, max_attempts: int, together: int, event: str
-) -> None:
+def _retry_after_crash(session: Session, job: Job, together: int, event: str) -> None:
     """Retry or fail a job whose worker died or raised an exception (`event`).
 
     A job that ran `together` with others is retried alone without counting an attempt, to isolate
-    the job that crashed the worker. A job that ran alone fails after `max_attempts`. A job that had
+    the job that crashed the worker. A job that ran alone fails after MAX_ATTEMPTS. A job that had
     not started (0) can't be the cause.
     """
     job.attempts += together == 1
     # An upload batch continues without the photo that may be the cause: see BatchWorker.
-    if together == 1 and job.attempts >= max_attempts and not has_batch_items(job):
+    if together == 1 and job.attempts >= MAX_ATTEMPTS and not has_batch_items(job):
         error = PlacewiseError(
             "worker_crashed",
             f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "

@@ -24,6 +24,8 @@ from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("lab", "services", "shared")
+LOG_FILE_BYTES = 10_000_000  # at which LOG_FILE is renamed to LOG_FILE.1
+ROTATED_LOG_FILES = 5
 # Third-party loggers, limited to warnings.
 QUIET_LOGGERS = (
     "alembic",
@@ -151,7 +153,7 @@ def configure_logging(
         stderr.setLevel(logging.WARNING)
     handlers: list[logging.Handler] = [stderr]
     if to_file and settings.log_file is not None:
-        handlers.append(_open_log_file(settings, settings.log_file))
+        handlers.append(_open_log_file(settings.log_file))
     for handler in handlers:
         handler.addFilter(_ContextFilter(service))
         handler.setFormatter(
@@ -169,11 +171,11 @@ def configure_logging(
         logging.getLogger(name).setLevel(logging.WARNING)
 
 
-def _open_log_file(settings: Settings, file: Path) -> logging.Handler:
+def _open_log_file(file: Path) -> logging.Handler:
     try:
         make_private_folder(file.parent)
         return _PrivateRotatingFileHandler(
-            file, maxBytes=settings.log_file_size, backupCount=settings.log_files, encoding="utf-8"
+            file, maxBytes=LOG_FILE_BYTES, backupCount=ROTATED_LOG_FILES, encoding="utf-8"
         )
     except OSError as error:
         raise Misconfigured("bad_setting", f"LOG_FILE={file}: {error.strerror}") from None

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from services.http_server import SHUTDOWN_GRACE_SECONDS
-from shared.config.settings import Settings
+from shared.jobs.celery_wakeups import DRAIN_SECONDS
 from tests.deploy.composition import (
     EMBEDDED,
     PROFILES,
@@ -261,11 +261,9 @@ def test_the_servers_are_on_a_network_that_leads_nowhere(everything: dict[str, J
 
 def test_an_extractor_has_time_to_end_its_drain(everything: dict[str, Json]) -> None:
     for name in ("extractor", "extractor-gpu"):
-        drain_seconds = float(everything[name]["environment"]["DRAIN_SECONDS"])
-        assert seconds(everything[name]["stop_grace_period"]) > drain_seconds + 60
+        assert seconds(everything[name]["stop_grace_period"]) > DRAIN_SECONDS + 60
         # Nor may a drain be taken for a standstill.
-        assert float(everything[name]["healthcheck"]["test"][-1]) > 10 * drain_seconds
-        assert drain_seconds == Settings().drain_seconds
+        assert float(everything[name]["healthcheck"]["test"][-1]) > 10 * DRAIN_SECONDS
     for name in ("gateway", "search-0", "search-1"):
         assert seconds(everything[name]["stop_grace_period"]) > 2 * SHUTDOWN_GRACE_SECONDS
 

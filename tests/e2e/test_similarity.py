@@ -19,10 +19,7 @@ PLACES = 8
 AT_ONCE = 25
 
 # None of them is to be turned away because others are on their way.
-SETTINGS = {
-    "max_concurrent_uploads": 2 * AT_ONCE,
-    "max_concurrent_uploads_per_caller": 2 * AT_ONCE,
-}
+SETTINGS = {"max_concurrent_uploads": 4 * AT_ONCE}
 SIMILARITY = "/api/v1/similarity"
 ANSWER_FIELDS = {
     "query_file_id",

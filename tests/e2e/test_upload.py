@@ -29,8 +29,8 @@ UPLOAD = "/api/v1/upload"
 AT_ONCE = 50
 SETTINGS = {
     "max_file_size": MAX_FILE_SIZE,
-    "max_concurrent_uploads_per_caller": AT_ONCE,
-    "max_concurrent_uploads": AT_ONCE,  # none is to be turned away because others are on their way
+    # None is to be turned away because others are on their way: one caller may use half of them.
+    "max_concurrent_uploads": 2 * AT_ONCE,
 }
 ANSWER_FIELDS = {
     "file_id",

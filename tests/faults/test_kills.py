@@ -61,7 +61,7 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
     tmp_path: Path,
 ) -> None:
     moments = random.Random(20_261_121)
-    with ServerProcess(tmp_path / "home", batch_photos=8, compact_chunks=3) as server:
+    with ServerProcess(tmp_path / "home", batch_photos=3) as server:
         uploader = Uploader(server)
         uploader.start()
         for kill in range(1, KILLS + 1):

@@ -13,7 +13,6 @@ from pathlib import Path
 import psutil
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import problem
 from tests.support.server import ServerProcess
 
 ADMIN_KEY = "the-admin-key-of-slow-clients"
@@ -54,9 +53,7 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
         max_connections=100,
         max_connections_per_address=60,
         max_concurrent_uploads=8,
-        max_concurrent_uploads_per_caller=4,
-        max_event_streams=STREAMS,
-        max_event_streams_per_caller=STREAMS - 1,
+        max_event_streams=2 * (STREAMS - 1),
     )
     with server, contextlib.ExitStack() as held:
         psutil.Process(server.process.pid).rlimit(psutil.RLIMIT_NOFILE, (FILES, FILES))
@@ -76,8 +73,7 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
             assert server.client.get("/api/v1/maps").status_code == 200
             assert server.upload(photo_bytes(10 + number)).status_code == 202
         with server.client.stream("GET", f"{job['status_url']}/events") as last:
-            assert last.status_code == 200, "another address still gets the last place"
-            problem(server.client.get(f"{job['status_url']}/events"), 429, "too_many_event_streams")
+            assert last.status_code == 200, "another address still gets a place"
         refusals = sorted(body.recv(65536).split()[1] for body in bodies)
         assert refusals == 4 * [b"408"] + 4 * [b"429"], "half of the places, and not for long"
         text = server.client.get("/metrics").text

@@ -141,7 +141,7 @@ class Workplace:
         for job_id in jobs:
             set_columns(self.catalog, job_id, lease_until=None)
         with self.catalog.write() as session:
-            reclaim_expired_leases(session, self.settings.max_attempts, all_leases=True)
+            reclaim_expired_leases(session, all_leases=True)
 
     # --- what can be seen ---
 

@@ -11,7 +11,7 @@ import pytest
 
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.telemetry.logs import configure_logging
+from shared.telemetry.logs import LOG_FILE_BYTES, configure_logging
 from shared.telemetry.tracing import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
@@ -157,14 +157,14 @@ def test_a_log_file_gets_the_same_lines_is_rotated_and_private(
     set_up: Set, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "logs" / "gateway.log"
-    set_up(LOG_FILE=str(file), LOG_FILE_SIZE="1000", LOG_FILES="2", LOG_FORMAT="json")
+    set_up(LOG_FILE=str(file), LOG_FORMAT="json")
     for number in range(50):
-        logging.getLogger("services").info("line %d", number)
+        logging.getLogger("services").info("line %d %s", number, "x" * (LOG_FILE_BYTES // 20))
     files = sorted(path.name for path in file.parent.iterdir())
     assert files == ["gateway.log", "gateway.log.1", "gateway.log.2"]
     contents = [(file.parent / name).read_text() for name in reversed(files)]
     assert capsys.readouterr().err.endswith("".join(contents))
-    assert all(len(text) <= 1000 for text in contents)
+    assert all(len(text) <= LOG_FILE_BYTES for text in contents)
     assert all(path.stat().st_mode & 0o077 == 0 for path in (file.parent, *file.parent.iterdir()))
 
 

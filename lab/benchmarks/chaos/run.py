@@ -200,9 +200,7 @@ def run_chaos(
             extractor="test-slow-avg:milliseconds=20,width=256",  # so that a kill finds it at work
             lease_seconds=LEASE_SECONDS,
             batch_photos=8,
-            compact_chunks=3,
             slot_rows=50,
-            superseded_grace_seconds=5,
         ) as fleet,
     ):
         for name, seconds in CLOCK_OFFSETS_SECONDS.items():

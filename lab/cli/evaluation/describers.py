@@ -32,6 +32,7 @@ from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import DECODER
 
 CACHE_FOLDER = "descriptors"
+CACHE_BYTES = 20_000_000_000
 FIT_SAMPLE_PHOTOS = 1000  # same default as for fits on a map
 SEED = 0
 
@@ -171,5 +172,5 @@ def _with_cache(
         describe,
         settings.placewise_home / CACHE_FOLDER,
         spec,
-        max_bytes=settings.descriptor_cache_bytes,
+        max_bytes=CACHE_BYTES,
     )

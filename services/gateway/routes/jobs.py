@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.admission import ADMIT_JOB, AdmissionDep
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import (
+    MAX_WAIT_SECONDS,
     GatewayContext,
     GatewayDep,
     JobId,
@@ -73,7 +74,7 @@ async def read_job_status(
     """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
     job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
     if query.wait and job.state in UNFINISHED_STATES:
-        seconds = min(query.wait, gateway.settings.max_wait_seconds)
+        seconds = min(query.wait, MAX_WAIT_SECONDS)
         job = await wait_for_job(gateway, job_id, seconds) or job
     return JobResponse.of(job, query.map)
 

@@ -42,6 +42,8 @@ from shared.storage.vocabulary_npz import encode_vocabulary_file
 
 router = APIRouter(tags=["model changes"])
 
+MAX_VOCABULARY_BYTES = 64_000_000
+
 
 class FitVocabularyRequest(RequestModel):
     """Options of the fit; the defaults suit most maps."""
@@ -135,7 +137,7 @@ async def start_vocabulary_import(
             request,
             gateway.store,
             lambda _filename: new_vocabulary_key(),
-            gateway.settings.max_vocabulary_bytes,
+            MAX_VOCABULARY_BYTES,
         )
     await idempotent.claim_form(gateway.store, received)
 

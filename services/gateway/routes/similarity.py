@@ -109,7 +109,7 @@ async def search_by_stored_photo(
     if isinstance(result, SimilarityResponse):
         return result
     settings = gateway.settings
-    wait = parse_prefer_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
+    wait = parse_prefer_wait(request) or settings.compare_wait_seconds
     return await _wait_for_result(gateway, response, result, query.map, wait)
 
 
@@ -141,7 +141,7 @@ async def search_by_uploaded_photo(
     job = await run_in_threadpool(
         _queue_query, gateway, query.map, job_id, received, search_params, idempotent
     )
-    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    wait = parse_prefer_wait(request)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
     return await _wait_for_result(gateway, response, job, query.map, wait)

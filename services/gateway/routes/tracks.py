@@ -276,7 +276,7 @@ async def add_track_frame(
     frame = await run_in_threadpool(
         _accept_frame, request, gateway, query.map, track_id, job_id, received, idempotent
     )
-    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    wait = parse_prefer_wait(request)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
     return await _wait_until_applied(gateway, response, query.map, track_id, frame.id, wait)
@@ -300,7 +300,7 @@ async def read_track_frame(
     """Get a frame; 202 while it is pending. `Prefer: wait=N` waits until it is applied."""
     await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
     await run_in_threadpool(apply_pending_frames, gateway, track_id, APPLY_SECONDS)
-    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    wait = parse_prefer_wait(request)
     return await _wait_until_applied(gateway, response, query.map, track_id, frame_id, wait)
 
 

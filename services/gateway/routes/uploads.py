@@ -174,7 +174,7 @@ async def respond_to_upload(
     within the wait, to store it for repetitions of the request.
     """
     job = stored.job
-    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    wait = parse_prefer_wait(request)
     if wait and job is not None and job.state != JobState.SUCCEEDED:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
         job = await wait_for_job(gateway, job.id, wait) or job

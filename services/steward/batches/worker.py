@@ -64,7 +64,7 @@ from shared.ingest.validation import (
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner
+from shared.jobs.runner import IDLE_POLL_SECONDS, MAX_ATTEMPTS, JobInterrupted, JobRunner
 from shared.jobs.transitions import (
     cancel_batch_items,
     make_waiting_jobs_claimable,
@@ -300,7 +300,7 @@ class BatchWorker:
         deadline = time.monotonic() + SLICE_SECONDS
         if not job.params["listed"]:
             self._list_items(job)
-        elif job.attempts >= self._settings.max_attempts:
+        elif job.attempts >= MAX_ATTEMPTS:
             self._fail_suspect_item(job)
         try:
             while time.monotonic() < deadline and (items := self._next_items(job)):

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 # An open slot of small batches has many merged chunks: they are merged again from this multiple of
 # COMPACT_CHUNKS on, because a search worker holds each chunk as an open file.
+COMPACT_CHUNKS = 8  # new chunks of an open slot that are merged
 MAX_CHUNKS_FACTOR = 4
 
 DEAD_ROW_SAMPLE_SLOTS = 100  # slots whose dead rows one run counts: 100,000 rows, about 0.2 s
@@ -37,7 +38,10 @@ DEAD_ROW_SHARE = 0.2  # of a slot's rows; with more, it is rewritten
 
 
 def merge_small_chunks(
-    catalog: Catalog, store: ObjectStore, compact_chunks: int, retries: ReadRetries | None = None
+    catalog: Catalog,
+    store: ObjectStore,
+    compact_chunks: int = COMPACT_CHUNKS,
+    retries: ReadRetries | None = None,
 ) -> int:
     """Merge every slot that needs it.
 

@@ -43,6 +43,8 @@ from shared.storage.keys import (
 
 T = TypeVar("T")
 
+SUPERSEDED_GRACE_SECONDS = 600.0  # search reads a merged chunk until it has loaded the new one
+RETIRED_GRACE_SECONDS = 3600.0  # the same of a replaced generation, and time to switch back
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
 COMPLETED_UPLOAD_SECONDS = 86_400.0  # retention of a completed presigned upload
 
@@ -296,14 +298,21 @@ def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: J
             store.delete(key)
 
 
-def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+def collect_garbage(
+    catalog: Catalog,
+    store: ObjectStore,
+    settings: Settings,
+    *,
+    superseded_grace_seconds: float = SUPERSEDED_GRACE_SECONDS,
+    retired_grace_seconds: float = RETIRED_GRACE_SECONDS,
+) -> None:
     """Run every collection of this module once, and complete the switch to new generations."""
     settle_photo_jobs(catalog)
     delete_done_reindex_jobs(catalog)
-    collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
-    collect_ended_generations(catalog, store, settings.retired_grace_seconds)
-    collect_whitenings(catalog, store, settings.retired_grace_seconds)
-    collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
+    collect_superseded_chunks(catalog, store, superseded_grace_seconds)
+    collect_ended_generations(catalog, store, retired_grace_seconds)
+    collect_whitenings(catalog, store, retired_grace_seconds)
+    collect_deleted_photos(catalog, store, retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_model_change_files(catalog, store)
     collect_presigned_uploads(catalog, store)

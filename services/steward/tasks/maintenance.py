@@ -34,10 +34,10 @@ from shared.jobs.wakeups import WakeupQueue
 log = logging.getLogger(__name__)
 
 
-def release_expired_leases(catalog: Catalog, max_attempts: int, *, all_leases: bool = False) -> int:
+def release_expired_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
     """Requeue or fail the jobs of dead workers; see `reclaim_expired_leases`."""
     with catalog.write() as session:
-        reclaimed = reclaim_expired_leases(session, max_attempts, all_leases=all_leases)
+        reclaimed = reclaim_expired_leases(session, all_leases=all_leases)
     if reclaimed:
         log.warning("reclaimed %d jobs of workers that died", reclaimed)
     return reclaimed

@@ -37,20 +37,10 @@ PING_AFTER_IDLE_SECONDS = 60.0
 class TransactionTimeouts:
     """Timeouts inside a PostgreSQL transaction; SQLite has none."""
 
-    statement_seconds: float = 60.0
+    statement_seconds: float
     """Statement timeout (SQLSTATE 57014); 0 for none."""
-    lock_seconds: float = 60.0
+    lock_seconds: float
     """Lock timeout (SQLSTATE 55P03)."""
-
-    @classmethod
-    def for_requests(cls, settings: Settings) -> Self:
-        """Return the timeouts for requests, where a client waits for the response."""
-        return cls(settings.database_statement_seconds, settings.database_lock_seconds)
-
-    @classmethod
-    def for_background(cls, settings: Settings) -> Self:
-        """Return the timeouts for background work, where an abort costs more than waiting."""
-        return cls(settings.database_work_seconds, settings.database_work_seconds)
 
     def sql(self) -> str:
         return (
@@ -60,8 +50,12 @@ class TransactionTimeouts:
         )
 
 
+# Where an abort costs more than waiting.
+BACKGROUND_TIMEOUTS = TransactionTimeouts(statement_seconds=60.0, lock_seconds=60.0)
+# Where a client waits for the response.
+REQUEST_TIMEOUTS = TransactionTimeouts(statement_seconds=5.0, lock_seconds=3.0)
 # For statements that read whole tables.
-NO_TIMEOUTS = TransactionTimeouts(statement_seconds=0)
+NO_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=60.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +73,7 @@ class PoolConfig:
 
     @classmethod
     def from_settings(cls, settings: Settings, service: str) -> Self:
-        return cls(
-            name=f"placewise-{service}",
-            size=settings.database_pool_size,
-            overflow=settings.database_pool_overflow,
-            wait_seconds=settings.database_pool_wait_seconds,
-            connect_seconds=settings.database_connect_seconds,
-        )
+        return cls(name=f"placewise-{service}", size=settings.database_pool_size)
 
 
 # A longer wait for SQLite's single write lock is caused by a bug, not by load.
@@ -129,7 +117,7 @@ class Catalog:
         self,
         url: str,
         pool: PoolConfig = PoolConfig(),
-        limits: TransactionTimeouts = TransactionTimeouts(),
+        limits: TransactionTimeouts = BACKGROUND_TIMEOUTS,
     ) -> None:
         self.url = make_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"

@@ -150,7 +150,7 @@ def test_limits_hold_inside_the_transaction_and_leave_nothing_behind(catalog: Ca
 def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
     catalog: Catalog,
 ) -> None:
-    quick = catalog.with_timeouts(TransactionTimeouts(statement_seconds=0.2))
+    quick = catalog.with_timeouts(TransactionTimeouts(statement_seconds=0.2, lock_seconds=60.0))
     with pytest.raises(OperationalError) as caught, quick.read() as session:
         session.execute(text("SELECT pg_sleep(30)"))
     error = to_unavailable(caught.value)

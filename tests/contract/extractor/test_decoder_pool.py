@@ -17,7 +17,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.extractor.decoder_pool import MAX_DECODE_ATTEMPTS, SCHEDULED_PER_PROCESS, DecoderPool
+from services.extractor.decoder_pool import (
+    DECODE_TIMEOUT_SECONDS,
+    MAX_DECODE_ATTEMPTS,
+    SCHEDULED_PER_PROCESS,
+    DecoderPool,
+)
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto
@@ -56,8 +61,11 @@ POISONED = Poisoned(
 
 
 @contextlib.contextmanager
-def pool_with(settings: Settings, **changes: Any) -> Iterator[DecoderPool]:
-    pool = DecoderPool(settings.model_copy(update={"decode_processes": 1, **changes}))
+def pool_with(
+    settings: Settings, timeout_seconds: float = DECODE_TIMEOUT_SECONDS, **changes: Any
+) -> Iterator[DecoderPool]:
+    changed = settings.model_copy(update={"decode_processes": 1, **changes})
+    pool = DecoderPool(changed, timeout_seconds)
     try:
         yield pool
     finally:
@@ -110,7 +118,7 @@ def test_a_jpeg_of_200_megapixels_is_decoded_within_the_memory_limit(
         settings,
         max_image_pixels=limits["max_image_pixels"].default,
         decode_memory_bytes=limits["decode_memory_bytes"].default,
-        decode_timeout_seconds=500.0,
+        timeout_seconds=500.0,
     ) as pool:
         buffer = io.BytesIO()
         stripes = Image.effect_noise((200, 200), 50).resize((20_000, 10_000)).convert("RGB")
@@ -163,7 +171,7 @@ def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> 
 
 
 def test_photo_that_takes_too_long_harms_only_itself(settings: Settings) -> None:
-    with pool_with(settings, decode_timeout_seconds=2.0) as pool:
+    with pool_with(settings, timeout_seconds=2.0) as pool:
         pool.decode([GOOD], POISONED)
         first, poison, last = pool.decode([GOOD, photo_of(HANGS), GOOD], POISONED)
     assert "within 2 s" in refusal(poison)

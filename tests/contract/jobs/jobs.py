@@ -19,7 +19,6 @@ from tests.support.catalog_rows import (
     add_job,
 )
 
-MAX_ATTEMPTS = 3
 PROBLEM = Unprocessable("undecodable_photo", "The photo can't be decoded.").as_problem()
 
 
@@ -50,4 +49,4 @@ def end(catalog: Catalog, jobs: list[Job]) -> list[UUID]:
 
 def free(catalog: Catalog, **options: Any) -> int:
     with catalog.write() as session:
-        return reclaim_expired_leases(session, MAX_ATTEMPTS, **options)
+        return reclaim_expired_leases(session, **options)

@@ -31,11 +31,12 @@ from shared.jobs import (
     reclaim_expired_leases,
 )
 from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import (
     cancel_job,
     release_job,
 )
-from tests.contract.jobs.jobs import MAX_ATTEMPTS, end, free, ids, queue, token_of
+from tests.contract.jobs.jobs import end, free, ids, queue, token_of
 from tests.support.catalog_rows import (
     add_generation,
     add_job,
@@ -338,7 +339,7 @@ def test_a_job_that_had_not_begun_is_not_blamed_for_the_fall(
     for _ in range(5):
         with catalog.write() as session:
             claim_jobs(session, worker="w", limit=1, lease_seconds=60, started=False)
-            assert reclaim_expired_leases(session, max_attempts=3, all_leases=True) == 1
+            assert reclaim_expired_leases(session, all_leases=True) == 1
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
 
@@ -350,5 +351,5 @@ def test_a_job_that_has_begun_may_be_blamed(catalog: Catalog, map_id: UUID) -> N
         assert job.lease_token is not None
         mark_started(session, job.lease_token, 1)
     with catalog.write() as session:
-        reclaim_expired_leases(session, max_attempts=3, all_leases=True)
+        reclaim_expired_leases(session, all_leases=True)
     assert read_job(catalog, job_id).attempts == 1

@@ -13,7 +13,7 @@ from shared.catalog.jobs import Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import Unavailable, Unprocessable
 from shared.jobs import reclaim_expired_leases
-from shared.jobs.runner import JobInterrupted, JobRunner, StepOutcome
+from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner, StepOutcome
 from tests.support.catalog_rows import add_job, add_map, read_job, take
 
 KINDS = (JobKind.INDEX, JobKind.DESCRIBE, JobKind.EVALUATE)
@@ -102,7 +102,7 @@ def test_the_jobs_of_a_crashed_batch_are_retried_alone_until_the_cause_fails(
 
     while recorder.runner.run_next(crash_on_bad):
         pass
-    assert seen == [good] + [bad] * settings.max_attempts
+    assert seen == [good] + [bad] * MAX_ATTEMPTS
     failed = read_job(catalog, bad)
     assert failed.state == JobState.FAILED
     assert failed.error is not None
@@ -117,7 +117,7 @@ def test_a_job_that_was_taken_over_meanwhile_is_left_to_its_new_worker(
 
     def lose_lease(_: Job) -> None:
         with catalog.write() as session:
-            reclaim_expired_leases(session, 3, all_leases=True)
+            reclaim_expired_leases(session, all_leases=True)
         take(catalog, worker="another")
         raise REFUSED
 

@@ -16,6 +16,7 @@ from shared.jobs import (
     JobState,
 )
 from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import (
     cancel_job,
     fail_job,
@@ -24,7 +25,7 @@ from shared.jobs.transitions import (
     retry_job,
     succeed_job,
 )
-from tests.contract.jobs.jobs import MAX_ATTEMPTS, PROBLEM, end, ids, queue, token_of
+from tests.contract.jobs.jobs import PROBLEM, end, ids, queue, token_of
 from tests.support.catalog_rows import (
     add_job,
     add_photo,

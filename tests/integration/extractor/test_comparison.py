@@ -245,7 +245,7 @@ def test_comparison_of_a_worker_that_was_given_up_is_ended_by_the_next_one(
     def compare(self: ComparisonRunner, prepared: PreparedComparison) -> CompareResult:
         if not given_up:
             with service.catalog.write() as session:
-                given_up.append(reclaim_expired_leases(session, 3, all_leases=True))
+                given_up.append(reclaim_expired_leases(session, all_leases=True))
         return real(self, prepared)
 
     query = service.indexed(0, 1, 2)[0]

@@ -25,6 +25,7 @@ from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobState, claim_jobs
+from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import requeue_job
 from shared.storage import FolderStore
 from tests.integration.extractor.conftest import Hook
@@ -54,7 +55,7 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
     photo_ids = averages.upload(1, 2, 3)
     averages.drain()
     # Once with the others, then alone as often as a photo may.
-    assert batches == [3] + [1] * averages.settings.max_attempts
+    assert batches == [3] + [1] * MAX_ATTEMPTS
     poisonous = averages.job_of(photo_ids[1])
     assert (poisonous.state, poisonous.attempts) == (JobState.FAILED, 3)
     assert poisonous.error is not None
@@ -112,9 +113,9 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
     orphans = averages.keys("chunks/")
     assert len(orphans) == 2  # rows and manifest
     assert averages.rows() == {}
-    assert release_expired_leases(averages.catalog, 3) == 0  # the lease has to expire first
+    assert release_expired_leases(averages.catalog) == 0  # the lease has to expire first
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
-    assert release_expired_leases(averages.catalog, 3) == 2
+    assert release_expired_leases(averages.catalog) == 2
     _drain(make_worker())
     assert set(averages.rows()) == set(photo_ids)
     live = averages.keys("")
@@ -164,7 +165,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     monkeypatch.undo()
     assert len(averages.rows()) == 4
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
-    release_expired_leases(averages.catalog, 3)
+    release_expired_leases(averages.catalog)
     averages.drain()
     assert set(averages.rows()) == set(photo_ids)
 
@@ -181,7 +182,7 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     def take_over() -> None:
         jobs = [averages.job_of(photo_id).id for photo_id in photo_ids]
         expire_lease(averages.catalog, *jobs)
-        assert release_expired_leases(averages.catalog, 3) == 3
+        assert release_expired_leases(averages.catalog) == 3
         _drain(quick)
         seen.append(averages.keys("chunks/"))
 
@@ -261,7 +262,7 @@ def test_jobs_pause_while_the_object_store_is_away_and_no_attempt_is_counted(
     def away(*_: Any) -> None:
         raise OSError("the disk is not there")
 
-    for _ in range(averages.settings.max_attempts + 1):
+    for _ in range(MAX_ATTEMPTS + 1):
         with monkeypatch.context() as patched:
             patched.setattr(FolderStore, failing, away)
             result = averages.drain()

@@ -26,6 +26,7 @@ from shared.descriptors.vocabulary import decode_centres
 from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
 from shared.integrity.verify import discard_chunk
 from shared.jobs import Job, JobKind, JobState
+from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import cancel_job, requeue_job, retry_job
 from tests.integration.extractor.model_changes import (
     PHOTOS,
@@ -210,7 +211,7 @@ def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
     fitted.drain()
     job = fitted.job(job_id)
     assert (job.state, job.stage) == (JobState.FAILED, "cluster")
-    assert next(crashes) == fitted.settings.max_attempts + 1
+    assert next(crashes) == MAX_ATTEMPTS + 1
     assert job.error is not None
     assert job.error["code"] == "worker_crashed"
     monkeypatch.undo()

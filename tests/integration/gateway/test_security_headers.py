@@ -102,14 +102,6 @@ def test_refusals_at_the_door_have_the_headers_too(door: Door) -> None:
     checked(refused.headers)
 
 
-def test_hsts_is_sent_where_it_is_set(
-    catalog: Catalog, store: FolderStore, settings: Settings
-) -> None:
-    strict = settings.model_copy(update={"hsts_seconds": 31_536_000})
-    answer = client_of(catalog, store, strict, Broken()).get("/livez")
-    assert answer.headers["strict-transport-security"] == "max-age=31536000"
-
-
 def test_an_unhandled_error_returns_an_id_and_nothing_of_the_code(
     catalog: Catalog, store: FolderStore, settings: Settings, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -95,7 +95,7 @@ def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
         assert batches.photos() == [], life
         batches.worker = restart(batches, job_id)
     assert len(batches.keys("originals/")) == 2, "orphans of the two lives"
-    batches.work(batches.new_worker(max_attempts=100))
+    batches.work(batches.new_worker())
     assert_each_is_there_once(batches, job_id, 5)
 
 

@@ -103,7 +103,7 @@ def test_a_killed_evaluation_begins_anew(town: Town) -> None:
     assert not town.work(), "its lease is not over"
     expire_lease(town.catalog, job_id)
     with town.catalog.write() as session:
-        assert reclaim_expired_leases(session, max_attempts=3) == 1
+        assert reclaim_expired_leases(session) == 1
     search = Watched(town.search, 0, kill)
     assert town.work(search)
     assert search.searches >= len(STREETS)
@@ -121,7 +121,7 @@ def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(town: Town) -> 
     def take_over() -> None:
         expire_lease(town.catalog, job_id)
         with town.catalog.write() as session:
-            reclaim_expired_leases(session, max_attempts=3)
+            reclaim_expired_leases(session)
         assert town.work()
 
     assert town.work(Watched(town.search, 3, take_over))

@@ -11,7 +11,7 @@ from sqlalchemy import select
 
 from services.steward.scheduler import PeriodicTask, Scheduler
 from services.steward.tasks import auto_fit
-from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.compaction import COMPACT_CHUNKS, merge_slot
 from services.steward.tasks.garbage_collection import (
     collect_ended_generations,
     collect_garbage,
@@ -57,16 +57,18 @@ def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: S
     ]
     chunk_map.delete(*gone)
     ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
-    now = settings.model_copy(
-        update=dict.fromkeys(
-            ("superseded_grace_seconds", "retired_grace_seconds", "query_ttl_seconds"), -1.0
-        )
-    )
+    now = settings.model_copy(update={"query_ttl_seconds": -1.0})
     together = threading.Barrier(2)
 
     def both() -> None:
         together.wait(timeout=30)
-        collect_garbage(chunk_map.catalog, chunk_map.store, now)
+        collect_garbage(
+            chunk_map.catalog,
+            chunk_map.store,
+            now,
+            superseded_grace_seconds=-1.0,
+            retired_grace_seconds=-1.0,
+        )
 
     with ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(both) for _ in range(2)]:
@@ -138,10 +140,10 @@ def test_each_duty_is_done_by_the_loop(
 ) -> None:
     """One round does everything once: each duty leaves its trace."""
     wakeups = InProcessWakeups()
-    soon = settings.model_copy(update={"compact_chunks": 2, "orphan_age_seconds": 0.0})
+    soon = settings.model_copy(update={"orphan_age_seconds": 0.0})
     monkeypatch.setattr(vocabularies, "MIN_PHOTOS_TO_FIT", 1)
     monkeypatch.setattr(auto_fit, "QUIET_SECONDS", -1.0)
-    retained = sum_of(chunk_map.chunks(1, 1))
+    retained = sum_of(chunk_map.chunks(*[1] * COMPACT_CHUNKS))
     gone, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"gone")
     chunk_map.delete(gone)
     with chunk_map.catalog.write() as session:
@@ -170,12 +172,12 @@ def test_each_duty_is_done_by_the_loop(
     stop = threading.Event()
 
     def stop_when_merged_and_collected() -> None:  # by the tasks that have a thread of their own
-        if chunk_map.live() == [(0, 2)] and not chunk_map.objects("originals/"):
+        if chunk_map.live() == [(0, COMPACT_CHUNKS)] and not chunk_map.objects("originals/"):
             stop.set()
 
     steward.tasks.append(PeriodicTask("stop", 0.0, stop_when_merged_and_collected))
     steward.run(stop)
-    assert chunk_map.live() == [(0, 2)]
+    assert chunk_map.live() == [(0, COMPACT_CHUNKS)]
     assert chunk_map.objects("originals/") == set()
     assert chunk_map.objects("incoming/") == set()
     assert wakeups.wait(0)

@@ -22,7 +22,7 @@ def test_environment_decides_and_the_rest_has_defaults(
     assert settings.max_file_size == 123
     assert settings.lease_seconds == 0.5
     assert settings.placewise_home == tmp_path / "home"
-    assert settings.max_attempts == 3
+    assert settings.max_image_pixels == 200_000_000
 
 
 def test_outside_of_tests_the_real_extractor_is_the_default(
@@ -88,7 +88,6 @@ def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) 
         ("LEASE_SECONDS", "-1"),
         ("BATCH_PHOTOS", "many"),
         ("DECODE_MEMORY_BYTES", "1000"),
-        ("MAX_ATTEMPTS", "0"),
         ("MAX_QUEUED_JOBS", "0"),
         ("MAX_CONCURRENT_UPLOADS", "0"),
         ("MIN_FREE_BYTES", "-1"),
