@@ -163,7 +163,6 @@ class Similar(Answer):
     generation_id: UUID
     rows: str = "float32"
     certificate: str
-    certified_k: int = 0
     max_z: float | None = None
     rows_scanned: int
     rows_reranked: int

@@ -226,14 +226,9 @@ class SimilarityResponse(ResponseModel):
         "`float16`"
     )
     certificate: str = Field(
-        description="`exhaustive`: every row was compared exactly; `bound`: no skipped row can "
-        "be in the result; `statistical`: the same with an error probability of 1e-8; `none`: the "
-        "search ended early, or a part of the map could not be searched (`missing`)"
-    )
-    certified_k: int = Field(
-        0,
-        description="how many of the first photos are certain: all, unless the search ended early; "
-        "0 if a part of the map is missing",
+        description="`exhaustive`: every row was compared exactly; `statistical`: no skipped "
+        "row can be in the result, with an error probability of 1e-8; `none`: a part of the map "
+        "could not be searched (`missing`)"
     )
     max_z: float | None = Field(
         None,

@@ -123,7 +123,8 @@ def sync_snapshot(
         photos = PhotoColumns.of(len(stored.rows), filter_values[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     large = sum(chunk.rows.nbytes for chunk in loaded) >= MIN_CODED_BYTES
-    if large or (old is not None and (old.has_sign_codes or old.has_int8_codes)):
+    long_rows = any(chunk.rows.shape[1] >= CODED_DIMENSION for chunk in loaded)
+    if long_rows and (large or (old is not None and old.has_sign_codes)):
         loaded = _with_codes(loader, loaded)
     else:
         compile_kernel(loaded)
@@ -166,31 +167,22 @@ def _with_codes(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedCh
     except (Unavailable, OSError) as error:
         log.error("codes can't be loaded or stored, searching without them: %s", error)
         return [
-            replace(
-                chunk,
-                codes=None,
-                int8=None,
-                stored=chunk.stored and replace(chunk.stored, codes=None, int8=None),
-            )
+            replace(chunk, codes=None, stored=chunk.stored and replace(chunk.stored, codes=None))
             for chunk in chunks
         ]
-    if any(chunk.codes is not None for chunk in coded):
-        from services.search.sign_code_search import compile_kernels
+    from services.search.sign_code_search import compile_kernels
 
-        compile_kernels()
+    compile_kernels()
     return coded
 
 
 def _attach_codes(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
-    """Return the chunk with the codes for rows of its dimension: sign codes, or int8 codes."""
+    """Return the chunk with its sign codes."""
     stored = chunk.stored
-    if stored is None or stored.codes is not None or stored.int8 is not None:
+    if stored is None or stored.codes is not None:
         return chunk
-    if stored.rows.shape[1] >= CODED_DIMENSION:
-        codes = loader.load_sign_codes(chunk.object_key, stored)
-        return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
-    int8 = loader.load_int8_codes(chunk.object_key, stored)
-    return replace(chunk, int8=int8, stored=replace(stored, int8=int8))
+    codes = loader.load_sign_codes(chunk.object_key, stored)
+    return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
 
 
 def _apply_photo_changes(chunk: LoadedChunk, changes: dict[UUID, PhotoFilterValues]) -> LoadedChunk:

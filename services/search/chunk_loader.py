@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
 import numpy as np
@@ -34,7 +34,6 @@ from shared.storage.chunks import StoredRows, chunk_corrupt_error, codes_key, de
 from shared.storage.copying import PARTIAL_SUFFIX, download_object, remove_stale_partials
 
 if TYPE_CHECKING:
-    from shared.codes.int8_codes import Int8Codes
     from shared.codes.sign_codes import SignCodes
 
 
@@ -179,8 +178,6 @@ class LoadedChunk:
     """Sign codes; None while they are not in use."""
     stored: StoredChunk | None = None
     """The mapped files; None for rows that exist in memory only."""
-    int8: Int8Codes | None = None
-    """Int8 codes; None while they are not in use."""
 
     def was_changed(self) -> bool:
         """Whether its mapped file was changed; see `_MappedFile.was_changed`."""
@@ -202,12 +199,9 @@ class StoredChunk:
     rows: StoredRows
     sha256: str
     codes: SignCodes | None = None
-    int8: Int8Codes | None = None
 
 
-CACHED_SUFFIXES = (".npy", ".codes", ".int8")  # of a chunk's files in the cache folder
-
-Codes = TypeVar("Codes")
+CACHED_SUFFIXES = (".npy", ".codes")  # of a chunk's files in the cache folder
 
 
 class ChunkLoader:
@@ -237,37 +231,12 @@ class ChunkLoader:
         def write_computed(target: Path) -> None:
             _write_durably(target, encode_sign_codes(stored.rows, stored.sha256))
 
-        return self._load_codes(
-            object_key, stored, "codes", (write_stored, write_computed), decode_sign_codes
-        )
-
-    def load_int8_codes(self, object_key: str, stored: StoredChunk) -> Int8Codes:
-        """Load the chunk's int8 codes from the cache folder, or else compute them from its rows."""
-        from shared.codes.serialization import decode_int8_codes, encode_int8_codes
-
-        def write_computed(target: Path) -> None:
-            _write_durably(target, encode_int8_codes(stored.rows, stored.sha256))
-
-        # Twice, because an existing file may be damaged.
-        return self._load_codes(
-            object_key, stored, "int8", (write_computed, write_computed), decode_int8_codes
-        )
-
-    def _load_codes(
-        self,
-        object_key: str,
-        stored: StoredChunk,
-        suffix: str,
-        writers: Sequence[Callable[[Path], None]],
-        decode: Callable[..., Codes],
-    ) -> Codes:
-        """Load codes from the cache folder; `writers` are tried in turn to create the file."""
-        name = f"{stored.sha256}.{suffix}"
+        name = f"{stored.sha256}.codes"
         rows, dimension = stored.rows.shape
-        for write in writers:
+        for write in (write_stored, write_computed):
             try:
                 file = self._files.map_or_create(name, write)
-                return decode(
+                return decode_sign_codes(
                     file.memory, rows=rows, dimension=dimension, chunk_sha256=stored.sha256
                 )
             except NotFound:
@@ -327,13 +296,8 @@ def hold_in_memory(chunk: LoadedChunk, parts: int) -> LoadedChunk:
             ),
             norms=np.array(stored.codes.norms),  # 4 bytes a row: always
         )
-    int8 = None
-    if stored.int8 is not None:
-        loaded = (chunk.int8 or stored.int8).numbers
-        int8 = replace(stored.int8, numbers=_in_memory(stored.int8.numbers, loaded, parts > part))
-        part += 1
     rows: StoredRows = _in_memory(stored.rows, chunk.rows, parts > part)
-    return replace(chunk, rows=rows, codes=codes, int8=int8)
+    return replace(chunk, rows=rows, codes=codes)
 
 
 def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
@@ -344,8 +308,6 @@ def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
         for number, level in enumerate(levels):
             name = f"codes {number}"
             sizes[name] = sizes.get(name, 0) + level.nbytes
-        if chunk.int8 is not None:
-            sizes["int8 codes"] = sizes.get("int8 codes", 0) + chunk.int8.numbers.nbytes
     return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 

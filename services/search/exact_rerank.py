@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import os
-import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -104,43 +102,10 @@ def _thread_pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, _cpu_count() - 1), "search-part")
 
 
-# Minimum number of rows compared exactly between two checks of the floor and the budget. A step is
+# Minimum number of rows compared exactly between two checks of the floor. A step is
 # at least an eighth of the rows compared before: long results occupy all threads, and at most an
 # eighth of the rows is compared in vain.
 RERANK_STEP_ROWS = 8
-
-
-@dataclass(slots=True)
-class SearchBudget:
-    """Limits of a search; a result that was cut short has certificate `none`."""
-
-    max_rows: int | None = None
-    """Maximum number of rows compared exactly."""
-    deadline: float | None = None
-    """Deadline on the clock of time.monotonic()."""
-
-    def is_exhausted(self, rows: int) -> bool:
-        """Whether `rows` rows compared exactly, or the time, have reached the limit."""
-        if self.max_rows is not None and rows >= self.max_rows:
-            return True
-        return self.deadline is not None and time.monotonic() >= self.deadline
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RerankedRows:
-    """Rows that were compared exactly, and a bound of the others."""
-
-    rows: Indices
-    """The compared rows, by descending upper bound."""
-    scores: Scores
-    """Cosines, float64."""
-    unseen_bound: float
-    """Upper bound of the other rows' scores; -inf if none of them can be in the result."""
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the comparison did not stop early."""
-        return self.unseen_bound == -math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,28 +122,27 @@ class ExactReranker:
     """Called with rows before they are compared."""
 
     def find_best(
-        self, rows: Indices, upper_bounds: Scores, floor: float, budget: SearchBudget
-    ) -> RerankedRows:
+        self, rows: Indices, upper_bounds: Scores, floor: float
+    ) -> tuple[Indices, Scores]:
         """Compare rows by descending upper bound, until no other row can reach the k-th score.
 
         Args:
             rows: Candidates.
             upper_bounds: Upper bound of each candidate's score.
             floor: Score that a row must reach; it rises to the k-th exact score.
-            budget: Limits, upon which the comparison stops early.
+
+        Returns:
+            The compared rows, by descending upper bound, and their float64 cosines.
         """
         order = np.argsort(-upper_bounds, kind="stable")
         order = order[: np.count_nonzero(upper_bounds >= floor)]
         rows, upper_bounds = rows[order], upper_bounds[order]
         scores = np.empty(len(rows))
-        done, unseen_bound = 0, -math.inf
+        done = 0
         while done < len(rows) and upper_bounds[done] >= floor:
-            if budget.is_exhausted(done):
-                unseen_bound = float(upper_bounds[done])
-                break
             # At least k rows are needed before the floor can rise.
             step = max(RERANK_STEP_ROWS, done // 8)
-            end = min(len(rows), max(self.k, done + step), budget.max_rows or len(rows))
+            end = min(len(rows), max(self.k, done + step))
             self.prefetch(rows[done:end])
             self.blocks.multiply(rows[done:end], self.query, scores[done:end])
             scores[done:end] /= self.norm
@@ -186,4 +150,4 @@ class ExactReranker:
             if done >= self.k:
                 kth = float(np.partition(scores[:done], done - self.k)[done - self.k])
                 floor = max(floor, kth)
-        return RerankedRows(rows[:done], scores[:done], unseen_bound)
+        return rows[:done], scores[:done]

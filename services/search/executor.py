@@ -1,16 +1,13 @@
 """Query executor: runs a query on a snapshot with the cheapest suitable search strategy.
 
-The strategies are the dense scan, sign codes, int8 codes and the GPU. All compare the best
-candidates exactly and rank by float64 cosines; they differ in the certificate of the result.
+The strategies are the dense scan, sign codes and the GPU. All compare the best candidates exactly
+and rank by float64 cosines; they differ in the certificate of the result.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
@@ -20,7 +17,6 @@ from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, s
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.search_api.protocol import (
-    BOUND,
     EXHAUSTIVE,
     NONE,
     STATISTICAL,
@@ -28,10 +24,6 @@ from shared.search_api.protocol import (
     SearchHit,
     SearchResponse,
 )
-
-if TYPE_CHECKING:  # imports numba, which takes a while to load
-    from services.search.exact_rerank import SearchBudget
-    from services.search.int8_search import Candidates
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +34,6 @@ MAX_Z = 5.5
 # Rounding makes equal rows have equal scores whatever the summation order; ties go by photo id.
 SCORE_DECIMALS = 12
 
-INT8_ROW_PARAMS_BYTES = 12  # scale, error and length of a code
-
 RowNumbers = NDArray[np.int64]
 Scores = NDArray[np.float64]
 
@@ -53,15 +43,12 @@ NO_SCORES = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Number of results, strategy, and limits of a search."""
+    """Number of results, minimum score and strategy of a search."""
 
     k: int
     min_score: float | None = None
     """Minimum cosine."""
     mode: Mode = Mode.AUTO
-    most_rows: int | None = None
-    """Maximum number of rows compared exactly."""
-    most_seconds: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +60,6 @@ class _ScoredRows:
     certificate: str
     scanned: int
     max_z: float | None = None
-    unseen_bound: float = -math.inf
-    """Upper bound of the scores of all other rows."""
 
 
 def execute_query(
@@ -91,7 +76,7 @@ def execute_query(
         snapshot: The snapshot.
         query: (dimension,) row of any length; a row of zeros has no similar rows.
         row_mask: (n,) bool, the rows that may be returned.
-        options: Number of results, minimum score, strategy and limits.
+        options: Number of results, minimum score and strategy.
         batcher: Batches the first-level scans of concurrent queries.
         weighted_query: If given, rows are ranked by their similarity to it. Hits also carry the
             plain cosine, and `options.min_score` applies to that.
@@ -132,17 +117,6 @@ def sign_codes_pay_off(selected: int, k: int) -> bool:
     return selected > 64 + 4 * k
 
 
-def int8_codes_pay_off(selected: int, k: int, dimension: int, row_bytes: int) -> bool:
-    """Whether a search by int8 codes reads fewer bytes than a dense scan of the selected rows.
-
-    It reads all codes and about 2 k full rows, of `row_bytes` each.
-    """
-    from shared.codes.rotation import get_rotation
-
-    code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
-    return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Query:
     """A query of a snapshot, and the strategies that score its rows."""
@@ -156,24 +130,13 @@ class _Query:
     def score_rows(self) -> _ScoredRows:
         """Score the rows with the cheapest suitable strategy."""
         snapshot, options, selected = self.snapshot, self.options, self._selected()
-        scored = None
-        if options.mode != Mode.DENSE and sign_codes_pay_off(selected, options.k):
-            scored = self._search_on_gpu()
-            if scored is None and options.mode == Mode.AUTO and snapshot.has_sign_codes:
-                scored = self._search_by_sign_codes()
-        if (
-            scored is None
-            and options.mode != Mode.DENSE
-            and snapshot.has_int8_codes
-            and int8_codes_pay_off(
-                selected, options.k, snapshot.dimension, snapshot.chunks[0].rows.strides[0]
-            )
-        ):
-            scored = self._search_by_int8()
-        if scored is None:
-            rows, scores = scan_top_k(snapshot.chunks, self.vector, options.k, self.row_mask)
-            scored = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
-        return scored
+        if options.mode == Mode.AUTO and sign_codes_pay_off(selected, options.k):
+            coded = snapshot.has_sign_codes
+            scored = self._search_by_sign_codes() if coded else self._search_on_gpu()
+            if scored is not None:
+                return scored
+        rows, scores = scan_top_k(snapshot.chunks, self.vector, options.k, self.row_mask)
+        return _ScoredRows(rows, scores, EXHAUSTIVE, selected)
 
     def mask_min_score(self) -> NDArray[np.bool_]:
         """Return the rows of the mask that score at least `options.min_score`."""
@@ -219,11 +182,9 @@ class _Query:
     def to_response(self, hits: list[SearchHit], scored: _ScoredRows) -> SearchResponse:
         """Build the response; missing chunks may contain better rows."""
         missing = self.snapshot.missing
-        certain = sum(hit.ranked_by > scored.unseen_bound for hit in hits)
         return SearchResponse(
             hits=tuple(hits),
             certificate=NONE if missing else scored.certificate,
-            certified_k=0 if missing else certain,
             rows_scanned=scored.scanned,
             rows_reranked=len(scored.rows),
             max_z=scored.max_z,
@@ -236,91 +197,46 @@ class _Query:
         resident = self.snapshot.gpu_snapshot
         if resident is None or resident.failure is not None:
             return None
-        from services.search.gpu import GpuError, GpuQuery
+        from services.search.gpu import GpuError
 
-        budget = self._budget()
-        query = GpuQuery(self.vector, self.row_mask, self.options.k, self._score_floor())
+        options = self.options
         try:
-            (candidates,) = resident.candidates([query])
+            rows = resident.find_candidates(
+                self.vector, self.row_mask, options.k, options.min_score
+            )
         except GpuError as error:
             log.error(
                 "generation %s is searched by the CPU: %s", self.snapshot.generation_id, error
             )
             return None
-        return self._rerank(candidates, budget)
-
-    def _search_by_int8(self) -> _ScoredRows:
-        from services.search.int8_search import find_candidates
-        from shared.codes.int8_codes import Int8Query
-
-        budget = self._budget()
-        candidates = find_candidates(
-            self.snapshot.int8_blocks,
-            Int8Query.from_row(self.vector),
-            self.row_mask,
-            self.options.k,
-            self._score_floor(),
-            budget,
-        )
-        if candidates is None:
-            return _ScoredRows(NO_ROWS, NO_SCORES, NONE, self._selected(), unseen_bound=math.inf)
-        return self._rerank(candidates, budget)
-
-    def _rerank(self, candidates: Candidates, budget: SearchBudget) -> _ScoredRows:
-        """Compare the candidates exactly."""
-        from services.search.exact_rerank import ExactReranker
-
-        norm = float(np.linalg.norm(self.vector.astype(np.float64)))
-        snapshot = self.snapshot
-        reranker = ExactReranker(
-            snapshot.row_blocks, self.vector, norm, self.options.k, snapshot.prefetch_rows
-        )
-        reranked = reranker.find_best(
-            candidates.rows, candidates.upper_bounds, candidates.floor, budget
-        )
-        return _ScoredRows(
-            reranked.rows,
-            reranked.scores,
-            BOUND if reranked.is_complete else NONE,
-            self._selected(),
-            unseen_bound=reranked.unseen_bound,
-        )
+        scores = exact_scores(self.snapshot.chunks, self.vector, rows)
+        return _ScoredRows(rows, scores, EXHAUSTIVE, self._selected())
 
     def _search_by_sign_codes(self) -> _ScoredRows | None:
         """Search by sign codes; None if an error of an estimate is larger than chance explains."""
         from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
         from shared.codes.rotation import get_rotation
 
-        budget, options = self._budget(), self.options
+        options = self.options
         blocks = self.snapshot.sign_code_blocks
         coded = SignCodedQuery.of(self.vector, get_rotation(len(self.vector)))
         first = self.batcher.scan(blocks, coded, self.row_mask)
         search = SignCodeSearch(
             blocks, coded, options.k, options.min_score, self.snapshot.prefetch_rows
         )
-        result = search.search(first, budget)
+        result = search.search(first)
         if result.max_z > MAX_Z:
             return None
         return _ScoredRows(
             result.rows,
             result.scores,
-            STATISTICAL if result.is_complete else NONE,
+            STATISTICAL,
             result.scanned,
             result.max_z,
-            result.unseen_bound,
         )
 
     def _selected(self) -> int:
         return int(np.count_nonzero(self.row_mask))
-
-    def _score_floor(self) -> float:
-        return -math.inf if self.options.min_score is None else self.options.min_score
-
-    def _budget(self) -> SearchBudget:
-        from services.search.exact_rerank import SearchBudget
-
-        seconds = self.options.most_seconds
-        return SearchBudget(self.options.most_rows, seconds and time.monotonic() + seconds)
 
 
 def _round_scores(scores: Scores) -> Scores:

@@ -1,4 +1,4 @@
-"""Compiled kernels of the search: Hamming distances, int8 products and exact products.
+"""Compiled kernels of the search: Hamming distances and exact products.
 
 Rows lie in many arrays, some of them memory-mapped files, so the kernels take addresses; the caller
 keeps the memory alive. The kernels release the GIL.
@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
 EXCLUDED_DISTANCE = 65_535  # more than any distance
-INT32_SAFE_TERMS = 1024  # this many products of 8-bit and 15-bit integers sum to less than 2^31
-ROUNDING = 1e-9  # bound of float64 rounding errors of a score: 2^-53 for each of 100,000 terms
 PLANES = 4  # `weighted_bit_sums` is written for exactly 4
 LOW_BIT_OF_EACH_BYTE = np.uint64(0x0101010101010101)
 BIT_GATHER_FACTOR = np.uint64(0x0102040810204080)
@@ -70,7 +68,6 @@ def _float16_value(_typing: Any, bits: types.Type) -> Any:
 _words_at = _pointer_to(types.uint64)
 _floats_at = _pointer_to(types.float32)
 _float16_bits_at = _pointer_to(types.uint16)
-_bytes_at = _pointer_to(types.int8)
 
 
 @numba_jit(REORDERED_FASTMATH)
@@ -126,96 +123,6 @@ def _address(
     """Address of a row."""
     block = np.searchsorted(first_rows, row, side="right") - 1
     return block_addresses[block] + np.uint64((row - first_rows[block]) * row_bytes)
-
-
-@numba_jit(REORDERED_FASTMATH)
-def int8_product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
-    """Exact dot product of integers up to 127 with integers up to 127 * 128 + 63."""
-    total = np.int64(0)
-    for begin in range(0, query.shape[0], INT32_SAFE_TERMS):
-        row_part = row[begin : begin + INT32_SAFE_TERMS]
-        query_part = query[begin : begin + INT32_SAFE_TERMS]
-        partial_sum = np.int32(0)
-        for j in range(query_part.shape[0]):
-            partial_sum = np.int32(partial_sum + np.int32(row_part[j]) * np.int32(query_part[j]))
-        total += np.int64(partial_sum)
-    return total
-
-
-@numba_jit(REORDERED_FASTMATH)
-def rows_above_floor(
-    block_addresses: Addresses,
-    first_rows: NDArray[np.int64],
-    row_mask: NDArray[np.bool_],
-    row_params: NDArray[np.float32],
-    query: NDArray[np.int16],
-    query_params: tuple[float, float, float],
-    begin: int,
-    end: int,
-    best_scores_heap: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    upper_bounds: NDArray[np.float64],
-    count: int,
-) -> int:
-    """Find the rows `begin` to `end`, numbered across all blocks, whose score may reach the floor.
-
-    Args:
-        block_addresses: (c,) addresses of the blocks' int8 codes, each row as long as the query.
-        first_rows: (c + 1,) number of each block's first row.
-        row_mask: (rows,) bool; other rows are skipped.
-        row_params: (3, rows) float32: scale, error and length of each row.
-        query: (padded,) int16.
-        query_params: Scale and error of the query, and the minimum floor.
-        begin: First row.
-        end: One past the last row.
-        best_scores_heap: (k,) min-heap of the highest lower bounds of scores; its minimum is the
-            floor.
-        rows: Rows that may reach the floor, written from index `count` on.
-        upper_bounds: Upper bounds of their scores, written from index `count` on.
-        count: Number of rows found so far.
-
-    Returns:
-        The new number of rows found.
-    """
-    padded = query.shape[0]
-    scale, error, lowest = query_params
-    floor = max(lowest, best_scores_heap[0])
-    block = np.searchsorted(first_rows, begin, side="right") - 1
-    while begin < end:
-        block_end = min(end, first_rows[block + 1])
-        codes = nb.carray(
-            _bytes_at(block_addresses[block]),
-            (first_rows[block + 1] - first_rows[block], padded),
-        )
-        for row in range(begin, block_end):
-            if not row_mask[row]:
-                continue
-            product = int8_product(codes[row - first_rows[block]], query)
-            score = np.float64(row_params[0, row]) * scale * np.float64(product)
-            bound = row_params[1, row] + row_params[2, row] * error + ROUNDING
-            if score + bound >= floor:
-                rows[count], upper_bounds[count] = row, score + bound
-                count += 1
-                if score - bound > best_scores_heap[0]:
-                    _replace_heap_minimum(best_scores_heap, score - bound)
-                    floor = max(lowest, best_scores_heap[0])
-        begin = block_end
-        block += 1
-    return count
-
-
-@numba_jit(REORDERED_FASTMATH)
-def _replace_heap_minimum(heap: NDArray[np.float64], value: float) -> None:
-    index, end = 0, heap.shape[0]
-    while True:
-        child = 2 * index + 1
-        if child + 1 < end and heap[child + 1] < heap[child]:
-            child += 1
-        if child >= end or heap[child] >= value:
-            break
-        heap[index] = heap[child]
-        index = child
-    heap[index] = value
 
 
 @numba_jit(REORDERED_FASTMATH)

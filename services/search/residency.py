@@ -47,18 +47,16 @@ def open_search_device(setting: str) -> GpuDevice | None:
         return None
     if not has_torch:
         raise _no_gpu_error("PyTorch is not installed: install placewise[search-gpu]")
-    from services.search.gpu import GpuDevice, GpuUnsupported
+    from services.search.gpu import GpuDevice
 
-    try:
-        device = GpuDevice.cuda()
-        reason = "PyTorch sees no CUDA device"
-    except GpuUnsupported as error:
-        device, reason = None, str(error)
-    if device is None:
-        if setting == "cuda":
-            raise _no_gpu_error(reason)
-        log.warning("search uses the CPU: %s", reason)
-    return device
+    device = GpuDevice.cuda()
+    if device is not None:
+        return device
+    reason = "PyTorch sees no CUDA device"
+    if setting == "cuda":
+        raise _no_gpu_error(reason)
+    log.warning("search uses the CPU: %s", reason)
+    return None
 
 
 def _no_gpu_error(reason: str) -> Misconfigured:
@@ -77,13 +75,14 @@ class GpuResidency:
         """Return the new snapshot with the GPU rows of the old one, if few must be copied."""
         resident = old.gpu_snapshot if old is not None else None
         if resident is not None:
-            resident = self._load(new, resident, MAX_SYNC_COPY_BYTES)
+            coded = new.has_sign_codes
+            resident = None if coded else self._load(new, resident, MAX_SYNC_COPY_BYTES)
         return replace(new, gpu_snapshot=resident)
 
     def needs_update(self, snapshot: Snapshot) -> bool:
         """Whether the snapshot is to be loaded onto the GPU, or dropped after a failure."""
-        if self._device is None or not snapshot.chunks:
-            return False
+        if self._device is None or not snapshot.chunks or snapshot.has_sign_codes:
+            return False  # sign codes are faster on a CPU than all rows are on a GPU
         if snapshot.gpu_snapshot is not None:
             return snapshot.gpu_snapshot.failure is not None
         return time.monotonic() >= self._retry_at.get(snapshot.generation_id, -math.inf)
@@ -117,11 +116,7 @@ class GpuResidency:
             DeviceStatus(
                 name=self._device.name,
                 resident_bytes=sum(gpu_snapshot.nbytes for gpu_snapshot in loaded.values()),
-                generations={
-                    key: "float16"
-                    for key, gpu_snapshot in loaded.items()
-                    if not gpu_snapshot.failure
-                },
+                generations=tuple(key for key, there in loaded.items() if not there.failure),
                 failure=failures[0] if failures else self._failure,
             ),
         )

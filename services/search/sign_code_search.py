@@ -32,7 +32,6 @@ from services.search.exact_rerank import (
     Indices,
     RowBlocks,
     Scores,
-    SearchBudget,
     array_addresses,
     parallel_for,
 )
@@ -127,7 +126,7 @@ class SignCodedQuery:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignCodeResult:
-    """The rows that were compared exactly, and a bound of the others."""
+    """The rows that were compared exactly; no other row can be in the result (see above)."""
 
     rows: Indices
     scores: Scores
@@ -135,20 +134,6 @@ class SignCodeResult:
     scanned: int
     max_z: float
     """Largest error of an estimate of the compared rows, in standard deviations."""
-    unseen_bound: float
-    """Upper bound of the other rows' scores (at BOUND_DEVIATIONS); -inf if none of them can be in
-    the result."""
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the search did not stop early."""
-        return self.unseen_bound == -math.inf
-
-    @classmethod
-    def interrupted(cls, first: FirstLevelScan, unseen_bound: float) -> SignCodeResult:
-        """Result of a search that stopped before any row was compared exactly."""
-        scanned = int(first.counts.sum())
-        return cls(np.empty(0, np.int64), np.empty(0), scanned, 0.0, unseen_bound)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +214,7 @@ def compile_kernels() -> None:
     add_hamming_distances(
         blocks.level_addresses[0], blocks.first_rows, no_rows, query.bits, no_rows
     )
-    SignCodeSearch(blocks, query, 1, None, lambda _: None).search(first, SearchBudget())
+    SignCodeSearch(blocks, query, 1, None, lambda _: None).search(first)
 
 
 def hamming_deviation(bits: int, padded: int) -> float:
@@ -262,7 +247,7 @@ class SignCodeSearch:
         self._level_ends = level_ends(self._padded)
         self._estimated = _Estimates.empty()
 
-    def search(self, first: FirstLevelScan, budget: SearchBudget) -> SignCodeResult:
+    def search(self, first: FirstLevelScan) -> SignCodeResult:
         """Prune rows level by level, then compare the remaining ones exactly."""
         seeds = max(SEED_ROWS, self._k)
         if self._k < int(first.counts.sum()):  # otherwise there is no k-th score to reach
@@ -279,26 +264,16 @@ class SignCodeSearch:
                 nearest = np.argpartition(distances, seeds)[:seeds]
                 self._raise_floor(rows[nearest])
                 rows, distances = self._prune(rows, level, distances)
-            if budget.is_exhausted(0):
-                return SignCodeResult.interrupted(first, self._max_score(level, distances))
         zeros = self._blocks.zero_rows
         if len(zeros):
             rows = np.union1d(rows, zeros[first.distances[zeros] != EXCLUDED_DISTANCE])
-        return self._rerank_exactly(self._estimate(rows), first, budget)
+        return self._rerank_exactly(self._estimate(rows), first)
 
     def _max_distance(self, level: int) -> int:
         """Largest Hamming distance at which a row may still reach the floor."""
         bits = int(self._level_ends[level]) * WORD_BITS
         min_cosine = self._floor - BOUND_DEVIATIONS * hamming_deviation(bits, self._padded)
         return int(bits / math.pi * math.acos(min(1.0, max(-1.0, min_cosine))))
-
-    def _max_score(self, level: int, distances: Indices) -> float:
-        """Highest score that rows at these distances may have."""
-        if not len(distances):
-            return -math.inf
-        bits = int(self._level_ends[level]) * WORD_BITS
-        best_estimate = math.cos(math.pi * int(distances.min()) / bits)
-        return best_estimate + BOUND_DEVIATIONS * hamming_deviation(bits, self._padded)
 
     def _add_distances(self, rows: Indices, level: int, distances: Indices) -> None:
         """Add the distances in the bits of a level."""
@@ -355,23 +330,20 @@ class SignCodeSearch:
         scores[zero] = deviations[zero] = 0.0
         return _Estimates(rows, scores, deviations)
 
-    def _rerank_exactly(
-        self, remaining: _Estimates, first: FirstLevelScan, budget: SearchBudget
-    ) -> SignCodeResult:
+    def _rerank_exactly(self, remaining: _Estimates, first: FirstLevelScan) -> SignCodeResult:
         """Compare rows exactly, highest upper bound first."""
         upper_bounds = remaining.scores + BOUND_DEVIATIONS * remaining.deviations
         query = self._query
         reranker = ExactReranker(self._blocks, query.row, query.norm, self._k, self._prefetch)
-        compared = reranker.find_best(remaining.rows, upper_bounds, self._floor, budget)
-        estimated = remaining.select(compared.rows)
-        errors = np.abs(compared.scores - estimated.scores)
+        rows, scores = reranker.find_best(remaining.rows, upper_bounds, self._floor)
+        estimated = remaining.select(rows)
+        errors = np.abs(scores - estimated.scores)
         deviations = estimated.deviations
         return SignCodeResult(
-            rows=compared.rows,
-            scores=compared.scores,
+            rows=rows,
+            scores=scores,
             scanned=int(first.counts.sum()),
             max_z=float(np.max(errors / np.where(deviations > 0, deviations, np.inf), initial=0.0)),
-            unseen_bound=compared.unseen_bound,
         )
 
 

@@ -18,7 +18,6 @@ from shared.search_api.protocol import IndexPart, LoadedGeneration
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
     from services.search.exact_rerank import RowBlocks
     from services.search.gpu import GpuSnapshot
-    from services.search.int8_search import Int8Blocks
     from services.search.sign_code_search import SignCodeBlocks
 
 
@@ -69,11 +68,6 @@ class Snapshot:
         """Whether every chunk has its sign codes."""
         return bool(self.chunks) and all(chunk.codes is not None for chunk in self.chunks)
 
-    @cached_property
-    def has_int8_codes(self) -> bool:
-        """Whether every chunk has its int8 codes."""
-        return bool(self.chunks) and all(chunk.int8 is not None for chunk in self.chunks)
-
     def prefetch_rows(self, rows: NDArray[np.int64]) -> None:
         """Advise the system that these rows are read next, where they are mapped files."""
         first_rows = self.photos.first_rows
@@ -88,13 +82,6 @@ class Snapshot:
         from services.search.sign_code_search import SignCodeBlocks
 
         return SignCodeBlocks.of(self.chunks)
-
-    @cached_property
-    def int8_blocks(self) -> Int8Blocks:
-        """Addresses of the int8 codes and rows; requires `has_int8_codes`."""
-        from services.search.int8_search import Int8Blocks
-
-        return Int8Blocks.of(self.chunks)
 
     @cached_property
     def row_blocks(self) -> RowBlocks:

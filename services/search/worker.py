@@ -254,8 +254,6 @@ class SearchWorker:
             k=request.k,
             min_score=request.min_score,
             mode=request.mode,
-            most_rows=request.most_rows,
-            most_seconds=request.most_seconds,
         )
         weighted = _weight_query(query, request.word_weights)
         return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)

@@ -2,7 +2,6 @@
 
     rotation.py       random rotation and fast Walsh-Hadamard transform, applied before coding
     sign_codes.py     one bit for each rotated number
-    int8_codes.py     one byte for each rotated number, with an error bound
     serialization.py  file format of codes
     jit.py            compilation of the loops by numba
 

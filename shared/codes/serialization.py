@@ -4,11 +4,8 @@ A file begins with one line of JSON that describes the arrays and the rows that 
 padded with blanks to a multiple of 64 bytes. The arrays follow, little-endian, each aligned to 64
 bytes, so that they can be used in a memory-mapped file.
 
-* Sign codes, `<chunk>.codes`: float32 norms and the words of each level. `shared.storage.chunks`
-  writes them beside the rows.
-* Int8 codes: float32 scales, errors and lengths, and the bytes. Search workers compute them
-  (`services.search.chunk_loader`): they are a quarter of the rows' size, and computed in a fraction
-  of the time that the rows took.
+Sign codes, `<chunk>.codes`, are float32 norms and the words of each level. `shared.storage.chunks`
+writes them beside the rows.
 
 Codes can always be computed again from the rows, and a reader does so if the file is missing or was
 written with other parameters.
@@ -24,12 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.int8_codes import Int8Codes, int8_codes
 from shared.codes.rotation import ROUNDS, SEED, StoredFloats, get_rotation
 from shared.codes.sign_codes import SignCodes, encode_signs, level_words
 
 SIGN_CODES_FORMAT = 1
-INT8_CODES_FORMAT = 1
 ALIGNMENT_BYTES = 64
 MAX_HEADER_BYTES = 4096
 
@@ -61,22 +56,6 @@ def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str
     return SignCodes(tuple(levels), norms)
 
 
-def encode_int8_codes(rows: StoredFloats, chunk_sha256: str) -> bytes:
-    """Encode the int8 codes of (n, dimension) rows of the chunk with this hash."""
-    codes = int8_codes(rows)
-    arrays: list[NDArray[Any]] = [codes.scales, codes.errors, codes.lengths, codes.numbers]
-    return _encode(_int8_codes_spec(rows.shape[1]), arrays, chunk_sha256)
-
-
-def decode_int8_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> Int8Codes:
-    """Decode int8 codes from a buffer, as `decode_sign_codes` does."""
-    scalar: Layout = ("<f4", ())
-    layout: list[Layout] = [scalar, scalar, scalar, ("|i1", (get_rotation(dimension).padded,))]
-    arrays = _decode(data, _int8_codes_spec(dimension), layout, rows, chunk_sha256)
-    scales, errors, lengths, numbers = arrays
-    return Int8Codes(numbers, scales, errors, lengths)
-
-
 def _sign_codes_spec(dimension: int) -> dict[str, Any]:
     """Parameters of sign codes; codes with different parameters can't be compared."""
     return {
@@ -85,16 +64,6 @@ def _sign_codes_spec(dimension: int) -> dict[str, Any]:
         "seed": SEED,
         "rounds": ROUNDS,
         "levels": list(level_words(get_rotation(dimension).padded)),
-    }
-
-
-def _int8_codes_spec(dimension: int) -> dict[str, Any]:
-    return {
-        "format": INT8_CODES_FORMAT,
-        "kind": "int8",
-        "dimension": dimension,
-        "seed": SEED,
-        "rounds": ROUNDS,
     }
 
 

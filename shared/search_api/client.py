@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import heapq
 import logging
-import math
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -58,7 +57,6 @@ def merge_responses(
     weakest = max((response.certificate for response in responses), key=_certificate_rank)
     return SearchResponse(
         hits=tuple(hits),
-        certified_k=0 if missing else _certified_count(hits, responses),
         max_z=max(
             (response.max_z for response in responses if response.max_z is not None), default=None
         ),
@@ -82,21 +80,6 @@ def _top_hits(k: int, responses: Sequence[SearchResponse]) -> list[SearchHit]:
         # Shards may be at different versions, between which a photo has moved.
         hits.setdefault(hit.photo_id, hit)
     return list(hits.values())
-
-
-def _certified_count(hits: Sequence[SearchHit], responses: Sequence[SearchResponse]) -> int:
-    """Number of leading hits that are certain.
-
-    A shard that stopped early guarantees only hits that rank at least as high as the last hit that
-    it certifies.
-    """
-    certain_from = -math.inf
-    for response in responses:
-        if _certificate_rank(response.certificate) >= CERTIFICATES.index(NONE):
-            last = response.certified_k - 1
-            bound = response.hits[last].ranked_by if last >= 0 else math.inf
-            certain_from = max(certain_from, bound)
-    return sum(hit.ranked_by >= certain_from for hit in hits)
 
 
 def _certificate_rank(certificate: str) -> int:

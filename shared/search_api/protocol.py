@@ -22,13 +22,12 @@ from shared.config.shards import SINGLE_SHARD
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
-BOUND = "bound"  # a proven bound excludes every row that was not compared exactly
-STATISTICAL = "statistical"  # the same, with a failure probability of about 1 in 10^8
-NONE = "none"  # stopped early, or a part of the map is missing: better rows may exist
+STATISTICAL = "statistical"  # no other row can be among them, but with odds of about 1 in 10^8
+NONE = "none"  # a part of the map is missing: better rows may exist
 BACKGROUND_FEATURE = "background"
 """Feature of workers that know `SearchRequest.background`."""
 
-CERTIFICATES = (EXHAUSTIVE, BOUND, STATISTICAL, NONE)
+CERTIFICATES = (EXHAUSTIVE, STATISTICAL, NONE)
 """Guarantees of a result's completeness, strongest first."""
 
 
@@ -37,7 +36,6 @@ class Mode(StrEnum):
 
     AUTO = "auto"  # the strategy that reads the fewest bytes
     DENSE = "dense"  # compare every row exactly
-    DETERMINISTIC = "deterministic"  # only certificates without probability: exhaustive, bound
 
 
 class _Message(BaseModel):
@@ -89,10 +87,6 @@ class SearchRequest(_Message):
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
-    most_rows: int | None = Field(None, ge=0)
-    """Maximum number of rows compared exactly; a search that stops there has certificate `none`."""
-    most_seconds: float | None = Field(None, gt=0)
-    """Time limit in seconds."""
     word_weights: tuple[float, ...] = ()
     background: tuple[RowReference, ...] = ()
 
@@ -119,8 +113,6 @@ class SearchResponse(_Message):
     hits: tuple[SearchHit, ...]
     certificate: str
     """Guarantee of the result's completeness, one of CERTIFICATES."""
-    certified_k: int = 0
-    """Number of leading hits that are certain: all of them, unless the search stopped early."""
     rows_scanned: int
     rows_reranked: int
     """Number of the scanned rows that were compared exactly, by their full descriptors."""
@@ -165,9 +157,8 @@ class DeviceStatus(_Message):
     name: str
     resident_bytes: int
     """Bytes of descriptors in the GPU's memory."""
-    generations: dict[UUID, str]
-    """Generations searched on the GPU, with their row format, `float16`; the others are
-    searched on the CPU."""
+    generations: tuple[UUID, ...]
+    """Generations searched on the GPU; the others are searched on the CPU."""
     failure: str | None = None
     """Last error, after which the CPU searches until the next attempt; None if there is none."""
 

@@ -9,7 +9,6 @@ The module also selects the word weights that a search ranks by (`select_ranking
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -289,7 +288,6 @@ def run_similarity_search(
         generation_id=query.generation.id,
         rows=RowType(query.generation.row_type),
         certificate=response.certificate,
-        certified_k=_count_certified(similar[: search_params.top_k], response),
         max_z=response.max_z,
         rows_scanned=response.rows_scanned,
         rows_reranked=response.rows_reranked,
@@ -352,9 +350,8 @@ def _rank_neighbours(
     if not hits:
         return []
     best = hits[0].photo_id
-    limits = (search_params.mode, search_params.most_rows, search_params.most_seconds)
     neighbours = gateway.neighbours.get_or_search(
-        (query.generation.id, query.map.version, best, weights, *limits),
+        (query.generation.id, query.map.version, best, weights, search_params.mode),
         partial(_search_neighbours, gateway, query, search_params, best, weights),
     )
     return [ranked for ranked in neighbours if ranked.photo != query.photo_id]
@@ -381,12 +378,6 @@ def _search_neighbours(
     except Gone:  # its chunk was merged into another one between the two reads
         return (), False
     return tuple(locate_hits(hits, photos)), not response.missing
-
-
-def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:
-    """Number of leading hits that the search guarantees."""
-    certain = {hit.photo_id for hit in response.hits[: response.certified_k]}
-    return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in certain, hits))
 
 
 def _search_live_photos(
@@ -416,8 +407,6 @@ def _search_live_photos(
                 word_weights=weights,
                 background=query.background,
                 mode=search_params.mode,
-                most_rows=search_params.most_rows,
-                most_seconds=search_params.most_seconds,
             )
         )
         with gateway.catalog.read() as session:

@@ -171,19 +171,7 @@ class RankingParams(BaseModel):
     mode: Mode = Field(
         Mode.AUTO,
         description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
-        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
-    )
-    most_rows: int | None = Field(
-        None,
-        ge=0,
-        le=MAX_INTEGER,
-        description="Stop the search after reading this many rows; `certificate` reports it.",
-    )
-    most_seconds: float | None = Field(
-        None,
-        gt=0,
-        allow_inf_nan=False,
-        description="Stop the search after this many seconds; `certificate` reports it.",
+        "every row. Both return the same photos.",
     )
 
     @property

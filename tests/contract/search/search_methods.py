@@ -12,9 +12,3 @@ def always_by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(catalog_sync, "MIN_CODED_BYTES", 0)
     monkeypatch.setattr(catalog_sync, "CODED_DIMENSION", 1)
     monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-
-
-def always_by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every search of more than nothing goes through int8 codes, as that of middle dimensions."""
-    monkeypatch.setattr(catalog_sync, "MIN_CODED_BYTES", 0)
-    monkeypatch.setattr(executor, "int8_codes_pay_off", lambda selected, *_: selected > 0)

@@ -25,7 +25,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, manifest_key
-from tests.contract.search.search_methods import always_by_codes, always_by_int8
+from tests.contract.search.search_methods import always_by_codes
 from tests.support.small_map import (
     Reference,
     Rows,
@@ -130,14 +130,12 @@ def migrated(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("migrated")
-@pytest.mark.parametrize("by", ["dense", "sign codes", "int8 codes"])
+@pytest.mark.parametrize("by", ["dense", "sign codes"])
 def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_photo(
     by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if by == "sign codes":
         always_by_codes(monkeypatch)
-    elif by == "int8 codes":
-        always_by_int8(monkeypatch)
     run_state_machine_as_test(
         AddDeleteMerge,
         settings=how(

@@ -1,4 +1,4 @@
-"""The search worker keeps the contract with each method: dense, sign codes, int8, GPU."""
+"""The search worker keeps the contract with each method: dense, sign codes, GPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shared.config.shards import SINGLE_SHARD
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import decode_rows
-from tests.contract.search.search_methods import always_by_codes, always_by_int8
+from tests.contract.search.search_methods import always_by_codes
 from tests.contract.search.test_search_backend import (
     OpenPort,
     SearchPortContract,
@@ -153,7 +153,7 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     settings: Settings,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    always_by_int8(monkeypatch)  # with cached files
+    always_by_codes(monkeypatch)  # with cached files
     places = SmallMap(catalog, store)
     places.add(unit_rows(1, 30))
     worker = SearchWorker(catalog, store, settings)
@@ -193,17 +193,6 @@ class TestSearchWorkerByCodes(TestSearchWorker):
     def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         always_by_codes(monkeypatch)
 
-
-@whatever_the_catalog
-class TestSearchWorkerByInt8(TestSearchWorker):
-    """The same promises where int8 codes select the rows."""
-
-    certificate = "bound"
-
-    @pytest.fixture(autouse=True)
-    def by_int8(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        always_by_int8(monkeypatch)
-
     @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
     def test_codes_that_are_damaged_or_gone_are_made_again(
         self, places: SmallMap, port: OpenPort, settings: Settings, damage: str
@@ -211,7 +200,7 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         places.add(unit_rows(1, 30))
         vector = unit_rows(2, 1)[0]
         first = port().search(places.request(places.query(vector)))
-        (path,) = settings.search_cache_folder(SINGLE_SHARD).rglob("*.int8")
+        (path,) = settings.search_cache_folder(SINGLE_SHARD).rglob("*.codes")
         whole = path.read_bytes()
         path.unlink()
         if damage != "gone":
@@ -275,7 +264,7 @@ class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):
 class TestSearchWorkerOnADevice(TestSearchWorker):
     """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
 
-    certificate = "bound"
+    certificate = "exhaustive"
 
     @pytest.fixture
     def port(
@@ -288,7 +277,7 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
 
         def open_port(**changes: object) -> SearchBackend:
-            device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)
+            device = gpu.GpuDevice(torch.device("cpu"))
             worker = SearchWorker(
                 catalog, store, settings.model_copy(update=changes), device=device
             )
@@ -305,9 +294,9 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         assert list(device.generations) == [places.generation_id]
         before = device.resident_bytes
         places.add(unit_rows(2, 40))
-        response = search.search(places.request(places.query(unit_rows(3, 1)[0])))
-        assert response.certificate == "bound", "a new chunk is on the device at once"
-        assert search.status().devices[0].resident_bytes == 2 * before
+        search.search(places.request(places.query(unit_rows(3, 1)[0])))
+        there = search.status().devices[0].resident_bytes
+        assert there == 2 * before, "a new chunk is on the device at once"
         assert search.status().devices[0].failure is None
 
     def test_metrics_tell_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:

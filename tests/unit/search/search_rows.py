@@ -18,7 +18,6 @@ from services.search.photo_columns import PhotoColumns
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.catalog.photos import PhotoFilterValues, PhotoRole
-from shared.codes.int8_codes import int8_codes
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import SearchResponse
@@ -33,8 +32,8 @@ def photo(number: int) -> UUID:
     return UUID(int=number + 1)
 
 
-def snapshot_of(rows: StoredRows, pieces: int = 3, by: str = "signs") -> Snapshot:
-    """The rows in so many chunks, with one kind of codes or none."""
+def snapshot_of(rows: StoredRows, pieces: int = 3, *, coded: bool = True) -> Snapshot:
+    """The rows in so many chunks, with sign codes or without."""
     bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
     chunks = [
         LoadedChunk(
@@ -42,8 +41,7 @@ def snapshot_of(rows: StoredRows, pieces: int = 3, by: str = "signs") -> Snapsho
             f"chunks/{a}.npy",
             rows[a:b],
             PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
-            codes=encode_signs(rows[a:b]) if by == "signs" else None,
-            int8=int8_codes(rows[a:b]) if by == "int8" else None,
+            codes=encode_signs(rows[a:b]) if coded else None,
         )
         for a, b in pairwise(bounds.tolist())
     ]

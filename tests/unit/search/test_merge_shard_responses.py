@@ -15,7 +15,6 @@ from shared.search_api.client import merge_responses, merge_statuses
 from shared.search_api.protocol import (
     EXHAUSTIVE,
     NONE,
-    STATISTICAL,
     ReplicationLag,
     SearchHit,
     SearchRequest,
@@ -108,9 +107,8 @@ def test_sums_least_version_and_missing_chunks_are_merged() -> None:
 def test_nothing_is_certain_of_an_answer_that_lacks_a_part_of_the_map(
     missing: tuple[str, ...], away: list[Shard]
 ) -> None:
-    """Also where a worker of the release before promised more."""
-    merged = merge_responses([answer((1, 0.9), certified_k=1, missing=missing)], 1, away)
-    assert (merged.certificate, merged.certified_k) == (NONE, 0)
+    merged = merge_responses([answer((1, 0.9), missing=missing)], 1, away)
+    assert merged.certificate == NONE
 
 
 def test_the_weakest_certificate_counts() -> None:
@@ -119,35 +117,6 @@ def test_the_weakest_certificate_counts() -> None:
         merge_responses([answer(), answer(certificate="of the future")], 1).certificate
         == "of the future"
     )
-
-
-@given(data=st.data(), of=st.integers(1, 4), k=st.integers(1, 12))
-def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
-    data: st.DataObject, of: int, k: int
-) -> None:
-    some_scores = st.lists(st.integers(-100, 100).map(lambda cent: cent / 100), max_size=10)
-    everything: list[tuple[int, float]] = []
-    answers = []
-    for shard in range(of):
-        hits = [(100 * shard + n, score) for n, score in enumerate(data.draw(some_scores))]
-        everything += hits
-        seen = [hit for hit in hits if data.draw(st.booleans())]
-        unseen = max((score for _, score in set(hits) - set(seen)), default=-2.0)
-        certain = sum(score > unseen for _, score in seen)
-        certificate = STATISTICAL if len(seen) == len(hits) else NONE
-        answers.append(answer(*seen, certified_k=certain, certificate=certificate))
-    merged = merge_responses(answers, k)
-    truth = sorted(everything, key=lambda hit: (-hit[1], hit[0]))[:k]
-    assert ranked(merged)[: merged.certified_k] == truth[: merged.certified_k]
-    if all(one.certificate != NONE for one in answers):
-        assert merged.certified_k == len(truth)
-
-
-def test_what_is_certain_of_a_ranking_by_weighted_scores_is_decided_by_them() -> None:
-    early = weighted((1, 0.3, 0.9), (2, 0.2, 0.5), certified_k=1, certificate=NONE)
-    # A photo that the first shard has not seen may have a weighted score of up to 0.9.
-    merged = merge_responses([early, weighted((3, 0.8, 0.7))], k=3)
-    assert (ranked(merged), merged.certified_k) == ([(1, 0.3), (3, 0.8), (2, 0.2)], 1)
 
 
 def test_largest_error_of_an_estimate_is_merged_and_none_without_estimates() -> None:

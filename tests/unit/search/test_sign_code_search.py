@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -50,7 +49,6 @@ def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     assert_best(hits_of(found), case.exact, case.k)
     if case.selected.any():
         assert found.certificate == "statistical"
-        assert found.certified_k == len(found.hits)
         assert found.rows_scanned == int(case.selected.sum())
         assert found.max_z is not None
         assert found.max_z < 5.5
@@ -66,7 +64,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
         assert found.certificate == "statistical"
 
 
-def test_most_rows_are_never_read_when_the_place_is_in_the_map() -> None:
+def test_few_rows_are_read_when_the_place_is_in_the_map() -> None:
     rows = places(1, 2000)
     query = rows[77] + np.float32(0.002) * places(9, 1)[0]
     found = answer(snapshot_of(rows), query, np.ones(2000, bool), SearchOptions(1))
@@ -122,38 +120,6 @@ def test_codes_that_lie_are_found_out_and_every_row_is_compared() -> None:
     found = answer(lying, rows[3], everything, SearchOptions(10))
     assert found.certificate == "exhaustive"
     assert_best(hits_of(found), dict(brute_force(rows, rows[3], len(rows), everything)), 10)
-
-
-@pytest.mark.parametrize("most_rows", [0, 1, 5, 12])
-def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_rows: int) -> None:
-    rows = places(8, 400)
-    everything = np.ones(400, bool)
-    query = rows[3] + np.float32(0.5) * places(19, 1)[0]
-    found = answer(snapshot_of(rows), query, everything, SearchOptions(20, most_rows=most_rows))
-    assert found.certificate == "none"
-    assert found.rows_reranked <= most_rows
-    exact = dict(brute_force(rows, query, 400, everything))
-    assert found.certified_k <= len(found.hits)
-    assert_best(hits_of(found)[: found.certified_k], exact, found.certified_k)
-
-
-def test_search_that_runs_out_of_time_says_so() -> None:
-    rows = places(8, 400)
-    found = answer(
-        snapshot_of(rows), rows[3], np.ones(400, bool), SearchOptions(20, most_seconds=1e-9)
-    )
-    assert found.certificate == "none"
-    assert found.certified_k <= len(found.hits) < 20
-
-
-def test_nothing_that_matters_left_out_is_no_giving_up() -> None:
-    rows = places(8, 400)
-    found = answer(
-        snapshot_of(rows), rows[3], np.ones(400, bool), SearchOptions(1, 0.999, most_rows=400)
-    )
-    assert found.certificate == "statistical"
-    assert [hit.photo_id for hit in found.hits] == [photo(3)]
-    assert math.isclose(found.hits[0].score, 1.0, abs_tol=1e-6)
 
 
 def test_queries_that_come_together_get_the_answers_that_they_get_alone(
