@@ -39,7 +39,7 @@ from services.gateway.routes import (
     uploads,
     webhooks,
 )
-from services.gateway.web_page import create_web_page_router
+from services.gateway.web_page import add_web_page
 from services.request_log import RequestLogMiddleware
 from shared.http.problem_details import (
     AUTHENTICATION_RESPONSES,
@@ -110,7 +110,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     )
     install_exception_handlers(app)
     app.add_exception_handler(IdempotentReplay, replay_response)
-    app.include_router(create_web_page_router(gateway.settings, gateway.lan_url))
+    add_web_page(app, gateway.settings, gateway.lan_url)
     return app
 
 

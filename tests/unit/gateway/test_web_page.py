@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 from pathlib import Path
 
@@ -12,20 +11,20 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.testclient import TestClient
 
-from services.gateway.web_page import create_web_page_router
-from services.web import PAGE_FOLDER
+from services.gateway.web_page import add_web_page
+from services.web import HTML_FOLDER, PAGE_FOLDER
 from shared.config.settings import Settings
 from shared.http.problem_details import install_exception_handlers
 
 TILES = "https://tiles.example.org/{z}/{x}/{y}.png"
 HTML = {"Accept": "text/html,*/*"}
-SOURCES = sorted(PAGE_FOLDER.rglob("*"))
+SOURCES = sorted([*HTML_FOLDER.rglob("*"), *PAGE_FOLDER.rglob("*")])
 
 
 def served(settings: Settings) -> TestClient:
     app = FastAPI(docs_url=None, redoc_url=None)
     install_exception_handlers(app)
-    app.include_router(create_web_page_router(settings))
+    add_web_page(app, settings)
     return TestClient(app, base_url="http://localhost")
 
 
@@ -56,7 +55,6 @@ def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> No
         ("views/ask.js", "text/javascript; charset=utf-8"),
         ("style.css", "text/css; charset=utf-8"),
         ("mark.svg", "image/svg+xml"),
-        ("settings.json", "application/json"),
         ("leaflet/leaflet.js", "text/javascript; charset=utf-8"),
         ("api/swagger-ui-bundle.js", "text/javascript; charset=utf-8"),
     ],
@@ -67,11 +65,9 @@ def test_files_have_their_type_and_are_small_on_the_way(
     zipped = page.get(f"/console/{path}", headers={"Accept-Encoding": "gzip"})
     plain = page.get(f"/console/{path}", headers={"Accept-Encoding": "identity"})
     assert zipped.headers["content-type"] == plain.headers["content-type"] == media_type
-    assert zipped.headers["content-encoding"] == "gzip"
+    assert ("content-encoding" in zipped.headers) == (len(plain.content) >= 500)
     assert "content-encoding" not in plain.headers
     assert zipped.content == plain.content
-    assert zipped.headers["etag"] != plain.headers["etag"]
-    assert int(zipped.headers["content-length"]) == len(gzip.compress(plain.content, 9, mtime=0))
 
 
 def test_a_browser_that_has_a_file_is_not_sent_it_again(page: TestClient) -> None:
