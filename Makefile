@@ -92,11 +92,11 @@ size: $(INSTALLED) ## print lines, settings, commands and migrations beside thei
 types: $(INSTALLED) ## check types with mypy (strict)
 	$(BIN)/mypy
 
-bench: $(INSTALLED) ## benchmark upload, description and search
-	$(BIN)/placewise bench spine
+bench: $(INSTALLED) ## measure CPU time per photo and upload throughput
+	$(BIN)/placewise bench pipeline
 
 demo: $(INSTALLED) ## generate a city, index it, fit a vocabulary, search, print recall, write docs/demo.jpg
-	$(BIN)/python -m lab.benchmarks.demo --picture docs/demo.jpg
+	$(BIN)/python -m lab.demo --picture docs/demo.jpg
 
 env: ## write .env for docker compose with new secrets (an existing one is kept)
 	@test ! -e .env || { echo ".env exists already"; exit 1; }

@@ -16,7 +16,7 @@ batches=${BATCHES:-64,1,16,256}
 photos=${PHOTOS:-256}
 rounds=${ROUNDS:-1}
 search=${SEARCH:-"--photos 20000 --dimensions 98304"}
-train=${TRAIN:-"--places 100 --epochs 2"}
+train=${TRAIN:-""}
 placewise=${PLACEWISE:-.venv/bin/placewise}
 python=${PYTHON:-.venv/bin/python}
 

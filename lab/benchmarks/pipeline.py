@@ -16,10 +16,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import typer
+from rich.progress import TaskID
 from sqlalchemy import select
 
 from lab.benchmarks.fleet import Fleet, ServiceProcess, open_fleet, start_servers
@@ -29,15 +31,13 @@ from lab.benchmarks.fleet.load_generator import (
     upload_all,
     wait_for_jobs,
 )
-from lab.benchmarks.report import Report
+from lab.benchmarks.report import Report, parse_integers, printed_report
+from services.cli.output import JsonOption
 from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
 from shared.extractor_config.configs import get_extractor_config
 from shared.search_api.client import HttpSearchClient
 from tests.support.servers.daemon import free_ports
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
 
 TARGET_MILLISECONDS = {7168: 20.0, 98304: 25.0}
 TARGET_SHARE_OF_BARE = 0.5
@@ -48,16 +48,26 @@ TIMEOUT_SECONDS = 900.0
 SERVICES = ("gateway", "extractor", "search", "steward")
 
 
-def measure(
-    progress: Progress, *, widths: Sequence[int], photos: int, batch: int, rounds: int
-) -> Report:
-    """Measure `photos` of 100 kB per descriptor width in batches of `batch`; then upload rates.
-
-    Uploads go to the gateway and to the bare server in `rounds` alternating rounds.
-    """
-    report = Report("CPU time per photo outside the model")
+def bench(
+    widths: Annotated[
+        Any,
+        typer.Option(
+            help="Descriptor dimensions, comma-separated.",
+            parser=parse_integers,
+            metavar="INTEGERS",
+        ),
+    ] = "7168,98304",
+    photos: Annotated[int, typer.Option(min=1)] = 320,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 32,
+    rounds: Annotated[int, typer.Option(min=1, help="Upload rounds per gateway.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure CPU time per photo outside the model, and upload throughput."""
     jpegs = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
-    with start_servers() as servers:
+    with (
+        printed_report("CPU time per photo outside the model", as_json) as (report, progress),
+        start_servers() as servers,
+    ):
         for width in widths:
             extractor = _test_extractor(width)
             with open_fleet(servers, extractor=extractor, batch_photos=batch) as fleet:
@@ -72,12 +82,11 @@ def measure(
             bar = progress.add_task("uploads", total=2 * rounds * photos)
             fleet.start("search-0-0", "gateway-0")
             _measure_uploads(report, fleet, jpegs, photos, rounds, lambda: progress.advance(bar))
-    report.details = {
-        "photo_bytes": statistics.mean(len(photo) for photo in jpegs),
-        "photos": photos,
-        "batch": batch,
-    }
-    return report
+        report.details = {
+            "photo_bytes": statistics.mean(len(photo) for photo in jpegs),
+            "photos": photos,
+            "batch": batch,
+        }
 
 
 def _test_extractor(width: int) -> str:

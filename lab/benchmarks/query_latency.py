@@ -3,8 +3,7 @@
     placewise bench query-latency [--backlog 5000] [--seconds 60] [--milliseconds 50] [--batch 16]
 
 A batch that runs on the model cannot be interrupted. A query may therefore wait for one batch, but
-not for two. Reported: the time of a batch; p50, p95 and maximum of a query; and of its three stages
-(waiting for a worker, at the worker, and the rest: gateway, store and search).
+not for two. Reported: the time of a batch, and p50, p95 and maximum of a query.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import statistics
 import time
 from collections.abc import Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import Annotated
 from uuid import UUID
 
+import typer
 from sqlalchemy import func, insert, select
 
 from lab.benchmarks.chaos.run import count_unfinished_jobs
@@ -30,14 +30,12 @@ from lab.benchmarks.fleet.load_generator import (
     upload_all,
     wait_for_jobs,
 )
-from lab.benchmarks.report import Report
+from lab.benchmarks.report import printed_report
+from services.cli.output import JsonOption
 from shared.catalog.chunks import Chunk
 from shared.catalog.photos import Photo
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 TARGET_MS_ABOVE_BATCH = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
@@ -47,16 +45,18 @@ TIMEOUT_SECONDS = 120.0
 SEED = 20_261_121
 
 
-def measure(
-    progress: Progress, *, backlog: int, seconds: float, milliseconds: int, batch: int
-) -> Report:
-    """Send queries at random moments for `seconds` while a backlog of photos is being described.
-
-    The extractor takes `batch` photos at a time and `milliseconds` per photo.
-    """
-    report = Report(f"Query photos while {backlog:,} uploads wait")
+def bench(
+    backlog: Annotated[int, typer.Option(min=1, help="Number of queued uploads.")] = 5000,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 60,
+    milliseconds: Annotated[int, typer.Option(min=0, help="Simulated work per photo.")] = 50,
+    batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 16,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure query latency while thousands of uploads are queued."""
     photos = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
+    title = f"Query photos while {backlog:,} uploads wait"
     with (
+        printed_report(title, as_json) as (report, progress),
         open_fleet(
             extractor=f"test-slow-avg:milliseconds={milliseconds},width={DESCRIPTOR_DIMENSION}",
             batch_photos=batch,
@@ -78,7 +78,6 @@ def measure(
             progress.update(bar, completed=seconds - left)
             time.sleep(rng.uniform(0, pause))
             latencies.append(_time_query(caller, rng.choice(photos)))
-        stages = _stage_seconds(fleet, latencies)
         periods = _batch_seconds(fleet, since, batch)
         report.add(
             "uploads still waiting at the end",
@@ -86,14 +85,11 @@ def measure(
             at_least=1,
         )
         report.add("services that crashed", len(fleet.crashed), at_most=0)
-    batch_ms = 1000 * statistics.median(periods)
-    report.add("queries", len(latencies))
-    report.add("a batch, p50", batch_ms, "ms")
-    report.add_latency("query", latencies, worst_at_most_ms=batch_ms + TARGET_MS_ABOVE_BATCH)
-    for stage, durations in stages.items():
-        report.add_latency(stage, durations)
-    report.details = {"seconds": latencies, "stages": stages, "batch_seconds": periods}
-    return report
+        batch_ms = 1000 * statistics.median(periods)
+        report.add("queries", len(latencies))
+        report.add("a batch, p50", batch_ms, "ms")
+        report.add_latency("query", latencies, worst_at_most_ms=batch_ms + TARGET_MS_ABOVE_BATCH)
+        report.details = {"seconds": latencies, "batch_seconds": periods}
 
 
 def _time_query(caller: HttpCaller, photo: bytes) -> float:
@@ -182,28 +178,3 @@ def _batch_seconds(fleet: Fleet, since: datetime, batch: int) -> list[float]:
     ]
     assert durations, "no batch came without a query between: query less often"
     return durations
-
-
-def _stage_seconds(fleet: Fleet, latencies: Sequence[float]) -> dict[str, list[float]]:
-    """Return the time of each query by stage, from the job table."""
-    with fleet.catalog.read() as session:
-        jobs = session.scalars(
-            select(Job)
-            .where(Job.kind == JobKind.DESCRIBE)
-            .order_by(Job.id.desc())
-            .limit(len(latencies))
-        ).all()
-    by_stage: dict[str, list[float]] = {
-        "waiting for a worker": [],
-        "at the worker": [],
-        "gateway, store and search": [],
-    }
-    for job, seconds in zip(reversed(jobs), latencies, strict=True):
-        assert job.started_at is not None
-        assert job.finished_at is not None
-        waited = (job.started_at - job.created_at).total_seconds()
-        worked = (job.finished_at - job.started_at).total_seconds()
-        by_stage["waiting for a worker"].append(waited)
-        by_stage["at the worker"].append(worked)
-        by_stage["gateway, store and search"].append(seconds - waited - worked)
-    return by_stage

@@ -8,13 +8,17 @@ well above 2 means that other work slowed the measurement down.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from services.cli.output import Table
+import typer
+from rich.progress import Progress
+
+from services.cli.output import Table, print_json, print_table, progress_bar
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +114,40 @@ class Report:
                 style="red" if figure.missed else None,
             )
         return table
+
+
+@contextlib.contextmanager
+def printed_report(title: str, as_json: bool) -> Iterator[tuple[Report, Progress]]:
+    """Yield an empty report and progress bars for a benchmark command, and print the report.
+
+    Raises:
+        typer.Exit: with code 1, if a value misses its target.
+    """
+    report = Report(title)
+    with progress_bar() as progress:
+        yield report, progress
+    if as_json:
+        print_json(report.as_json())
+    else:
+        for table in (*report.tables, report.table()):
+            print_table(table)
+    if report.missed:
+        raise typer.Exit(1)
+
+
+def parse_integers(text: str) -> list[int]:
+    """Parse a comma-separated list of positive integers; returns them sorted and unique.
+
+    Raises:
+        typer.BadParameter: the text is no such list.
+    """
+    try:
+        numbers = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a list of integers such as 1,2,4") from None
+    if numbers[0] < 1:
+        raise typer.BadParameter("numbers must be at least 1")
+    return numbers
 
 
 @dataclass(frozen=True, slots=True)

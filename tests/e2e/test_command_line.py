@@ -428,19 +428,6 @@ def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path)
     assert "Traceback" not in served.stderr
 
 
-def test_bench_prints_figures_and_leaves_the_folder_alone(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    bench = CommandLine(tmp_path, home)(
-        "bench", "spine", "--photos", "4", "--queries", "2", "--json"
-    )
-    figures = {figure["what"]: figure["measured"] for figure in bench.json()["figures"]}
-    assert figures["4 photos searchable after"] > 0
-    for name in ("upload, 4 clients", "query by stored photo", "query by new photo"):
-        assert 0 < figures[f"{name}, p50"] <= figures[f"{name}, p95"] <= figures[f"{name}, worst"]
-        assert figures[f"{name}, rate"] > 0
-    assert not home.exists()
-
-
 # --- config and doctor -----------------------------------------------------------------------
 
 

@@ -1,7 +1,4 @@
-"""Clients that are slow on purpose: others are answered meanwhile, and limits answer by name.
-
-How long calls take meanwhile is measured by `placewise bench slow-clients`.
-"""
+"""Clients that are slow on purpose: others are answered meanwhile, and limits answer by name."""
 
 from __future__ import annotations
 

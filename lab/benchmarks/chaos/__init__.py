@@ -8,6 +8,6 @@ each fault the time from its repair until every acknowledged photo was searchabl
 retried calls and of checked results; and the violations, which must all be zero.
 """
 
-from lab.benchmarks.chaos.run import ChaosRun, measure, run_chaos
+from lab.benchmarks.chaos.run import ChaosRun, run_chaos
 
-__all__ = ["ChaosRun", "measure", "run_chaos"]
+__all__ = ["ChaosRun", "run_chaos"]

@@ -10,15 +10,17 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated
 from uuid import UUID
 
+import typer
 from sqlalchemy import ColumnElement, func, select
 
 from lab.benchmarks.chaos.faults import CLOCK_OFFSETS_SECONDS, Fault, all_faults
 from lab.benchmarks.chaos.traffic import Traffic
 from lab.benchmarks.fleet import Fleet, start_servers
-from lab.benchmarks.report import Report
+from lab.benchmarks.report import printed_report
+from services.cli.output import JsonOption
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
@@ -29,9 +31,6 @@ from shared.jobs import Job
 from shared.storage import ObjectStore
 from shared.storage.chunks import manifest_key
 from tests.support.clock import clock_off_by
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 
 @dataclass(slots=True)
@@ -280,35 +279,47 @@ def _wait_until(deadline: float, done: Callable[[], bool]) -> None:
         time.sleep(POLL_SECONDS)
 
 
-def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int) -> Report:
-    """Inject every fault once, in a random order that is determined by the seed."""
+def bench(
+    photos: Annotated[
+        int, typer.Option(min=30, help="Photos to upload while services are killed.")
+    ] = 2000,
+    fault_seconds: Annotated[float, typer.Option(min=0.1, help="Duration of each outage.")] = 30,
+    seed: Annotated[int, typer.Option(help="Seed of the order and times of faults.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Kill every service and server in turn; check that nothing is lost, duplicated or stuck."""
     faults = all_faults()
-    bar = progress.add_task("injecting faults", total=len(faults))
+    with (
+        printed_report(f"{photos} photos, {len(faults)} faults, seed {seed}", as_json) as (
+            report,
+            progress,
+        ),
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        bar = progress.add_task("injecting faults", total=len(faults))
 
-    def show(outcome: FaultOutcome) -> None:
-        progress.update(bar, advance=1, description=outcome.fault)
+        def show(outcome: FaultOutcome) -> None:
+            progress.update(bar, advance=1, description=outcome.fault)
 
-    with tempfile.TemporaryDirectory() as folder:
         run = run_chaos(
             Path(folder), photos=photos, fault_seconds=fault_seconds, seed=seed, on_outcome=show
         )
-    report = Report(f"{photos} photos, {len(run.outcomes)} faults of {len(faults)}, seed {seed}")
-    for outcome in run.outcomes:
-        report.add(f"recovered after: {outcome.fault}", outcome.recovery_seconds, "s")
-    report.add("calls repeated", sum(outcome.refused for outcome in run.outcomes))
-    report.add("responses compared", run.compared)
-    for what, values in (
-        ("photos lost", [outcome.counts.lost for outcome in run.outcomes]),
-        ("photos searchable twice", [outcome.counts.twice for outcome in run.outcomes]),
-        ("jobs stuck", [outcome.counts.stuck for outcome in run.outcomes]),
-        ("jobs failed", [outcome.counts.failed for outcome in run.outcomes]),
-        ("chunks torn", [outcome.counts.torn for outcome in run.outcomes]),
-        ("wrong matches", [outcome.wrong for outcome in run.outcomes]),
-        ("unexpected responses", [outcome.unexpected for outcome in run.outcomes]),
-    ):
-        report.add(what, sum(values), at_most=0)
-    report.details = {
-        "crashed": [name for outcome in run.outcomes for name in outcome.crashed],
-        "violations": run.details,
-    }
-    return report
+        for outcome in run.outcomes:
+            report.add(f"recovered after: {outcome.fault}", outcome.recovery_seconds, "s")
+        report.add("faults injected", len(run.outcomes), at_least=len(faults))
+        report.add("calls repeated", sum(outcome.refused for outcome in run.outcomes))
+        report.add("responses compared", run.compared)
+        for what, values in (
+            ("photos lost", [outcome.counts.lost for outcome in run.outcomes]),
+            ("photos searchable twice", [outcome.counts.twice for outcome in run.outcomes]),
+            ("jobs stuck", [outcome.counts.stuck for outcome in run.outcomes]),
+            ("jobs failed", [outcome.counts.failed for outcome in run.outcomes]),
+            ("chunks torn", [outcome.counts.torn for outcome in run.outcomes]),
+            ("wrong matches", [outcome.wrong for outcome in run.outcomes]),
+            ("unexpected responses", [outcome.unexpected for outcome in run.outcomes]),
+        ):
+            report.add(what, sum(values), at_most=0)
+        report.details = {
+            "crashed": [name for outcome in run.outcomes for name in outcome.crashed],
+            "violations": run.details,
+        }

@@ -1,4 +1,4 @@
-"""Load generator: synthetic JPEGs, an HTTP client with little overhead, counts of described photos.
+"""Load generator: synthetic JPEGs, an HTTP client with little overhead, waiting for jobs.
 
 The client shares the machine with the measured services. Request bodies are therefore built before
 the clock starts, and are sent over persistent connections without a framework.
@@ -11,14 +11,12 @@ import itertools
 import json
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from http.client import HTTPConnection, HTTPException
 from typing import Any, Self
 from urllib.parse import urlsplit
-from uuid import UUID
 
 import numpy as np
 from PIL import Image
@@ -27,7 +25,6 @@ from sqlalchemy import func, select
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.jobs import Job, JobKind, JobState
-from shared.storage import ObjectStore
 from tests.support.server import SERVICES_KEY
 
 BOUNDARY = "placewise-bench"
@@ -166,21 +163,6 @@ def upload_all(
 
 
 POLL_SECONDS = 0.2
-MANIFEST_SUFFIX = ".json"
-
-
-def count_descriptions(store: ObjectStore) -> Counter[UUID]:
-    """Count how often each photo was described.
-
-    A worker writes its chunk and a manifest of its photos before it tries to commit. Duplicate work
-    is therefore counted even if only one of two workers could commit. The counts are valid while
-    the steward does not merge chunks (COMPACT_CHUNKS, SLOT_ROWS).
-    """
-    found: Counter[UUID] = Counter()
-    for info in store.list("chunks/"):
-        if info.key.endswith(MANIFEST_SUFFIX):
-            found.update(UUID(name) for name in json.loads(store.get(info.key))["photo_ids"])
-    return found
 
 
 def wait_for_jobs(
@@ -208,9 +190,3 @@ def wait_for_jobs(
             return
         assert time.monotonic() < deadline, f"{left} photos wait after {seconds:g} s"
         time.sleep(POLL_SECONDS)
-
-
-def load_jobs(catalog: Catalog, job_ids: Collection[UUID]) -> list[Job]:
-    """Load the current state of jobs."""
-    with catalog.read() as session:
-        return list(session.scalars(select(Job).where(Job.id.in_(job_ids))))

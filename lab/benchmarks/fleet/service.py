@@ -1,26 +1,18 @@
-"""Processes of Placewise: a service that can be killed and paused, and `placewise serve`.
-
-`ServiceProcess` is one service of a fleet, `start_embedded_server` the embedded form.
-"""
+"""A service of a fleet in a process of its own, which can be killed and paused."""
 
 from __future__ import annotations
 
 import contextlib
-import os
-import resource
 import signal
-import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import httpx2
 import psutil
 
-from shared.config.embedded_home import RunningServer, find_running_server
-from shared.errors import Unavailable
-from tests.support.processes import PLACEWISE, Process, start
+from tests.support.processes import Process, start
 from tests.support.servers.daemon import cpu_seconds_of
 
 START_TIMEOUT_SECONDS = 120.0
@@ -148,45 +140,3 @@ class ServiceProcess:
 
     def log(self) -> str:
         return self.log_path.read_text(errors="replace")[-3000:]
-
-
-@contextlib.contextmanager
-def start_embedded_server(
-    folder: Path, *, max_open_files: int | None = None, **variables: str
-) -> Iterator[RunningServer]:
-    """Context manager that runs `placewise serve` in a process of its own; logs to server.log.
-
-    `variables` are added to this process's environment.
-
-    Raises:
-        Unavailable: `server_unreachable`, if the server does not start.
-    """
-    home = folder / "home"
-    environment = {**os.environ, "HOST": "127.0.0.1", "PORT": "0", **variables}
-
-    def limit_files() -> None:
-        if max_open_files is not None:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
-
-    with (
-        (folder / "server.log").open("wb") as log,
-        subprocess.Popen(  # noqa: S603
-            [PLACEWISE, "serve"],
-            env={**environment, "PLACEWISE_HOME": str(home)},
-            stderr=log,
-            cwd=folder,
-            preexec_fn=limit_files,
-        ) as server,
-    ):
-        try:
-            deadline = time.monotonic() + START_TIMEOUT_SECONDS
-            while (running := find_running_server(home)) is None:
-                if server.poll() is not None or time.monotonic() > deadline:
-                    output = (folder / "server.log").read_text(errors="replace")
-                    raise Unavailable(
-                        "server_unreachable", f"The server did not start: {output[-3000:]}"
-                    )
-                time.sleep(0.1)
-            yield running
-        finally:
-            server.terminate()

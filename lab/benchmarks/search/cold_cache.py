@@ -12,18 +12,14 @@ import numpy as np
 from rich.progress import Progress
 
 from lab.benchmarks.report import LatencySummary, Report
-from lab.benchmarks.search.comparison import MATCHED_CASE, load_worker
-from lab.benchmarks.search.methods import (
-    BenchmarkQuery,
-    BruteForce,
-    PlacewiseSearch,
-    Ranking,
-    same_ranking,
-)
+from lab.benchmarks.search.brute_force import BruteForce, Ranking, same_ranking
+from lab.benchmarks.search.methods import SearchMethod, load_worker, placewise_search
 from lab.benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
 from services.search.snapshot import Snapshot
+from shared.storage.chunks import Row
 
 TARGET_SLOWDOWN = 5.0  # p95 of cold queries over p95 of warm ones
+K = 10
 MAX_CACHED_SHARE = 0.01  # of the rows' pages; with more the cache was not cold
 
 
@@ -42,17 +38,16 @@ def measure_cold_cache(
     oracle = BruteForce.of(pieces, world.photo_ids, query_rows)
     worker = load_worker(world)
     snapshot = worker.snapshot(world.generation_id, world.version)
-    ours = PlacewiseSearch(world, worker, query_rows)
+    ours = placewise_search(world, worker)
     warm, cold, cached, differ = [], [], [], 0
-    for number in range(queries):
-        params = BenchmarkQuery(number, MATCHED_CASE.k)
-        ours.search(params)
-        warm.append(_time_search(ours, params)[0])
+    for number, row in enumerate(query_rows):
+        ours(row, K, None)
+        warm.append(_time_search(ours, row)[0])
         _drop_page_cache(snapshot, world)
         cached.append(_cached_share(snapshot))
-        seconds, found = _time_search(ours, params)
+        seconds, found = _time_search(ours, row)
         cold.append(seconds)
-        differ += not same_ranking(found, oracle.best(number, MATCHED_CASE.k))
+        differ += not same_ranking(found, oracle.best(number, K))
         bar.advance(task)
     report.add("cold: wrong results", differ, at_most=0)
     report.add("cold: share of pages still cached", max(cached), at_most=MAX_CACHED_SHARE)
@@ -91,7 +86,7 @@ def _cached_share(snapshot: Snapshot) -> float:
     return cached_pages / pages
 
 
-def _time_search(ours: PlacewiseSearch, params: BenchmarkQuery) -> tuple[float, Ranking]:
+def _time_search(search: SearchMethod, row: Row) -> tuple[float, Ranking]:
     started_at = time.perf_counter()
-    found = ours.search(params)
+    found = search(row, K, None)
     return time.perf_counter() - started_at, found

@@ -27,28 +27,24 @@ from numpy.typing import NDArray
 from sqlalchemy import insert
 
 from services.search.catalog_sync import MIN_CODED_BYTES
-from services.steward.tasks.compaction import merge_slot
-from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
+from shared.catalog.chunks import list_live_chunks
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation, GenerationState, RowType
-from shared.catalog.installation import open_installation_store
-from shared.catalog.maps import Map, create_map, increment_map_version, lock_map
-from shared.catalog.models import get_or_create_model
-from shared.catalog.photos import Photo, mark_photo_deleted
+from shared.catalog.generations import RowType
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
 from shared.codes.rotation import get_rotation
 from shared.config.settings import Settings
-from shared.ids import new_id
-from shared.search_api.protocol import SearchRequest
 from shared.storage import FolderStore
-from shared.storage.chunks import Row, Rows, encode_rows, write_chunk
+from shared.storage.chunks import Rows
+from tests.support.catalog_rows import add_chunk, add_generation, add_map, made_up_photo
 
 CHUNK_ROWS = 1000
 
 
 @dataclass(slots=True)
 class SyntheticMap:
-    """A map in a folder, which is changed as extractor, gateway and steward change it."""
+    """A map with one generation of float16 rows in a folder."""
 
     settings: Settings
     catalog: Catalog
@@ -56,9 +52,8 @@ class SyntheticMap:
     map_id: UUID
     generation_id: UUID
     dimension: int
-    row_type: RowType = RowType.FLOAT16
     photo_ids: list[UUID] = field(default_factory=list)
-    """In the order in which they were added; those that were deleted, too."""
+    """In the order in which they were added."""
 
     @property
     def version(self) -> int:
@@ -66,60 +61,15 @@ class SyntheticMap:
         with self.catalog.read() as session:
             return session.get_one(Map, self.map_id).version
 
-    def add(self, rows: Rows, slot: int | None = None) -> int:
-        """Publish a chunk of new photos, by default in a new slot; return the map's version."""
-        chunk_id, photo_ids = new_id(), [new_id() for _ in rows]
-        written = write_chunk(
-            self.store,
-            generation_id=self.generation_id,
-            chunk_id=chunk_id,
-            rows=rows.astype(self.row_type, copy=False),
-            photo_ids=photo_ids,
-            spec={},
-        )
-        photos = [self._photo(photo_id) for photo_id in photo_ids]
+    def add(self, rows: Rows) -> None:
+        """Publish a chunk of new photos."""
+        photos = [made_up_photo(self.map_id) for _ in rows]
         with self.catalog.write() as session:
-            lock_map(session, self.map_id)
             session.execute(insert(Photo), photos)
-            session.add(
-                Chunk(
-                    id=chunk_id,
-                    generation_id=self.generation_id,
-                    slot=len(self.photo_ids) // CHUNK_ROWS if slot is None else slot,
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
-                )
-            )
-            session.flush()
-            session.execute(
-                insert(Descriptor),
-                [
-                    {
-                        "generation_id": self.generation_id,
-                        "photo_id": photo_id,
-                        "chunk_id": chunk_id,
-                        "row": row,
-                    }
-                    for row, photo_id in enumerate(photo_ids)
-                ],
-            )
-            version = increment_map_version(session, self.map_id)
-        self.photo_ids += photo_ids
-        return version
-
-    def delete(self, photo_id: UUID) -> int:
-        """Delete a photo; return the version from which on it is gone."""
-        with self.catalog.write() as session:
-            lock_map(session, self.map_id)
-            version = increment_map_version(session, self.map_id)
-            mark_photo_deleted(session, session.get_one(Photo, photo_id), version)
-        return version
-
-    def merge(self, slot: int) -> bool:
-        """Merge the slot's chunks into one, as the steward does."""
-        return merge_slot(self.catalog, self.store, self.generation_id, slot)
+        ids = [photo["id"] for photo in photos]
+        stored = rows.astype(RowType.FLOAT16)
+        add_chunk(self.catalog, self.store, self.generation_id, ids, CHUNK_ROWS, stored)
+        self.photo_ids += ids
 
     def chunk_paths(self) -> list[Path]:
         """Return the files of the live chunks."""
@@ -127,78 +77,25 @@ class SyntheticMap:
             keys = [chunk.object_key for chunk in list_live_chunks(session, self.generation_id)]
         return [self.store.path(key) for key in keys]
 
-    def request(
-        self, object_key: str, k: int, min_version: int, min_score: float | None = None
-    ) -> SearchRequest:
-        """Build a search request for a row that `store_query` has stored."""
-        return SearchRequest(
-            map_id=self.map_id,
-            generation_id=self.generation_id,
-            object_key=object_key,
-            row=0,
-            min_version=min_version,
-            k=k,
-            min_score=min_score,
-        )
-
-    def store_query(self, row: Row) -> str:
-        """Store a query's descriptor, as a `describe` job does; return its key."""
-        key = f"queries/{new_id()}.npy"
-        self.store.put(key, encode_rows(row[np.newaxis]))
-        return key
-
-    def _photo(self, photo_id: UUID) -> dict[str, object]:
-        return {
-            "id": photo_id,
-            "map_id": self.map_id,
-            "sha256": photo_id.hex * 2,
-            "object_key": f"originals/{photo_id}",
-            "filename": "photo.jpg",
-            "media_type": "image/jpeg",
-            "size_bytes": 1,
-            "width": 1,
-            "height": 1,
-        }
-
 
 @contextlib.contextmanager
 def create_synthetic_map(
-    home: Path,
-    dimension: int,
-    *,
-    search_memory_budget: int,
-    row_type: RowType = RowType.FLOAT16,
+    home: Path, dimension: int, *, search_memory_budget: int
 ) -> Iterator[SyntheticMap]:
     """Create an empty map in the folder `home`, in a SQLite catalog."""
-    chosen = Settings(
+    settings = Settings(
         _env_file=None, placewise_home=home, search_memory_budget=search_memory_budget
     )
     home.mkdir(parents=True, exist_ok=True)
-    catalog = Catalog(chosen.catalog_url())
-    try:
+    with contextlib.closing(Catalog(settings.catalog_url())) as catalog:
         migrate(catalog)
         with catalog.write() as session:
-            map_id = create_map(session, "default", "test-tiny-avg").id
-            generation = Generation(
-                id=new_id(),
-                map_id=map_id,
-                state=GenerationState.ACTIVE,
-                extractor="test-tiny-avg",
-                spec={"clusters": None},
-                spec_fingerprint="0" * 64,
-                dimension=dimension,
-                row_type=row_type,
-                model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
+            map_id = add_map(session).id
+            generation = add_generation(
+                session, map_id, dimension=dimension, row_type=RowType.FLOAT16
             )
-            session.add(generation)
-        open_installation_store(
-            catalog, chosen, exclusive=True
-        )  # marks the folder as the catalog's
         store = FolderStore(home / "objects")
-        world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension, row_type)
-        yield world
-    finally:
-        catalog.close()
+        yield SyntheticMap(settings, catalog, store, map_id, generation.id, dimension)
 
 
 def required_memory_bytes(photos: int, dimension: int) -> int:

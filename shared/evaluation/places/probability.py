@@ -2,7 +2,7 @@
 
 Each is a logistic regression on the features of the ranking (`level_features`). `fit` fits
 them to a map; without a fit, the coefficients are those of generated maps
-(`lab/benchmarks/places/place_prior.py`), which order the levels of any map, but are far too certain
+(`lab/benchmarks/place_prior.py`), which order the levels of any map, but are far too certain
 in a map of few photos. `thresholds` decides which level is the answer.
 """
 

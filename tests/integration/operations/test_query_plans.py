@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy.engine import make_url
 
-from lab.benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
-from lab.benchmarks.catalog.explain import Explainer
-from lab.benchmarks.catalog.fill import SyntheticCatalog, fill_catalog
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
+from tests.integration.operations.query_plans.calls import KNOWN_FULL_SCANS, run_all_calls
+from tests.integration.operations.query_plans.explain import Explainer
+from tests.integration.operations.query_plans.fill import SyntheticCatalog, fill_catalog
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.
@@ -49,7 +49,7 @@ def _open(url: str) -> Catalog:
 
 def test_no_statement_reads_a_whole_map(filled: Filled, tmp_path: Path) -> None:
     catalog, contents = filled
-    explainer = Explainer(catalog, small=True)
+    explainer = Explainer(catalog)
     calls = list(run_all_calls(catalog, contents, explainer, tmp_path))
     assert {e.call for e in explainer.plans} >= set(calls) - {
         "steward: fit vocabularies",
@@ -69,6 +69,6 @@ def test_missing_index_is_noticed(filled: Filled, tmp_path: Path) -> None:
     catalog, contents = filled
     with catalog.engine.begin() as connection:
         connection.exec_driver_sql("DROP INDEX ix_photos_tags")
-    explainer = Explainer(catalog, small=True)
+    explainer = Explainer(catalog)
     assert list(run_all_calls(catalog, contents, explainer, tmp_path, "GET /search?tags"))
     assert any(e.faults() for e in explainer.plans)

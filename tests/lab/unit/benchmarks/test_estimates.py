@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.progress import Progress
+from typer.testing import CliRunner
 
-from lab.benchmarks.places import estimates
-from lab.benchmarks.places.estimates import (
+from lab.benchmarks import estimates
+from lab.benchmarks.estimates import (
     DescribedPhotos,
     add_answers,
     add_left_out,
@@ -19,6 +20,7 @@ from lab.benchmarks.places.estimates import (
     left_out_labels,
 )
 from lab.benchmarks.report import Report
+from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.fit import MIN_LABELLED_QUERIES
@@ -80,15 +82,15 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
 
     monkeypatch.setattr(estimates, "describe_set", describe)
     monkeypatch.setenv("PLACEWISE_TEST_DATA", str(tmp_path))
-    report = estimates.measure(Progress(), folders=None, splits=1)
+    output = (
+        CliRunner().invoke(build_app(["bench"]), ["bench", "estimates", "--splits", "1"]).output
+    )
     assert described_folders == [tmp_path / "tower"]
-    titles = [table.title for table in report.tables]
-    assert "house, half of its queries labelled" in titles
-    shares = report.tables[0].columns
-    assert [column.header for column in shares] == ["share", "%", "95 % interval"]
+    assert "house, half of its queries labelled" in output
+    assert "95 % interval" in output
     monkeypatch.delenv("PLACEWISE_TEST_DATA")
     with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
-        estimates.measure(Progress(), folders=None, splits=1)
+        estimates.bench()
 
 
 def test_each_floor_is_left_out_once_and_its_photos_get_few_fine_answers() -> None:

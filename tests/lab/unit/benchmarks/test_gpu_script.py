@@ -17,7 +17,7 @@ TINY = {
     "BATCHES": "1,2",
     "PHOTOS": "2",
     "SEARCH": "--photos 20 --dimensions 64 --queries 2",
-    "TRAIN": "--places 0",  # refused: its row says why
+    "TRAIN": "--photos 0",  # refused: its row says why
     "PYTHON": sys.executable,
     "ALLOW_TEST_EXTRACTORS": "1",
 }
@@ -41,8 +41,8 @@ def run_script(folder: Path, **variables: str) -> str:
 
 def test_script_writes_one_table_and_names_what_it_could_not_measure(tmp_path: Path) -> None:
     table = run_script(tmp_path)
-    assert "this pipeline, batches of 1 |" in table
-    assert "this pipeline, batches of 2 |" in table
+    assert "extraction, batches of 1 |" in table
+    assert "extraction, batches of 2 |" in table
     assert "90-search" in table
     assert "91-train | **not measured**" in table
     assert len({line.count("|") for line in table.splitlines()}) == 1

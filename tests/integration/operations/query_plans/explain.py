@@ -24,14 +24,13 @@ MAX_ROWS_READ_PER_RETURNED = 20
 
 @dataclass(frozen=True, slots=True)
 class StatementPlan:
-    """Plan of a statement: `read` is the number of rows scanned, `milliseconds` server time."""
+    """Plan of a statement: `read` is the number of rows scanned."""
 
     call: str
     sql: str
     scans: tuple[str, ...]
     read: int
     returned: int
-    milliseconds: float
     sequential: tuple[str, ...]
     """Large tables that were read completely."""
 
@@ -45,12 +44,13 @@ class StatementPlan:
 
 @dataclass
 class Explainer:
-    """Explains the statements that are sent through the catalog during `call`."""
+    """Explains the statements that are sent through the catalog during `call`.
+
+    The tables are small: a planner would scan them, because that is cheap. Sequential scans and
+    hash and merge joins are disabled, so that the plan shows whether an index can be used.
+    """
 
     catalog: Catalog
-    small: bool = False
-    """The tables are small: a planner would scan them, because that is cheap. Sequential scans and
-    hash and merge joins are disabled, so that the plan shows whether an index can be used."""
     plans: list[StatementPlan] = field(default_factory=list)
 
     @contextlib.contextmanager
@@ -76,9 +76,8 @@ class Explainer:
         # In the caller's transaction, so that it reads the same rows; rolled back to the savepoint.
         with connection.connection.cursor() as cursor:
             cursor.execute("SAVEPOINT explained")
-            if self.small:
-                for method in ("seqscan", "hashjoin", "mergejoin"):
-                    cursor.execute(f"SET LOCAL enable_{method} = off")
+            for method in ("seqscan", "hashjoin", "mergejoin"):
+                cursor.execute(f"SET LOCAL enable_{method} = off")
             cursor.execute(f"EXPLAIN (ANALYZE, FORMAT JSON) {sql}", parameters)
             plan = cursor.fetchone()[0][0]
             cursor.execute("ROLLBACK TO SAVEPOINT explained")
@@ -90,7 +89,6 @@ class Explainer:
             scans=tuple(_node_label(node) for node in nodes if "Scan" in node["Node Type"]),
             read=sum(_rows_read(node) for node in scans),
             returned=_rows_returned(plan["Plan"]),
-            milliseconds=plan["Planning Time"] + plan["Execution Time"],
             sequential=tuple(
                 node["Relation Name"]
                 for node in scans

@@ -1,7 +1,7 @@
 """Fits the prior of place models on generated cities and writes it to `prior.json`.
 
     placewise datasets synth CITY --no-ladder --no-train --seed 1 ...   (several cities)
-    python -m lab.benchmarks.places.place_prior CITY [CITY ...]
+    python -m lab.benchmarks.place_prior CITY [CITY ...]
 
 Only coefficients are stored. Each city is described by the default extractor, with a vocabulary
 fitted on it, and sampled once with its coordinates, and once with label paths, which are squares of
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress
 
-from lab.benchmarks.places.estimates import DescribedPhotos, TrialMap, describe_set
+from lab.benchmarks.estimates import DescribedPhotos, TrialMap, describe_set
 from services.cli.output import console
 from shared.evaluation.places.evidence import PhotoLocation, is_same_place
 from shared.evaluation.places.fit import (

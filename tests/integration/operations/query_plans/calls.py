@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from uuid import UUID
 
-import psycopg
 from PIL import Image
-from psycopg.sql import SQL, Identifier
 from sqlalchemy import select
-from sqlalchemy.engine import URL, make_url
 from starlette.testclient import TestClient
 
-from lab.benchmarks.catalog.explain import Explainer
-from lab.benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog, fill_catalog
-from lab.benchmarks.report import Report
-from services.cli.environment import read_settings
-from services.cli.output import Table
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
@@ -31,23 +20,21 @@ from services.search.catalog_sync import read_generation_versions
 from services.steward.evaluation_search import read_geotagged_photos
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
-from shared.catalog.database.schema import migrate
-from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import STEWARD_JOBS
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
 from shared.catalog.processes import upsert_search_worker
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
-from shared.errors import Misconfigured, PlacewiseError
+from shared.errors import PlacewiseError
 from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.transitions import release_job
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
 from shared.storage import FolderStore
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from tests.integration.operations.query_plans.explain import Explainer
+from tests.integration.operations.query_plans.fill import LARGEST_MAP, SyntheticCatalog
 
 # Calls that may read a whole map: a periodic count, an evaluation, and substrings of file names
 # that are too short for an index.
@@ -218,7 +205,7 @@ def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], objec
     def claim_batch() -> None:
         with catalog.write() as session:
             claimed[:] = claim_jobs(
-                session, worker="bench", limit=16, lease_seconds=60, started=False
+                session, worker="explained", limit=16, lease_seconds=60, started=False
             )
 
     def extend() -> None:
@@ -237,11 +224,11 @@ def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], objec
 
     def claim_queries() -> None:
         with catalog.write() as session:
-            claim_jobs(session, worker="bench", limit=16, lease_seconds=60, min_priority=100)
+            claim_jobs(session, worker="explained", limit=16, lease_seconds=60, min_priority=100)
 
     def claim_evaluations() -> None:
         with catalog.write() as session:
-            claim_jobs(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
+            claim_jobs(session, worker="explained", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
 
     yield "extractor: claim a batch", claim_batch
     yield "extractor: hold the lease", extend
@@ -263,7 +250,7 @@ def _search_calls(
 
     def register() -> None:
         with catalog.write() as session:
-            upsert_search_worker(session, new_id(), "bench", None, SINGLE_SHARD, {})
+            upsert_search_worker(session, new_id(), "explained", None, SINGLE_SHARD, {})
 
     def evaluate() -> None:
         with catalog.read() as session:
@@ -277,56 +264,3 @@ def _search_calls(
 
 def _path_template(path: str) -> str:
     return "/".join("{id}" if len(part) == 36 else part for part in path.split("/"))
-
-
-def measure(progress: Progress, *, photos: int) -> Report:
-    """Fill a temporary database on the server of DATABASE_URL, and explain all statements.
-
-    Raises:
-        Misconfigured: `postgres_missing`, if DATABASE_URL is not a PostgreSQL.
-    """
-    url = make_url(read_settings().catalog_url())
-    if url.get_backend_name() != "postgresql":
-        raise Misconfigured("postgres_missing", "Set DATABASE_URL to a PostgreSQL to fill.")
-    bar = progress.add_task("filling the catalog", total=None)
-    with _create_database(url) as own, tempfile.TemporaryDirectory() as folder:
-        catalog = Catalog(own, PoolConfig(name="placewise-bench"), TransactionTimeouts(3600, 3600))
-        try:
-            migrate(catalog)
-            filled = fill_catalog(catalog, photos)
-            explainer = Explainer(catalog)
-            for name in run_all_calls(catalog, filled, explainer, Path(folder)):
-                progress.update(bar, description=name)
-        finally:
-            catalog.close()
-    faulty = [e for e in explainer.plans if e.faults() and e.call not in KNOWN_FULL_SCANS]
-    report = Report(f"Statements of the services, {photos:,} photos")
-    table = Table("call", "ms", "rows read", "rows returned", "scans")
-    for e in explainer.plans:
-        cells = (e.call, f"{e.milliseconds:.1f}", f"{e.read:,}", f"{e.returned:,}")
-        table.add_row(*cells, ", ".join(e.scans), style="red" if e in faulty else None)
-    report.tables.append(table)
-    for name, size_bytes in sorted(filled.tables.items(), key=lambda item: -item[1]):
-        report.add(f"{name}: bytes per photo", size_bytes / photos, "B")
-    for e in faulty:
-        report.add(f"{e.call}: {'; '.join(e.faults())}: {e.sql}", 1, at_most=0)
-    report.details = {
-        "photos": photos,
-        "tables": filled.tables,
-        "statements": [{**asdict(e), "faults": e.faults()} for e in explainer.plans],
-    }
-    return report
-
-
-@contextlib.contextmanager
-def _create_database(url: URL) -> Iterator[str]:
-    """Create a database on the same server and return its URL."""
-    name = f"placewise_bench_{new_id().hex}"
-    admin = url.set(drivername="postgresql").render_as_string(hide_password=False)
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(SQL("CREATE DATABASE {}").format(Identifier(name)))
-    try:
-        yield url.set(database=name).render_as_string(hide_password=False)
-    finally:
-        with psycopg.connect(admin, autocommit=True) as connection:
-            connection.execute(SQL("DROP DATABASE {} WITH (FORCE)").format(Identifier(name)))

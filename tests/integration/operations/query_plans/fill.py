@@ -97,26 +97,25 @@ FILL_STATEMENTS = {
 
 @dataclass(frozen=True, slots=True)
 class SyntheticCatalog:
-    """Contents of the synthetic catalog. `tables`: bytes of each table including its indexes."""
+    """Contents of the synthetic catalog."""
 
     photos: int
     big: UUID
     generation: UUID
-    tables: dict[str, int]
 
 
 def fill_catalog(catalog: Catalog, photos: int) -> SyntheticCatalog:
     """Fill an empty, migrated PostgreSQL catalog and run ANALYZE."""
     with catalog.write() as session:
         maps = [create_map(session, f"map-{n}", "test-tiny-avg").id for n in range(MAPS)]
-        model = get_or_create_model(session, "bench", "0" * 64, "MIT", {})
+        model = get_or_create_model(session, "synthetic", "0" * 64, "MIT", {})
         for map_id in maps:
             session.add(
                 Generation(
                     id=new_id(),
                     map_id=map_id,
                     state=GenerationState.ACTIVE,
-                    extractor="bench",
+                    extractor="synthetic",
                     spec={"clusters": None},
                     spec_fingerprint="0" * 64,
                     dimension=7168,
@@ -142,9 +141,4 @@ def fill_catalog(catalog: Catalog, photos: int) -> SyntheticCatalog:
         connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql(
             "VACUUM (ANALYZE)"
         )
-        sizes = connection.exec_driver_sql(
-            "SELECT relname, pg_total_relation_size(oid) FROM pg_class"
-            " WHERE relkind = 'r' AND relnamespace = 'public'::regnamespace"
-        )
-        tables = {name: int(size) for name, size in sizes}
-    return SyntheticCatalog(photos, maps[0], generations[0], tables)
+    return SyntheticCatalog(photos, maps[0], generations[0])

@@ -1,11 +1,10 @@
 """`make demo`: indexes a generated city, fits, evaluates, queries, and draws a picture.
 
-    python -m lab.benchmarks.demo [--places 300] [--picture docs/demo.jpg]
+    python -m lab.demo [--places 300] [--picture docs/demo.jpg]
 
 Half of the city's queries are uploaded as labelled queries, with which the map's confidence is
 calibrated. The other half is held out and queried as a user's photos; the printed results are those
-that a user would get. All metrics are of a generated city and are not comparable with published
-results.
+that a user would get. They are of a generated city and are not comparable with published results.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -21,16 +20,14 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image, ImageDraw, ImageFont
 
-from lab.benchmarks.generated_city import generate_city
-from lab.city.plan import CityOptions
-from lab.city.write import NOT_COMPARABLE
+from lab.city.plan import CityOptions, make_plan
+from lab.city.write import NOT_COMPARABLE, write_city
 from placewise.answers import Estimate
 from placewise.client import Client
 from services.cli.client import connect, wait_for_job
 from services.cli.ingest.geotags import LocalPhoto, find_photos
 from services.cli.ingest.upload import switch_off_fits, upload_photos
 from services.cli.output import progress_bar
-from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
 from shared.evaluation.places.evidence import PhotoLocation, distance_between_m
 
 if TYPE_CHECKING:
@@ -76,34 +73,6 @@ def _query_with_photo(
     )
 
 
-def _summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> dict[str, Any]:
-    """Compute recall, false accepts and confidence metrics (None while uncalibrated)."""
-    inside = [a for a in outcomes if a.in_map]
-    outside = [a for a in outcomes if not a.in_map]
-    accepted = [a for a in outcomes if a.estimate.in_map]
-    errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    confidences = [a.estimate.confidence for a in outcomes if a.estimate.confidence is not None]
-    # Without an estimated location, the best photo decides whether the result is correct.
-    right = [a.right or (a.estimate.in_map is False and a.best_is_correct) for a in outcomes]
-    is_calibrated = len(confidences) == len(outcomes)
-    return {
-        "queries": len(outcomes),
-        "out_of_map": len(outside),
-        "R@1": _ratio(sum(a.best_is_correct for a in inside), len(inside)),
-        "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
-        "accepted_in_map": _ratio(sum(bool(a.estimate.in_map) for a in inside), len(inside)),
-        "false_accepts": _ratio(sum(bool(a.estimate.in_map) for a in outside), len(outside)),
-        "median_error_m": median(errors) if errors else None,
-        "calibration_error": (
-            expected_calibration_error(confidences, right) if is_calibrated else None
-        ),
-        "auroc": auroc(confidences, right) if is_calibrated else None,
-        "recall_at_99_precision": (
-            recall_at_precision(confidences, right, len(inside)) if is_calibrated else None
-        ),
-    }
-
-
 def _location(fields: Mapping[str, Any]) -> PhotoLocation:
     latitude, longitude = fields.get("latitude"), fields.get("longitude")
     if latitude is None or longitude is None:
@@ -114,10 +83,6 @@ def _location(fields: Mapping[str, Any]) -> PhotoLocation:
 def _is_near(a: PhotoLocation, b: PhotoLocation) -> bool:
     distance = distance_between_m(a, b)
     return distance is not None and distance <= CORRECT_WITHIN_M
-
-
-def _ratio(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
 
 
 COLUMNS = 6
@@ -191,7 +156,7 @@ def main() -> None:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
         city = Path(folder, "city")
-        generate_city(
+        plan = make_plan(
             CityOptions(
                 options.places,
                 options.views,
@@ -202,10 +167,10 @@ def main() -> None:
                 320,
                 240,
                 train=False,
-            ),
-            city,
-            progress,
+            )
         )
+        bar = progress.add_task("rendering", total=len(plan.photos))
+        write_city(plan, city, lambda count: progress.advance(bar, count))
         with connect(None, None) as client:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
@@ -253,21 +218,25 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
     return outcomes
 
 
-def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
-    summary = _summarise_outcomes(outcomes)
-    print(f"{summary['queries']} held-out queries, {summary['out_of_map']} from outside the map:")
-    for name, label, style in (
-        ("R@1", "R@1 of queries in the map", ".1%"),
-        ("right_of_accepted", "precision of the accepted estimates", ".1%"),
-        ("accepted_in_map", "accepted queries in the map", ".1%"),
-        ("false_accepts", "false accepts from outside the map", ".1%"),
-        ("median_error_m", "median error of the correct estimates, m", ".1f"),
-        ("calibration_error", "calibration error (ECE)", ".3f"),
-        ("auroc", "AUROC", ".3f"),
-        ("recall_at_99_precision", "recall at 99 % precision", ".1%"),
+def _print_outcomes(outcomes: Sequence[QueryOutcome]) -> None:
+    inside = [a for a in outcomes if a.in_map]
+    outside = [a for a in outcomes if not a.in_map]
+    accepted = [a for a in outcomes if a.estimate.in_map]
+    errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
+    print(f"{len(outcomes)} held-out queries, {len(outside)} from outside the map:")
+    for label, share in (
+        ("R@1 of queries in the map", _share(a.best_is_correct for a in inside)),
+        ("precision of the accepted estimates", _share(a.right for a in accepted)),
+        ("accepted queries in the map", _share(bool(a.estimate.in_map) for a in inside)),
+        ("false accepts from outside the map", _share(bool(a.estimate.in_map) for a in outside)),
+        ("median error of the correct estimates", f"{median(errors):.1f} m" if errors else "-"),
     ):
-        value = summary[name]
-        print(f"  {label:42s}{'-' if value is None else format(value, style)}")
+        print(f"  {label:42s}{share}")
+
+
+def _share(counts: Iterable[bool]) -> str:
+    known = list(counts)
+    return f"{sum(known) / len(known):.1%}" if known else "-"
 
 
 if __name__ == "__main__":

@@ -24,17 +24,19 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
+from rich.progress import Progress
 
-from lab.benchmarks.report import Report
+from lab.benchmarks.report import Report, printed_report
 from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.query_clusters import cluster_queries
 from services.cli.environment import read_settings
-from services.cli.output import Table
+from services.cli.output import JsonOption, Table
 from shared.errors import Misconfigured
 from shared.evaluation.bootstrap import bootstrap_intervals
 from shared.evaluation.calibration import expected_calibration_error
@@ -44,9 +46,6 @@ from shared.evaluation.places.levels import LevelScheme, candidate_levels
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.place_paths import label_levels
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
@@ -99,41 +98,54 @@ class Share:
     at_most: float | None = None
 
 
-def measure(progress: Progress, *, folders: Sequence[Path] | None, splits: int) -> Report:
-    """Measure the estimates of evaluation sets, by default of the tower in PLACEWISE_TEST_DATA."""
-    report = Report(f"estimates at certainty {CERTAINTY}")
-    for folder in folders or [_tower()]:
-        photos = describe_set(folder, progress)
-        bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
-        published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
-        add_answers(report, f"{photos.name}, its queries", published)
-        add_reliability(report, f"{photos.name}, its queries", published)
+def bench(
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Evaluation sets with coordinates or places. Default: tower in "
+            "PLACEWISE_TEST_DATA.",
+            exists=True,
+        ),
+    ] = None,
+    splits: Annotated[int, typer.Option(min=0, help="Random splits of each set.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how often place estimates answer, how often they are right, and their calibration."""
+    with printed_report(f"estimates at certainty {CERTAINTY}", as_json) as (report, progress):
+        for folder in folders or [_tower()]:
+            measure_set(report, describe_set(folder, progress), splits, progress)
+
+
+def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: Progress) -> None:
+    """Report the estimates of one evaluation set."""
+    bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
+    published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
+    add_answers(report, f"{photos.name}, its queries", published)
+    add_reliability(report, f"{photos.name}, its queries", published)
+    progress.advance(bar)
+    drawn: list[Judged] = []
+    refined: list[Judged] = []
+    for seed in range(splits):
+        everything = np.ones(len(photos.rows), dtype=bool)
+        chosen = draw(everything, int(photos.is_query.sum()), seed)
+        drawn += fit_and_judge(photos, ~chosen, chosen)
+        labelled = draw(photos.is_query, int(photos.is_query.sum()) // 2, seed)
+        unlabelled = photos.is_query & ~labelled
+        refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
         progress.advance(bar)
-        drawn: list[Judged] = []
-        refined: list[Judged] = []
-        for seed in range(splits):
-            everything = np.ones(len(photos.rows), dtype=bool)
-            chosen = draw(everything, int(photos.is_query.sum()), seed)
-            drawn += fit_and_judge(photos, ~chosen, chosen)
-            labelled = draw(photos.is_query, int(photos.is_query.sum()) // 2, seed)
-            unlabelled = photos.is_query & ~labelled
-            refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
-            progress.advance(bar)
-        for what, judged in (
-            (f"{photos.name}, {splits} random splits", drawn),
-            (f"{photos.name}, half of its queries labelled", refined),
-        ):
-            if judged:
-                add_answers(report, what, judged)
-                add_reliability(report, what, judged)
-        left_out = []
-        for missing in left_out_labels(photos):
-            in_map = ~photos.is_query & ~missing
-            left_out += fit_and_judge(photos, in_map, missing)
-            progress.advance(bar)
-        if left_out:
-            add_left_out(report, f"{photos.name}, labels left out", left_out)
-    return report
+    for what, judged in (
+        (f"{photos.name}, {splits} random splits", drawn),
+        (f"{photos.name}, half of its queries labelled", refined),
+    ):
+        if judged:
+            add_answers(report, what, judged)
+            add_reliability(report, what, judged)
+    left_out = []
+    for missing in left_out_labels(photos):
+        left_out += fit_and_judge(photos, ~photos.is_query & ~missing, missing)
+        progress.advance(bar)
+    if left_out:
+        add_left_out(report, f"{photos.name}, labels left out", left_out)
 
 
 def describe_set(folder: Path, progress: Progress, name: str | None = None) -> DescribedPhotos:

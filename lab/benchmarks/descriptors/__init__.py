@@ -1,1 +1,0 @@
-"""Speed and quality of descriptors: extraction, precision, reranking, training."""

@@ -1,1 +1,0 @@
-"""Place estimates, located photos and tracks."""
