@@ -39,7 +39,6 @@ _numbers = itertools.count()
 @dataclass(frozen=True, slots=True)
 class HttpResponse:
     status: int
-    headers: dict[str, str]
     body: bytes
 
     def json(self) -> Any:
@@ -68,9 +67,7 @@ class HttpCaller:
         for connection in self._connections:
             connection.close()
 
-    def call(
-        self, method: str, path: str, body: bytes | None = None, **headers: str
-    ) -> HttpResponse:
+    def post_form(self, path: str, form: bytes, **headers: str) -> HttpResponse:
         """Return the response of any status; OSError or HTTPException if there is none."""
         connection: HTTPConnection | None = getattr(self._own, "connection", None)
         if connection is None:
@@ -78,15 +75,12 @@ class HttpCaller:
             self._own.connection = connection
             self._connections.append(connection)
         try:
-            connection.request(method, path, body, AUTH_HEADER | headers)
+            connection.request("POST", path, form, {**AUTH_HEADER, **CONTENT_TYPE, **headers})
             answer = connection.getresponse()
-            return HttpResponse(answer.status, dict(answer.getheaders()), answer.read())
+            return HttpResponse(answer.status, answer.read())
         except (OSError, HTTPException):
             connection.close()
             raise
-
-    def post_form(self, path: str, form: bytes, **headers: str) -> HttpResponse:
-        return self.call("POST", path, form, **CONTENT_TYPE, **headers)
 
 
 def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:

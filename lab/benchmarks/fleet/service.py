@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import httpx2
-import psutil
 
 from tests.support.processes import Process, start
 from tests.support.servers.daemon import cpu_seconds_of
@@ -44,7 +43,6 @@ class ServiceProcess:
         self.ready_url = ready_url
         self.ready_line = ready_line.encode()
         self.should_run = False
-        self.starts = 0
         self._command = command
         self._executed = executed
         self._process: Process | None = None
@@ -54,11 +52,6 @@ class ServiceProcess:
     @property
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None
-
-    @property
-    def process(self) -> psutil.Process:
-        assert self._process is not None, f"{self.name} was not started"
-        return psutil.Process(self._process.pid)
 
     def start(self) -> None:
         with self._lock:
@@ -84,7 +77,6 @@ class ServiceProcess:
                 stderr=log,
                 executed=self._executed,
             )
-        self.starts += 1
 
     def kill(self) -> None:
         """Send SIGKILL, without restart."""
@@ -131,7 +123,8 @@ class ServiceProcess:
 
     def cpu_seconds(self) -> float:
         """Return user and system time of the process and its children so far."""
-        return cpu_seconds_of(self.process.pid)
+        assert self._process is not None, f"{self.name} was not started"
+        return cpu_seconds_of(self._process.pid)
 
     def _log_since_start(self) -> bytes:
         with self.log_path.open("rb") as log:
