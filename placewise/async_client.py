@@ -42,13 +42,13 @@ class AsyncClient(AsyncTransport):
     """Client of one server and one map."""
 
     async def upload(
-        self, photo: str | Path, filename: str | None = None, **fields: Any
+        self, photo: str | Path | BinaryIO, filename: str | None = None, **fields: Any
     ) -> answers.Uploaded:
         """Upload a photo, streamed from its file.
 
         Args:
-            photo: The file.
-            filename: Name to store; None for the file's own name.
+            photo: The file: its path, or open for reading bytes, such as io.BytesIO.
+            filename: Name to store; None for the name of the path.
             fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
                 `place`, `tags`, `metadata`, `role`, `relative_path`.
 
@@ -59,9 +59,8 @@ class AsyncClient(AsyncTransport):
             Unprocessable: A field or the image is invalid.
         """
         data = {name: str(value) for name, value in drop_none(**fields).items()}
-        return answers.Uploaded(
-            **await self._send_file("/upload", Path(photo), filename, data=data)
-        )
+        file = Path(photo) if isinstance(photo, (str, Path)) else photo
+        return answers.Uploaded(**await self._send_file("/upload", file, filename, data=data))
 
     async def upload_direct(
         self, photo: str | Path, filename: str | None = None, **fields: Any
@@ -85,16 +84,6 @@ class AsyncClient(AsyncTransport):
             await self._put_presigned(presigned, file)
         complete_path = presigned["complete_url"].removeprefix(API)
         return answers.Uploaded(**await self._call("POST", complete_path))
-
-    async def upload_archive(
-        self, archive: str | Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
-    ) -> answers.BatchStarted:
-        """Start a batch upload of a zip or tar; `on_sent` receives the bytes sent so far."""
-        with open_file(Path(archive)) as file:
-            stream = ReadProgressFile(file, on_sent)
-            return await self._start_batch(
-                files={"archive": (printable_name(Path(archive)), stream)}
-            )
 
     async def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()

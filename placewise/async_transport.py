@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import copy
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -96,11 +97,14 @@ class AsyncTransport:
         return other
 
     async def _send_file(
-        self, path: str, file: Path, filename: str | None = None, **options: Any
+        self, path: str, file: Path | BinaryIO, filename: str | None = None, **options: Any
     ) -> Any:
-        """POST a file as the form field `file`, streamed."""
-        with open_file(file) as stream:
-            files = {"file": (filename or printable_name(file), stream)}
+        """POST a file, by its path or open, as the form field `file`, streamed."""
+        with contextlib.ExitStack() as stack:
+            if isinstance(file, Path):
+                filename = filename or printable_name(file)
+                file = stack.enter_context(open_file(file))
+            files = {"file": (filename or "photo", file)}
             return await self._call("POST", path, files=files, **options)
 
     async def _call(self, method: str, path: str, **options: Any) -> Any:

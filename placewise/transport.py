@@ -5,6 +5,7 @@ Generated from `async_transport.py` by `make client`. Edit that file.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import time
 from collections.abc import Callable, Iterator
@@ -94,10 +95,15 @@ class Transport:
         other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
-    def _send_file(self, path: str, file: Path, filename: str | None = None, **options: Any) -> Any:
-        """POST a file as the form field `file`, streamed."""
-        with open_file(file) as stream:
-            files = {"file": (filename or printable_name(file), stream)}
+    def _send_file(
+        self, path: str, file: Path | BinaryIO, filename: str | None = None, **options: Any
+    ) -> Any:
+        """POST a file, by its path or open, as the form field `file`, streamed."""
+        with contextlib.ExitStack() as stack:
+            if isinstance(file, Path):
+                filename = filename or printable_name(file)
+                file = stack.enter_context(open_file(file))
+            files = {"file": (filename or "photo", file)}
             return self._call("POST", path, files=files, **options)
 
     def _call(self, method: str, path: str, **options: Any) -> Any:

@@ -12,7 +12,7 @@ PlacewiseError
 ├── Gone 410                    query_expired
 ├── LengthRequired 411          length_required
 ├── TooLarge 413                file_too_large, batch_too_large, ...
-├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
+├── UnsupportedMedia 415        unsupported_photo, unsupported_body
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
 ├── TooManyRequests 429         queue_full, too_many_requests, ... (retry after `Retry-After`)
 ├── Unavailable 503             search_behind, catalog_busy, ... (transient, retryable)

@@ -37,7 +37,6 @@ class BatchSource(StrEnum):
     """Source of a batch's photos."""
 
     FILES = "files"  # uploaded files, already in the object store
-    ARCHIVE = "archive"  # members of an uploaded archive
     KEYS = "keys"  # objects that the user has put into the store
     PREFIX = "prefix"  # all such objects under a prefix, which the steward lists
 
@@ -53,9 +52,9 @@ class BatchItem(Base):
     number: Mapped[int] = mapped_column(sa.Integer, primary_key=True, autoincrement=False)
     name: Mapped[str] = mapped_column(sa.Text)
     state: Mapped[JobState] = mapped_column(sa.String(20), default=JobState.QUEUED)
-    # The object with its bytes; null for a member of an archive.
+    # The object with its bytes; null for an uploaded file that was refused.
     object_key: Mapped[str | None] = mapped_column(sa.Text)
-    # Its location in the archive, or the size and hash of the uploaded file.
+    # The size and hash of an uploaded file.
     source: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     fields: Mapped[dict[str, str]] = mapped_column(JsonValue, default=dict)
     # The line of the manifest with these fields.
@@ -201,7 +200,7 @@ def update_batch_progress(job: Job, counts: Counter[JobState]) -> None:
 
 
 def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
-    """Return the result of an ended batch, as photo counts; `ignored` counts other members."""
+    """Return the result of an ended batch, as photo counts; `ignored` counts other objects."""
     already_there = session.scalar(
         sa.select(sa.func.count())
         .select_from(BatchItem)

@@ -109,17 +109,10 @@ class GatewaySettings(BaseSettings):
     max_image_pixels: int = Field(
         200_000_000, gt=0, description="maximum width x height of one photo"
     )
-    max_archive_size: Size = Field(
-        10_737_418_240,
-        gt=0,
-        description="maximum bytes of one batch: of its archive, packed and unpacked, or of all "
-        "its files",
+    max_batch_size: Size = Field(
+        10_737_418_240, gt=0, description="maximum bytes of all files of one batch"
     )
-    max_batch_photos: int = Field(
-        100_000,
-        gt=0,
-        description="maximum photos in one batch; every member of an archive counts",
-    )
+    max_batch_photos: int = Field(100_000, gt=0, description="maximum photos in one batch")
     import_prefix: str = Field(
         "imports/",
         description="key prefix of the objects that a batch may import from the object store",

@@ -1,4 +1,4 @@
-"""File formats of photos and archives: detection by content, limits by the header."""
+"""File formats of photos: detection by content, limits by the header."""
 
 from __future__ import annotations
 
@@ -9,40 +9,6 @@ from pathlib import PurePosixPath
 from PIL import Image
 
 from shared.errors import Unprocessable
-
-ARCHIVE_SIGNATURE_BYTES = 512  # a tar's first header
-ACCEPTED_ARCHIVES = "a zip, a tar or a gzipped tar"
-
-TAR_CHECKSUM_FIELD = slice(148, 156)  # of a tar header: the octal sum of its other bytes
-
-
-class ArchiveFormat(StrEnum):
-    """Accepted archive formats."""
-
-    ZIP = "zip"
-    TAR = "tar"
-    GZIP = "gzip"  # expected to contain a tar; known only after decompression
-
-
-def detect_archive_format(first_bytes: bytes) -> ArchiveFormat | None:
-    """Detect the format from the first ARCHIVE_SIGNATURE_BYTES; None if not accepted."""
-    if first_bytes.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # the second is an empty zip
-        return ArchiveFormat.ZIP
-    if first_bytes.startswith(b"\x1f\x8b\x08"):
-        return ArchiveFormat.GZIP
-    return ArchiveFormat.TAR if _is_tar_header(first_bytes[:ARCHIVE_SIGNATURE_BYTES]) else None
-
-
-def _is_tar_header(block: bytes) -> bool:
-    """Whether a block of 512 bytes is a tar header, by its checksum; `ustar` is optional."""
-    if len(block) != ARCHIVE_SIGNATURE_BYTES:
-        return False
-    try:
-        checksum = int(block[TAR_CHECKSUM_FIELD].strip(b"\0 ") or b"-1", 8)
-    except ValueError:
-        return False
-    return checksum == sum(block) - sum(block[TAR_CHECKSUM_FIELD]) + 8 * ord(" ")
-
 
 # Pillow opens MPO (a JPEG followed by a second picture, which many phones write as .jpg) as JPEG;
 # listing MPO here raises KeyError for all other formats.
@@ -64,6 +30,7 @@ PHOTO_READ_ERRORS = (
 # Suffixes searched for in folders and archives; the format is detected from the content.
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"}
 PHOTO_SIGNATURE_BYTES = 16  # enough to detect every accepted format
+ARCHIVE_SIGNATURES = (b"PK\x03\x04", b"\x1f\x8b\x08")  # zip, gzip
 
 # Disabled: check_pixel_count checks our own limit before anything is decoded.
 Image.MAX_IMAGE_PIXELS = None

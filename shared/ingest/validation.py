@@ -12,7 +12,12 @@ from uuid import UUID
 
 from shared.config.values import format_megabytes
 from shared.errors import PlacewiseError, TooLarge, UnsupportedMedia
-from shared.imaging.file_formats import ACCEPTED_PHOTOS, PHOTO_SIGNATURE_BYTES, detect_media_type
+from shared.imaging.file_formats import (
+    ACCEPTED_PHOTOS,
+    ARCHIVE_SIGNATURES,
+    PHOTO_SIGNATURE_BYTES,
+    detect_media_type,
+)
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, read_form_fields
 from shared.storage import ObjectStore
@@ -58,21 +63,18 @@ class StreamValidator:
         max_bytes: int,
         check_signature: Callable[[bytes], object] = lambda first_bytes: None,
         *,
-        signature_bytes: int = PHOTO_SIGNATURE_BYTES,
         too_large: Callable[[int], PlacewiseError] | None = None,
     ) -> None:
         """
         Args:
             max_bytes: size limit.
-            check_signature: called with the first `signature_bytes` as soon as they have arrived;
-                it may raise.
-            signature_bytes: number of bytes that `check_signature` needs.
+            check_signature: called with the first PHOTO_SIGNATURE_BYTES as soon as they have
+                arrived; it may raise.
             too_large: returns the error for a file larger than `max_bytes`.
         """
         self.size_bytes = 0
         self.first_bytes = b""
         self._max_bytes = max_bytes
-        self._signature_bytes = signature_bytes
         self._too_large = too_large or file_too_large_error
         self._check_signature = check_signature
         self._checked = False
@@ -92,9 +94,9 @@ class StreamValidator:
         self.size_bytes += len(block)
         if self.size_bytes > self._max_bytes:
             raise self._too_large(self._max_bytes)
-        if len(self.first_bytes) < self._signature_bytes:
-            self.first_bytes = (self.first_bytes + block)[: self._signature_bytes]
-        if not self._checked and len(self.first_bytes) == self._signature_bytes:
+        if len(self.first_bytes) < PHOTO_SIGNATURE_BYTES:
+            self.first_bytes = (self.first_bytes + block)[:PHOTO_SIGNATURE_BYTES]
+        if not self._checked and len(self.first_bytes) == PHOTO_SIGNATURE_BYTES:
             self._check_first_bytes()
         self._hash.update(block)
 
@@ -112,10 +114,11 @@ def check_photo_signature(first_bytes: bytes) -> str:
     """Return the photo's media type by its content; UnsupportedMedia (`unsupported_photo`)."""
     media_type = detect_media_type(first_bytes)
     if media_type is None:
-        raise UnsupportedMedia(
-            "unsupported_photo",
-            f"The file is not a photo in a supported format. Send {ACCEPTED_PHOTOS}.",
-        )
+        what = "is not a photo in a supported format"
+        advice = f"Send {ACCEPTED_PHOTOS}."
+        if first_bytes.startswith(ARCHIVE_SIGNATURES):
+            what, advice = "is an archive", "Unpack it, or run placewise index ARCHIVE."
+        raise UnsupportedMedia("unsupported_photo", f"The file {what}. {advice}")
     return media_type
 
 

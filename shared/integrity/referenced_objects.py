@@ -37,17 +37,12 @@ class ObjectKind(StrEnum):
     WHITENING = "whitening"
     MODEL = "model"
     CHECKPOINT = "checkpoint"  # upload of a model that is being added
-    ARCHIVE = "archive"  # upload of an unfinished batch
     FILE = "file"  # of an unfinished batch, not yet a photo
 
 
 def plural(kind: str) -> str:
     """Return the plural of a kind, for messages."""
     return f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
-
-
-KIND_BY_JOB = {JobKind.BATCH: ObjectKind.ARCHIVE, JobKind.ADD_MODEL: ObjectKind.CHECKPOINT}
-"""Uploads that belong to a job and are deleted when it ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +96,11 @@ def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
         yield ReferencedObject(
             model.object_key, ObjectKind.MODEL, model.id, model.size_bytes, model.sha256
         )
-    for kind, what in KIND_BY_JOB.items():
-        jobs = select(Job.id, Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
-        for job in session.execute(jobs).all():
-            if (key := job.params.get("object_key")) is not None:
-                yield ReferencedObject(key, what, job.id)
+    jobs = select(Job.id, Job.params).where(
+        Job.kind == JobKind.ADD_MODEL, Job.state.in_(UNFINISHED_STATES)
+    )
+    for job in session.execute(jobs).all():
+        yield ReferencedObject(job.params["object_key"], ObjectKind.CHECKPOINT, job.id)
     files = select(BatchItem.object_key, BatchItem.job_id).where(
         BatchItem.state == JobState.QUEUED, BatchItem.object_key.startswith(ORIGINALS)
     )

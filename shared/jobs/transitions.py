@@ -283,8 +283,8 @@ def cancel_batch_items(session: Session, job: Job) -> None:
 def retry_batch(session: Session, job: Job) -> None:
     """Queue the failed and cancelled items of the batch again whose bytes are still stored.
 
-    The bytes are stored with the photo, or under the object key that the manifest named. Archives
-    and rejected files are not stored.
+    The bytes are stored with the photo, or under the object key that the manifest named. Rejected
+    files are not stored.
 
     Raises:
         Conflict: `job_not_retryable`: the batch is unfinished, or no item can be retried.

@@ -6,7 +6,6 @@
 |---|---|
 | `originals/<uuid>` | an uploaded photo |
 | `incoming/<upload>` | a presigned upload, until it is completed |
-| `archives/<uuid>` | an uploaded archive, until its photos are stored |
 | `checkpoints/<uuid>` | an uploaded checkpoint, until it is added as a model or rejected |
 | `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
 | `thumbnails/<photo>` | a photo's thumbnail, JPEG |

@@ -12,7 +12,6 @@ from shared.ids import new_id
 OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
 
 INCOMING = "incoming/"
-ARCHIVES = "archives/"
 CHECKPOINTS = "checkpoints/"
 FEATURES = "features/"
 JOURNAL = "journal/"
@@ -27,7 +26,6 @@ WHITENINGS = "whitenings/"
 WORK = "work/"
 
 OWN_PREFIXES = (
-    ARCHIVES,
     CHECKPOINTS,
     "chunks/",
     FEATURES,
@@ -84,11 +82,6 @@ def key_before_trash(trashed: str) -> str:
     if not trashed.startswith(TRASH) or not key:
         raise ValueError(f"not the key of an object in the trash: {trashed!r}")
     return key
-
-
-def new_archive_key() -> str:
-    """Return a new key for the archive of a batch upload."""
-    return f"{ARCHIVES}{new_id()}"
 
 
 def check_import_prefix(prefix: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from playwright.sync_api import FilePayload, Page, expect
 
 from tests.browser.conftest import Town, Visitor
+from tests.support.archives import tar_of, zip_of
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 NO_PHOTO: FilePayload = {
@@ -133,14 +133,47 @@ def test_a_photo_of_a_folder_is_named_with_its_path(page: Page, town: Town, tmp_
     expect(page.locator("h1")).to_have_text("Italy/Day 2/IMG_2078.jpg")
 
 
-def test_an_archive_goes_as_it_is(page: Page, town: Town) -> None:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for number in range(3):
-            archive.writestr(f"hall/{number}.jpg", photo_bytes(number))
-    add(page, {"name": "h.zip", "mimeType": "application/zip", "buffer": buffer.getvalue()})
+def archive(name: str, data: bytes) -> FilePayload:
+    return {"name": name, "mimeType": "application/octet-stream", "buffer": data}
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_the_photos_of_a_zip_keep_their_paths(page: Page, town: Town, method: int) -> None:
+    photos = {f"hall/{number} ü.jpg": photo_bytes(number) for number in range(3)}
+    others = {"hall/notes.txt": b"", "__MACOSX/._0.jpg": b"", "hall/photos.csv": b"filename\n"}
+    add(page, archive("h.zip", zip_of({**photos, **others, "empty/": b""}, method)))
     expect(page.locator(".queue-row.done .state")).to_have_text("3 photos added")
+    expect(page.get_by_text("1 file left out: no photos.")).to_be_visible()
+    expect(page.get_by_text("hall/photos.csv of h.zip is not read here")).to_be_visible()
     assert searchable(page, town) == 3
+    name = page.evaluate("localStorage.getItem('placewise-map')")
+    images = town.get("/search", map=name)["images"]
+    assert {image["relative_path"] for image in images} == set(photos)
+
+
+def test_details_hold_for_the_photos_of_a_zip(page: Page, town: Town) -> None:
+    page.get_by_text("Details for these photos").click()
+    page.get_by_label("Tags").fill("north")
+    add(page, archive("h.zip", zip_of({"1.jpg": photo_bytes(1), "2.jpg": photo_bytes(2)})))
+    expect(page.locator(".queue-row.done .state")).to_have_text("2 photos added")
+    name = page.evaluate("localStorage.getItem('placewise-map')")
+    assert town.get("/search", map=name, tags="north")["total_found"] == 2
+
+
+def test_an_archive_that_the_page_can_not_read_says_what_to_do(page: Page) -> None:
+    whole = zip_of({"1.jpg": photo_bytes(1)})
+    for name, data, words in (
+        ("cut.zip", whole[:-30], "cut.zip is damaged. Unpack it and add the folder."),
+        ("no.zip", b"no zip" * 99, "no.zip is damaged. Unpack it and add the folder."),
+        ("empty.zip", zip_of({"notes.txt": b""}), "empty.zip has no photos."),
+        ("a.tar.gz", tar_of({"1.jpg": b""}, "w:gz"), "unpack it, or run placewise index."),
+    ):
+        add(page, archive(name, data))
+        expect(page.get_by_text(words)).to_be_visible()
+    expect(page.locator(".queue-row")).to_have_count(0)
+    flags = whole.index(b"PK\x01\x02") + 8
+    add(page, archive("locked.zip", whole[:flags] + b"\x01" + whole[flags + 1 :]))
+    expect(page.locator(".queue-row.failed .errors")).to_contain_text("can't be read, 1.jpg")
 
 
 def test_a_job_is_polled_where_events_do_not_arrive(page: Page, town: Town) -> None:

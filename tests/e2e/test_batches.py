@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import signal
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,8 @@ import pytest
 import placewise
 from placewise.client import Client
 from shared.errors import InvalidRequest
-from shared.storage.s3 import S3Store
 from tests.e2e.test_separate_services import Deployment, until
-from tests.support.archives import PACKED, tar_of, zip_of
+from tests.support.archives import PACKED, zip_of
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import PostgresServer, S3Server, start_redis
@@ -36,15 +33,23 @@ def table(*numbers: int) -> bytes:
     return ("filename,latitude,longitude\n" + "".join(rows)).encode()
 
 
+def form(*numbers: int) -> list[tuple[str, Any]]:
+    """The form of a batch of these photos, with a manifest of their coordinates."""
+    manifest = "\n".join(
+        json.dumps({"filename": f"{number}.jpg", "latitude": 45 + number / 1000, "longitude": 7})
+        for number in numbers
+    )
+    return [("manifest", ("m", manifest)), *(("file", one) for one in photos(*numbers).items())]
+
+
 @pytest.fixture
 def client(server: ServerProcess) -> Iterator[Client]:
     with Client(str(server.client.base_url)) as opened:
         yield opened
 
 
-def test_an_archive_is_searchable_when_its_job_has_succeeded(server: ServerProcess) -> None:
-    archive = zip_of(photos(*range(100, 112)) | {"photos.csv": table(*range(100, 112))})
-    answer = server.client.post("/api/v1/upload/batch", files={"archive": ("a.zip", archive)})
+def test_files_are_searchable_when_their_job_has_succeeded(server: ServerProcess) -> None:
+    answer = server.client.post("/api/v1/upload/batch", files=form(*range(100, 112)))
     assert answer.status_code == 202
     started = answer.json()
     assert answer.headers["location"] == started["status_url"]
@@ -114,28 +119,48 @@ def test_index_takes_an_archive_as_it_takes_a_folder(
     server: ServerProcess, tmp_path: Path, kind: str
 ) -> None:
     first = 140 if kind == "zip" else 150
+    members = {f"trip/{name}": data for name, data in photos(*range(first, first + 4)).items()}
+    members |= {"trip/bad.jpg": b"no photo", "trip/notes.txt": b"of the trip"}
     path = tmp_path / "photos"  # its name says nothing
-    path.write_bytes(PACKED[kind](photos(*range(first, first + 4)) | {"bad.jpg": b"no photo"}))
-    report = index(server, path, code=1)
+    path.write_bytes(PACKED[kind]({**members, "trip/photos.csv": table(first)}))
+    journal = ("--journal", str(tmp_path / "journal.jsonl"))
+    report = index(server, path, *journal, code=1)
     assert (report["photos"], report["uploaded"], report["already_there"]) == (5, 4, 0)
+    assert (report["other_files"], report["without_coordinates"]) == (1, 3)
     [refused] = report["refused"]
-    assert refused["path"] == "bad.jpg"
+    assert refused["path"].endswith("photos/trip/bad.jpg")
     assert "not a photo" in refused["reason"]
-    path.write_bytes(PACKED[kind](photos(*range(first, first + 4))))
-    report = index(server, path)
-    assert (report["uploaded"], report["already_there"], report["refused"]) == (0, 4, [])
+    found = server.ask(photo_bytes(first), top_k=1).json()["similar_images"][0]
+    assert found["relative_path"] == f"trip/{first}.jpg"
+    assert found["latitude"] == 45 + first / 1000
+
+    report = index(server, path, *journal, code=1)
+    assert (report["uploaded"], report["already_there"]) == (0, 4)
+    assert len(Path(journal[1]).read_text().splitlines()) == 5, "none was sent again"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["journal.jsonl", "photos"]
 
 
-def test_index_rejects_what_is_no_archive_and_options_that_archives_do_not_have(
+def test_index_takes_the_options_of_a_folder_for_an_archive(
     server: ServerProcess, tmp_path: Path
 ) -> None:
+    path = tmp_path / "rooms.zip"
+    path.write_bytes(zip_of({"hall/160.jpg": photo_bytes(160), "161.jpg": photo_bytes(161)}))
+    places = tmp_path / "places.csv"
+    places.write_bytes(b"filename,latitude,longitude\nhall/160.jpg,45.5,7\n")
+    index(server, path, "--places-by-folder", "--csv", str(places))
+    found = server.ask(photo_bytes(160), top_k=1).json()["similar_images"][0]
+    assert (found["place"], found["latitude"]) == ("hall", 45.5)
+    path.write_bytes(zip_of({"162.jpg": photo_bytes(162)}))
+    index(server, path, "--role", "query")
+    found = server.ask(photo_bytes(162), top_k=1).json()["similar_images"][0]
+    assert found["original_filename"] != "162.jpg"
+
+
+def test_index_rejects_what_holds_no_photos(server: ServerProcess, tmp_path: Path) -> None:
     path = tmp_path / "photos.zip"
     path.write_bytes(b"not a zip, whatever its name says" * 50)
-    assert index(server, path, code=1)["code"] == "not_an_archive"
-    path.write_bytes(zip_of(photos(160)))
-    refused = index(server, path, "--role", "query", code=1)
-    assert refused["code"] == "not_for_archives"
-    assert "--role" in refused["detail"]
+    assert index(server, path, code=1)["code"] == "unsupported_source"
+    assert index(server, tmp_path / "nothing.zip", code=1)["code"] == "unreadable_file"
     path.write_bytes(zip_of({"readme.txt": b"hello"}))
     assert index(server, path, code=1)["code"] == "no_photos"
 
@@ -176,7 +201,7 @@ def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -
     listed.write_text(json.dumps({"key": "imports/keys/180.jpg", "latitude": 45, "longitude": 7}))
     assert index(server, listed)["uploaded"] == 1
     refused = index(server, listed, "--journal", str(tmp_path / "j.jsonl"), code=1)
-    assert refused["code"] == "not_for_archives"
+    assert refused["code"] == "unsupported_option"
 
 
 def test_the_client_brings_in_a_prefix(server: ServerProcess) -> None:
@@ -221,25 +246,10 @@ def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path:
     assert all(len(set(line.split())) == 2 for line in lines)
 
 
-def test_a_bomb_does_no_harm(server: ServerProcess) -> None:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for number in range(3):
-            archive.writestr(f"{number}.jpg", b"\xff\xd8\xff" + bytes(50_000_000))
-    answer = server.client.post(
-        "/api/v1/upload/batch", files={"archive": ("bomb.zip", buffer.getvalue())}
-    )
-    job = server.finished(answer.json()["job_id"])
-    assert job["progress"] == {"done": 0, "total": 3, "failed": 3}
-    items = server.client.get(answer.json()["items_url"]).json()["items"]
-    assert {item["error"]["code"] for item in items} == {"file_too_large"}
-
-
 def test_a_batch_goes_on_after_each_kill_and_brings_each_photo_in_once(tmp_path: Path) -> None:
     count = 120
-    archive = tar_of(photos(*range(count)), "w:gz")
     with ServerProcess(tmp_path / "home", batch_ahead_photos=20) as server:
-        answer = server.client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})
+        answer = server.client.post("/api/v1/upload/batch", files=form(*range(count)))
         job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
         for reached in (10, 40, 80):
             while server.client.get(job_url).json()["progress"]["done"] < reached:
@@ -255,18 +265,12 @@ def test_a_batch_goes_on_after_each_kill_and_brings_each_photo_in_once(tmp_path:
         originals = server.home / "objects" / "originals"
         # A kill may leave one that is being written; the steward removes it after a day.
         assert count <= len([p for p in originals.iterdir() if p.is_file()]) <= count + 3
-        archives = server.home / "objects" / "archives"
-        deadline = time.monotonic() + 30
-        while any(archives.iterdir()):
-            assert time.monotonic() < deadline, server.log()
-            time.sleep(0.2)
 
 
 def test_a_batch_in_separate_services_outlives_its_steward(
     tmp_path: Path, postgres: PostgresServer, s3: S3Server
 ) -> None:
     bucket = s3.new_bucket()
-    store = S3Store(bucket)
     count = 60
     with start_redis(own=True) as redis:
         deployment = Deployment(tmp_path, postgres.new_database(), redis.url)
@@ -280,8 +284,7 @@ def test_a_batch_in_separate_services_outlives_its_steward(
             steward = deployment.start("steward")
             with deployment.client(1) as client:
                 until(lambda: client.get("/readyz").is_success)
-                archive = zip_of(photos(*range(count)) | {"photos.csv": table(*range(count))})
-                answer = client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})
+                answer = client.post("/api/v1/upload/batch", files=form(*range(count)))
                 assert answer.status_code == 202, answer.text
                 job_url = answer.json()["status_url"]
                 until(lambda: client.get(job_url).json()["progress"]["done"] >= 10)
@@ -294,7 +297,6 @@ def test_a_batch_in_separate_services_outlives_its_steward(
                 assert job["result"]["already_there"] == 0
                 stats = client.get("/api/v1/database/stats").json()
                 assert (stats["total_images"], stats["searchable_images"]) == (count, count)
-            until(lambda: not list(store.list("archives/")))
             assert "Traceback" not in deployment.logs()
         finally:
             deployment.close()

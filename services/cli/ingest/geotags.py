@@ -5,13 +5,17 @@ The server reads EXIF itself and uses it for every field that is not given here.
 
 from __future__ import annotations
 
+import contextlib
 import glob
+import io
 import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
+from services.cli.ingest.photo_archive import ArchivedFile, PhotoArchive, is_archive
 from services.cli.output import utf8_path
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.imaging.file_formats import PHOTO_SUFFIXES
@@ -27,19 +31,33 @@ from shared.utm_filenames import upload_fields_of_file_name
 
 @dataclass(frozen=True, slots=True)
 class LocalPhoto:
-    """A photo file with the metadata that is uploaded with it."""
+    """A photo file, or a photo in an archive, with the metadata that is uploaded with it."""
 
     path: Path
+    """Of a photo in an archive: the archive's path and the photo's name in it."""
     fields: dict[str, str]
     """Form fields of `POST /upload`."""
     name: str | None = None
     """Name to store; None for the file's own name."""
     relative_path: str | None = None
-    """Path in the folder that is indexed."""
+    """Path in the folder or archive that is indexed."""
+    archived: ArchivedFile | None = None
+    """The photo in its archive."""
+
+    @property
+    def file(self) -> Path:
+        """The file with its bytes: the photo itself, or its archive."""
+        return self.path if self.archived is None else self.archived.archive.path
+
+    def open(self) -> BinaryIO:
+        """Open the photo. Raises OSError, and what `ArchivedFile.read` raises."""
+        if self.archived is None:
+            return self.path.open("rb")
+        return io.BytesIO(self.archived.read())
 
 
 def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
-    """Expand patterns, and return the folders and photos; None unless all sources are such.
+    """Expand patterns, and return the folders, photos and archives; None if a source is none.
 
     Raises:
         InvalidRequest: `no_photos` if a pattern matches nothing.
@@ -52,16 +70,27 @@ def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
             if not found:
                 raise InvalidRequest("no_photos", f"No file matches the pattern {source}.")
         paths += found
-    if all(p.is_dir() or (p.is_file() and p.suffix.lower() in PHOTO_SUFFIXES) for p in paths):
-        return paths
-    return None
+    return paths if all(p.is_dir() or _is_photo(p) or is_archive(p) for p in paths) else None
 
 
-def count_other_files(source: Path) -> Counter[str]:
-    """Count the files below a folder that are no photos by their suffix, such as `.mov`.
+def _is_photo(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES
+
+
+def open_local_source(path: Path, stack: contextlib.ExitStack) -> Path | PhotoArchive:
+    """Open the path if it is an archive, which the stack closes; else return it."""
+    if path.is_dir() or _is_photo(path):
+        return path
+    return stack.enter_context(PhotoArchive(path))
+
+
+def count_other_files(source: Path | PhotoArchive) -> Counter[str]:
+    """Count the files of a folder or archive that are no photos by their suffix, such as `.mov`.
 
     Hidden files are left out.
     """
+    if isinstance(source, PhotoArchive):
+        return source.other_files
     return Counter(
         path.suffix.lower()
         for path in source.rglob("*")
@@ -79,19 +108,24 @@ def has_coordinates(photo: LocalPhoto) -> bool:
     if "latitude" in photo.fields:
         return True
     try:
-        with photo.path.open("rb") as file:
+        with photo.open() as file:
             return read_photo_header(file, sys.maxsize).latitude is not None
     except (OSError, PlacewiseError):
         return True
 
 
 def find_photos(
-    source: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
+    source: Path | PhotoArchive,
+    table: Path | None,
+    utm_zone: str | None,
+    *,
+    places_by_folder: bool = False,
 ) -> list[LocalPhoto]:
-    """Find the photos below a folder, sorted by path, or one photo, with their metadata.
+    """Find the photos below a folder, sorted by path, of an archive, or one photo.
 
     Args:
-        source: A photo, or a folder, which is searched recursively.
+        source: A photo, a folder, which is searched recursively, or an open archive, of which the
+            own table is read as well.
         table: CSV file with metadata; it takes precedence over names of files and folders.
         utm_zone: Zone for `@UTM@` file names that don't contain it, such as `32T`.
         places_by_folder: Use the name of a photo's parent folder as its place label. Photos
@@ -101,11 +135,20 @@ def find_photos(
         InvalidRequest: The table refers to a photo that does not exist, or contains coordinates
             that can't be parsed; `no_photos` if the folder contains none.
     """
-    folder = source if source.is_dir() else source.parent
-    paths = [source] if source != folder else list_photos(folder)
-    table_fields = _read_csv_fields(folder, table, set(paths)) if table else {}
+    found: list[tuple[Path, ArchivedFile | None]]
+    table_fields: dict[Path, dict[str, str]] = {}
+    if isinstance(source, PhotoArchive):
+        folder = source.path
+        found = [(folder / photo.name, photo) for photo in source.photos]
+        table_fields = {folder / name: fields for name, fields in source.table_fields().items()}
+    else:
+        folder = source if source.is_dir() else source.parent
+        found = [(path, None) for path in ([source] if source != folder else list_photos(folder))]
+    if table is not None:
+        csv_fields = _read_csv_fields(folder, table, {path for path, _ in found})
+        table_fields |= {p: {**table_fields.get(p, {}), **csv_fields[p]} for p in csv_fields}
     photos = []
-    for path in paths:
+    for path, archived in found:
         fields = upload_fields_of_file_name(path.name, utm_zone)
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
@@ -114,6 +157,7 @@ def find_photos(
                 path,
                 {**fields, **table_fields.get(path, {})},
                 relative_path=utf8_path(path.relative_to(folder)),
+                archived=archived,
             )
         )
     return photos

@@ -1,4 +1,4 @@
-"""`placewise index`: upload photos from a folder, an archive, a manifest or a bucket prefix."""
+"""`placewise index`: upload photos from folders, archives, a manifest or a bucket prefix."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from placewise.client import Client
+from placewise.protocol import open_file
 from services.cli.client import client_command, connect, describe_target
 from services.cli.environment import read_settings
 from services.cli.ingest.geotags import (
@@ -21,17 +22,16 @@ from services.cli.ingest.geotags import (
     find_local_sources,
     find_photos,
     has_coordinates,
+    open_local_source,
     read_photo_manifest,
 )
 from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
-    check_archive,
     import_keys,
     import_prefix,
     manifest_has_keys,
     switch_off_fits,
-    upload_archive,
     upload_photos,
 )
 from services.cli.ingest.upload_journal import UploadJournal
@@ -50,6 +50,7 @@ from services.cli.output import (
 )
 from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest
+from shared.imaging.file_formats import PHOTO_SUFFIXES
 
 MAX_LISTED_SUFFIXES = 5
 
@@ -59,9 +60,9 @@ def index(
         list[str],
         typer.Argument(
             metavar="SOURCE",
-            help="Folders (searched recursively), photos and patterns such as 'trip/*.jpg'; or one "
-            "zip, tar or gzipped tar archive; or one JSONL manifest with one photo per line; or "
-            "one prefix of the server's own bucket.",
+            help="Folders (searched recursively), photos, patterns such as 'trip/*.jpg', and "
+            "archives (zip, tar, tar.gz); or one JSONL manifest with one photo per line; or one "
+            "prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
@@ -69,7 +70,8 @@ def index(
         typer.Option(
             "--csv",
             help="CSV table with the columns filename, latitude, longitude, heading, captured_at, "
-            "place and tags. filename is relative to the folder; the others are optional.",
+            "place and tags. filename is relative to the folder or archive; the other columns are "
+            "optional.",
         ),
     ] = None,
     utm_zone: Annotated[
@@ -93,7 +95,7 @@ def index(
         typer.Option(
             metavar="FILE",
             help="Record uploaded photos in FILE; a later run with the same FILE skips them. Only "
-            "for folders and manifests of local files.",
+            "for photos of this machine.",
         ),
     ] = None,
     failures: Annotated[
@@ -126,25 +128,27 @@ def index(
     source, path = sources[0], Path(sources[0])
     local = find_local_sources(sources)
     if local is not None:
-        if len(sources) > 1 or not path.is_dir():
+        if len(local) > 1 or path.suffix.lower() in PHOTO_SUFFIXES:
             _reject_options("photos and several folders", {"--csv": table})
-        photos = [
-            photo
-            for one in local
-            for photo in find_photos(one, table, utm_zone, places_by_folder=places)
-        ]
-        if role != PhotoRole.DATABASE:
-            photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-        report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
-        suffixes = sum(map(count_other_files, local), Counter[str]())
-        report["other_files"] = suffixes.total()
-        report["other_suffixes"] = dict(suffixes.most_common())
-        report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
+        with contextlib.ExitStack() as stack:
+            opened = [open_local_source(each, stack) for each in local]
+            photos = [
+                photo
+                for each in opened
+                for photo in find_photos(each, table, utm_zone, places_by_folder=places)
+            ]
+            if role != PhotoRole.DATABASE:
+                photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
+            report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
+            suffixes = sum(map(count_other_files, opened), Counter[str]())
+            report["other_files"] = suffixes.total()
+            report["other_suffixes"] = dict(suffixes.most_common())
+            report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
     elif len(sources) > 1:
         raise InvalidRequest(
             "several_sources",
-            f"{source} and {len(sources) - 1} more: index archives, manifests and bucket "
-            "prefixes one at a time. Only folders, photos and patterns can be combined.",
+            f"{source} and {len(sources) - 1} more: index manifests and bucket prefixes one at a "
+            "time. Only existing folders, photos, archives and patterns can be combined.",
         )
     elif source.startswith("s3://"):
         _reject_options("a bucket prefix", local_file_options)
@@ -161,10 +165,13 @@ def index(
             photos = read_photo_manifest(path, data)
             report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
     else:
-        check_archive(path)
-        _reject_options("an archive", local_file_options)
-        with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
-            report = upload_archive(client, path, progress)
+        with open_file(path):  # says why a file can't be read
+            raise InvalidRequest(
+                "unsupported_source",
+                f"{path} is not a folder or a photo, and not a complete zip or tar. If it is an "
+                "archive, download or create it again. Photos end with "
+                f"{', '.join(sorted(PHOTO_SUFFIXES))}.",
+            )
     if failures is not None:
         _write_failures(failures, report)
     _finish_command(report, server, map_name, role, as_json)
@@ -212,10 +219,10 @@ def _read_manifest(manifest: Path) -> bytes:
 
 
 def _reject_options(source: str, options: Mapping[str, object]) -> None:
-    """Raise InvalidRequest (`not_for_archives`) if an option does not apply to this source."""
+    """Raise InvalidRequest (`unsupported_option`) if an option does not apply to this source."""
     if invalid := [name for name, value in options.items() if value]:
         raise InvalidRequest(
-            "not_for_archives",
+            "unsupported_option",
             f"{', '.join(invalid)}: not supported for {source}. Put the metadata into its table or "
             "manifest, or index a folder.",
         )

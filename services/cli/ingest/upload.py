@@ -1,19 +1,19 @@
-"""Bulk uploads: local photos one by one, or batches that the server ingests itself.
+"""Bulk uploads: local photos one by one, or batches of objects that the server has.
 
-Batches are archives, bucket prefixes and lists of object keys. Both ways wait until the photos are
-described, and for the vocabulary fit that the server starts if the map has enough photos.
+Batches are bucket prefixes and lists of object keys. Both ways wait until the photos are described,
+and for the vocabulary fit that the server starts if the map has enough photos.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 from uuid import UUID
 
 import typer
@@ -21,20 +21,16 @@ from rich.progress import Progress, TaskID
 
 from placewise.answers import FINISHED, BatchItem, BatchStarted, Job, Uploaded
 from placewise.client import Client
-from placewise.protocol import open_file
+from placewise.protocol import printable_name
 from services.cli.client import wait_for_job
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
 from services.cli.output import Json, print_note, utf8_path
-from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
-from shared.imaging.file_formats import (
-    ACCEPTED_ARCHIVES,
-    ARCHIVE_SIGNATURE_BYTES,
-    detect_archive_format,
-)
+from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.ingest.photo_metadata import KEY_FIELD
 
 UPLOAD_CONCURRENCY = 4
+UPLOADS_AHEAD = 2 * UPLOAD_CONCURRENCY  # so that one slow upload does not stop the others
 # How long calls are retried while the server is unavailable. A busy server (429) is retried for as
 # long as its Retry-After says.
 RETRY_PERIOD_SECONDS = 60.0
@@ -187,9 +183,10 @@ def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
 def _upload_concurrently(
     client: Client, photos: list[LocalPhoto], update: bool
 ) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
-    def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
+    def upload(photo: LocalPhoto, content: Path | BinaryIO) -> Uploaded | PlacewiseError:
         fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
-        send = partial(client.upload, photo.path, filename=photo.name, **fields)
+        name = photo.name or printable_name(photo.path)
+        send = partial(client.upload, content, filename=name, **fields)
         try:
             try:
                 return send()
@@ -201,8 +198,21 @@ def _upload_concurrently(
         except PlacewiseError as error:
             return error
 
+    started: deque[tuple[LocalPhoto, Future[Uploaded | PlacewiseError]]] = deque()
     with ThreadPoolExecutor(UPLOAD_CONCURRENCY) as pool:
-        yield from zip(photos, pool.map(upload, photos), strict=True)
+        for photo in photos:
+            try:
+                # In the order of the archive, and only a few ahead: they are read into memory.
+                content = photo.path if photo.archived is None else photo.open()
+            except PlacewiseError as error:
+                yield photo, error
+                continue
+            started.append((photo, pool.submit(upload, photo, content)))
+            if len(started) == UPLOADS_AHEAD:
+                first, future = started.popleft()
+                yield first, future.result()
+        for each, future in started:
+            yield each, future.result()
 
 
 def _patch_fields(fields: dict[str, str]) -> Json:
@@ -251,40 +261,15 @@ def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
     return {"path": utf8_path(photo.path), **filename, "reason": reason}
 
 
-def check_archive(path: Path) -> None:
-    """Check the signature of an archive before it is uploaded.
-
-    Raises:
-        InvalidRequest: `not_an_archive`, `unreadable_file`.
-    """
-    with open_file(path) as file:
-        signature = file.read(ARCHIVE_SIGNATURE_BYTES)
-    if detect_archive_format(signature) is None:
-        raise InvalidRequest(
-            "not_an_archive",
-            f"{path} is neither a folder nor {ACCEPTED_ARCHIVES}.",
-        )
-
-
-def upload_archive(client: Client, archive: Path, progress: Progress) -> Json:
-    """Upload an archive as a batch, and wait until it and an automatic vocabulary fit have ended.
+def import_prefix(client: Client, prefix: str, progress: Progress) -> Json:
+    """Import every photo of the server's store below a prefix, and wait as `upload_photos` does.
 
     Returns:
-        The same report as `upload_photos`, with `ignored`: the number of other archive members.
+        The same report as `upload_photos`, with `ignored`: the number of other objects.
 
     Raises:
         Unprocessable: The batch as a whole failed or was cancelled.
     """
-    client.stats()  # fails before gigabytes are sent if the URL, key or map is wrong
-    sending = progress.add_task("uploading (bytes)", total=archive.stat().st_size)
-    started = client.upload_archive(
-        archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
-    )
-    return _wait_and_report(client, started, progress)
-
-
-def import_prefix(client: Client, prefix: str, progress: Progress) -> Json:
-    """Import every photo of the server's store below a prefix; see `upload_archive`."""
     return _wait_and_report(client, client.import_prefix(prefix), progress)
 
 
@@ -298,7 +283,7 @@ def manifest_has_keys(manifest: bytes) -> bool:
 
 
 def import_keys(client: Client, manifest: bytes, progress: Progress) -> Json:
-    """Import the objects listed by `key` in a JSONL manifest; see `upload_archive`."""
+    """Import the objects listed by `key` in a JSONL manifest; see `import_prefix`."""
     return _wait_and_report(client, client.import_manifest(manifest), progress)
 
 

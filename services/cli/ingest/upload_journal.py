@@ -26,9 +26,9 @@ class JournalEntry:
 class UploadJournal:
     """A JSONL file with one line per photo, appended when the server acknowledges the upload.
 
-    A photo counts as uploaded while its file's size and modification time and its metadata are
-    unchanged. An incomplete last line, left by a killed process, is ignored. A journal belongs to
-    one server and one map.
+    A photo counts as uploaded while the size and modification time of its file (or of its archive)
+    and its metadata are unchanged. An incomplete last line, left by a killed process, is ignored. A
+    journal belongs to one server and one map.
 
     Raises:
         InvalidRequest: `bad_journal` if the file is not a journal of this server and map.
@@ -106,7 +106,7 @@ class UploadJournal:
 def _file_state(photo: LocalPhoto) -> list[Any]:
     """The file attributes and metadata whose change requires a new upload, as JSON."""
     try:
-        stat = photo.path.stat()
+        stat = photo.file.stat()
     except OSError:
         return []
     return [stat.st_size, stat.st_mtime_ns, photo.name, dict(sorted(photo.fields.items()))]

@@ -36,7 +36,6 @@ REMEDIES = {
     "original": "restore the object from a backup, or delete the photo and upload it again",
     "vocabulary": "restore the object from a backup, or fit a new vocabulary",
     "whitening": "restore the object from a backup, or create a new generation",
-    "archive": "its batch fails: upload it again",
     "file": "its batch fails: upload it again",
 }
 

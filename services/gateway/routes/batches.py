@@ -36,7 +36,6 @@ from services.gateway.schemas import (
     to_job_accepted,
 )
 from services.gateway.uploads.batch import (
-    ARCHIVE_FIELD,
     FILES_FIELD,
     MANIFEST_FIELD,
     NDJSON_MEDIA_TYPES,
@@ -84,10 +83,6 @@ REQUEST_BODY = {
                             "type": "array",
                             "items": _BINARY_SCHEMA,
                             "description": "photos",
-                        },
-                        ARCHIVE_FIELD: {
-                            **_BINARY_SCHEMA,
-                            "description": "one zip, tar or gzipped tar",
                         },
                         MANIFEST_FIELD: _MANIFEST_SCHEMA,
                         PREFIX_FIELD: {
@@ -148,7 +143,7 @@ async def upload_batch(
     admission: AdmissionDep,
     query: MapQuery,
 ) -> BatchAcceptedResponse:
-    """Upload many photos: files of a form, one archive, or objects in the store.
+    """Upload many photos: files of a form, or objects in the store.
 
     Objects in the store are named by a manifest of their keys or by a prefix. One job shows the
     progress. Each photo is processed as by `POST /upload`; a refused photo becomes a failed item
@@ -168,7 +163,7 @@ async def upload_batch(
 def read_batch_items(
     gateway: GatewayDep, job_id: JobId, query: Annotated[BatchItemsParams, Query()]
 ) -> BatchItemsResponse:
-    """List the photos of a batch, in upload order; of an archive, after it has been listed."""
+    """List the photos of a batch, in upload order; of a prefix, after it has been listed."""
     after = _parse_item_cursor(query.cursor)
     with gateway.catalog.read() as session:
         job = get_job(session, get_map(session, query.map).id, job_id)
@@ -203,8 +198,7 @@ def _queue_batch(
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
             job = create_batch(session, map_id, source, {**params, **caller_params})
-            # The steward lists the items of archives and prefixes.
-            if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):
+            if source != BatchSource.PREFIX:  # the steward lists its items
                 add_batch_items(session, job, rows)
             items_url = job_url(job.id, map_name, "/items")
             job_accepted = to_job_accepted(job, map_name)
@@ -230,9 +224,6 @@ def _plan_items(
     gateway: GatewayContext, received: BatchUpload
 ) -> tuple[list[dict[str, Any]], BatchSource, dict[str, Any]]:
     """Return the items as column values of BatchItem, their source, and the job params."""
-    if received.archive is not None:
-        archive = received.archive
-        return [], BatchSource.ARCHIVE, {"object_key": archive.key, "filename": archive.name}
     if received.files:
         entries = read_jsonl_manifest(received.manifest or b"", "the manifest")
         return list(_form_file_items(received.files, entries)), BatchSource.FILES, {}

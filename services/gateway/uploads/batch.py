@@ -1,4 +1,4 @@
-"""Streaming parser of batch uploads: many files, one archive, or a manifest of object keys.
+"""Streaming parser of batch uploads: many files, or a manifest or a prefix of object keys.
 
 The files are written to the object store while they are received. Each file is validated on its
 own: a refused file becomes a failed item of the batch, and the rest of its bytes is skipped. If the
@@ -17,25 +17,14 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.uploads.multipart import MultipartFormParser, body_media_type
 from shared.config.settings import Settings
-from shared.errors import (
-    InvalidRequest,
-    PlacewiseError,
-    TooLarge,
-    UnsupportedMedia,
-    invalid_field_error,
-)
-from shared.imaging.file_formats import (
-    ACCEPTED_ARCHIVES,
-    ARCHIVE_SIGNATURE_BYTES,
-    detect_archive_format,
-    photo_suffix,
-)
+from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error
+from shared.imaging.file_formats import photo_suffix
 from shared.ingest.photo_metadata import MAX_MANIFEST_BYTES
 from shared.ingest.validation import StreamValidator, check_photo_signature
 from shared.storage import ObjectStore, ObjectWriter
-from shared.storage.keys import new_archive_key, new_original_key
+from shared.storage.keys import new_original_key
 
-FILES_FIELD, ARCHIVE_FIELD, MANIFEST_FIELD, PREFIX_FIELD = "file", "archive", "manifest", "prefix"
+FILES_FIELD, MANIFEST_FIELD, PREFIX_FIELD = "file", "manifest", "prefix"
 NDJSON_MEDIA_TYPES = ("application/x-ndjson", "application/jsonl", "application/x-jsonlines")
 MAX_PART_HEADER_BYTES = 1024
 MAX_PREFIX_BYTES = 1024  # the maximum length of an S3 key
@@ -57,7 +46,6 @@ class BatchUpload:
     """The parsed body of a batch upload."""
 
     files: list[BatchFile] = field(default_factory=list)
-    archive: BatchFile | None = None
     manifest: bytes | None = None
     prefix: str | None = None
 
@@ -65,7 +53,6 @@ class BatchUpload:
         """Content for the idempotency fingerprint: equal for the same files and manifest."""
         return [
             [[file.name, file.sha256] for file in self.files],
-            self.archive and [self.archive.name, self.archive.sha256],
             None if self.manifest is None else hashlib.sha256(self.manifest).hexdigest(),
             *([] if self.prefix is None else [self.prefix]),
         ]
@@ -81,19 +68,19 @@ async def parse_batch_upload(
     Raises:
         InvalidRequest: `no_file`, `several_sources`, `empty_file`, `malformed_body`.
         TooLarge: `batch_too_large`, `too_many_photos`, `manifest_too_large`.
-        UnsupportedMedia: `unsupported_archive`, `unsupported_body`.
+        UnsupportedMedia: `unsupported_body`.
         Unprocessable: `invalid_field`.
     """
     if body_media_type(request) in NDJSON_MEDIA_TYPES:
         return BatchUpload(manifest=await _read_manifest_body(request))
     max_bytes = (
-        settings.max_archive_size
+        settings.max_batch_size
         + MAX_MANIFEST_BYTES
         + settings.max_batch_photos * MAX_PART_HEADER_BYTES
     )
     parts = _BatchPartHandler(store, settings)
     form = MultipartFormParser(
-        request, parts, max_bytes, lambda: _batch_too_large_error(settings.max_archive_size)
+        request, parts, max_bytes, lambda: _batch_too_large_error(settings.max_batch_size)
     )
     try:
         async for piece in request.stream():
@@ -101,13 +88,13 @@ async def parse_batch_upload(
             await run_in_threadpool(parts.write)
         form.finish()
         received = parts.batch
-        if not received.files and received.archive is None and received.manifest is None:
+        if not received.files and received.manifest is None:
             if received.prefix is None:
                 raise InvalidRequest(
                     "no_file",
-                    f"The form has no photos ({FILES_FIELD!r}, once for each), no archive "
-                    f"({ARCHIVE_FIELD!r}), no manifest of keys ({MANIFEST_FIELD!r}) and no prefix "
-                    f"of keys ({PREFIX_FIELD!r}). Send one of them: curl -F archive=@PHOTOS.zip.",
+                    f"The form has no photos ({FILES_FIELD!r}, once for each), no manifest of keys "
+                    f"({MANIFEST_FIELD!r}) and no prefix of keys ({PREFIX_FIELD!r}). Send one of "
+                    "them: curl -F file=@1.jpg -F file=@2.jpg.",
                 )
         elif received.prefix is not None:
             raise _conflicting_sources_error("a prefix and another source")
@@ -119,8 +106,8 @@ async def parse_batch_upload(
 
 def discard_batch_upload(store: ObjectStore, received: BatchUpload) -> None:
     """Delete the stored files of the batch."""
-    for file in (*received.files, received.archive):
-        if file is not None and file.error is None:
+    for file in received.files:
+        if file.error is None:
             store.delete(file.key)
 
 
@@ -128,7 +115,7 @@ def _batch_too_large_error(max_bytes: int) -> PlacewiseError:
     """Build the 413 error for a batch of more than `max_bytes`."""
     return TooLarge(
         "batch_too_large",
-        f"The files of the batch are larger than {max_bytes} bytes together (MAX_ARCHIVE_SIZE). "
+        f"The files of the batch are larger than {max_bytes} bytes together (MAX_BATCH_SIZE). "
         "Split the batch into several.",
         max_bytes=max_bytes,
     )
@@ -185,29 +172,24 @@ class _BatchPartHandler:
             if self.batch.prefix is not None:
                 raise _conflicting_sources_error("two prefixes")
             self.batch.prefix = ""
-        elif name not in (FILES_FIELD, ARCHIVE_FIELD):
+        elif name != FILES_FIELD:
             raise invalid_field_error(
                 name,
-                f"is unknown; valid are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and "
-                f"{PREFIX_FIELD}. Put the fields of single photos into the manifest",
+                f"is unknown; valid are {FILES_FIELD}, {MANIFEST_FIELD} and {PREFIX_FIELD}. Put "
+                "the fields of single photos into the manifest. The server takes no archives: "
+                "unpack yours, or run placewise index ARCHIVE",
             )
         elif filename is None:
             raise InvalidRequest(
                 "no_file",
                 f"The field {name!r} is not a file. Send it as curl -F {name}=@PATH (with the @).",
             )
-        elif name == FILES_FIELD:
+        else:
             if len(self.batch.files) == self._settings.max_batch_photos:
                 raise too_many_photos_error(self._settings.max_batch_photos)
             key = new_original_key(photo_suffix(filename))
             self._file = BatchFile(_display_name(filename), key)
             self.batch.files.append(self._file)
-        else:
-            if self.batch.archive is not None:
-                raise _conflicting_sources_error("two archives")
-            self._file = self.batch.archive = BatchFile(_display_name(filename), new_archive_key())
-        if self.batch.archive and (self.batch.files or self.batch.manifest is not None):
-            raise _conflicting_sources_error("an archive and another source")
 
     def data(self, piece: bytes) -> None:
         if self._name == MANIFEST_FIELD:
@@ -221,8 +203,8 @@ class _BatchPartHandler:
                 raise invalid_field_error(PREFIX_FIELD, f"has more than {MAX_PREFIX_BYTES} bytes")
             return
         self._files_bytes += len(piece)
-        if self._files_bytes > self._settings.max_archive_size:
-            raise _batch_too_large_error(self._settings.max_archive_size)
+        if self._files_bytes > self._settings.max_batch_size:
+            raise _batch_too_large_error(self._settings.max_batch_size)
         assert self._file is not None
         self._write_queue.append((self._file, piece))
 
@@ -248,13 +230,13 @@ class _BatchPartHandler:
                 self._finish(file) if piece is None else self._write(file, piece)
             except PlacewiseError as error:
                 self._abort_write()
-                if file is self.batch.archive or error.status >= 500:
+                if error.status >= 500:
                     raise
                 file.error = error
 
     def _write(self, file: BatchFile, piece: bytes) -> None:
         if self._validator is None:
-            self._validator = self._new_validator(file)
+            self._validator = StreamValidator(self._settings.max_file_size, check_photo_signature)
         self._validator.add(piece)
         if self._writer is None:
             self._writer = self._store.writer(file.key)
@@ -273,14 +255,6 @@ class _BatchPartHandler:
             self._writer.abort()
         self._validator = self._writer = None
 
-    def _new_validator(self, file: BatchFile) -> StreamValidator:
-        if file is self.batch.archive:
-            limit = self._settings.max_archive_size
-            return StreamValidator(
-                limit, _check_archive_signature, signature_bytes=ARCHIVE_SIGNATURE_BYTES
-            )
-        return StreamValidator(self._settings.max_file_size, check_photo_signature)
-
 
 def too_many_photos_error(limit: int) -> PlacewiseError:
     """Build the 413 error for a batch of more than `limit` photos."""
@@ -288,15 +262,6 @@ def too_many_photos_error(limit: int) -> PlacewiseError:
         "too_many_photos",
         f"The batch has more than {limit} photos (MAX_BATCH_PHOTOS). Split it into several.",
     )
-
-
-def _check_archive_signature(begin: bytes) -> None:
-    if detect_archive_format(begin) is None:
-        raise UnsupportedMedia(
-            "unsupported_archive",
-            f"By its content the file is not {ACCEPTED_ARCHIVES}. Send single photos in the "
-            f"field {FILES_FIELD!r}.",
-        )
 
 
 def _display_name(filename: str) -> str:
@@ -308,8 +273,7 @@ def _conflicting_sources_error(what: str) -> PlacewiseError:
     return InvalidRequest(
         "several_sources",
         f"The form has {what}. A batch is one of: photos ({FILES_FIELD!r}) with an optional "
-        f"{MANIFEST_FIELD!r}; one {ARCHIVE_FIELD!r}, which may contain a table; one "
-        f"{MANIFEST_FIELD!r} of keys; one {PREFIX_FIELD!r} of keys.",
+        f"{MANIFEST_FIELD!r}; one {MANIFEST_FIELD!r} of keys; one {PREFIX_FIELD!r} of keys.",
     )
 
 

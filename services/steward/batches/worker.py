@@ -14,24 +14,16 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 from uuid import UUID
 
-from cachetools import LRUCache
 from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from services.steward.archives.archive import Archive, ArchiveLimits
-from services.steward.archives.readers import open_archive
-from services.steward.batches.listing import (
-    list_archive_photos,
-    list_prefix_photos,
-    member_from_location,
-)
+from services.steward.batches.listing import list_prefix_photos
 from services.steward.metrics import StewardMetrics
 from shared.catalog.batch_items import (
     BatchItem,
@@ -77,11 +69,10 @@ from shared.storage.keys import new_original_key
 log = logging.getLogger(__name__)
 
 OBJECT_READ_BYTES = 256 * 1024
-MAX_OPEN_ARCHIVES = 4  # reopening a gzipped archive decompresses it from its beginning
 
 
 class _BatchItemImporter:
-    """Imports batch items; caches the open archives."""
+    """Imports batch items."""
 
     def __init__(
         self, catalog: Catalog, store: ObjectStore, wakeups: Wakeups, settings: Settings
@@ -91,18 +82,6 @@ class _BatchItemImporter:
         self._wakeups = wakeups
         self._settings = settings
         self._quota = PhotoQuota(catalog)
-        self._archives: LRUCache[UUID, Archive] = LRUCache(MAX_OPEN_ARCHIVES)
-
-    def open_batch_archive(self, job: Job) -> Archive:
-        """Return the batch's archive, opened once. Raises as `open_archive` does."""
-        if job.id not in self._archives:
-            limits = ArchiveLimits(self._settings.max_batch_photos, self._settings.max_archive_size)
-            self._archives[job.id] = open_archive(self._store, job.params["object_key"], limits)
-        return self._archives[job.id]
-
-    def close_archive(self, job: Job) -> None:
-        """Drop the batch's archive from the cache."""
-        self._archives.pop(job.id, None)
 
     def import_item(self, job: Job, item: BatchItem) -> None:
         """Store the item as a photo with its job, or fail the item.
@@ -116,7 +95,7 @@ class _BatchItemImporter:
         key = item.object_key if uploaded and item.object_key else new_key
         try:
             stored_upload = (
-                self._received_upload(item) if uploaded else self._copy_to_store(job, item, key)
+                self._received_upload(item) if uploaded else self._copy_to_store(item, key)
             )
             key_id = UUID(job.params["key_id"]) if "key_id" in job.params else None
             photo = validate_photo(
@@ -130,7 +109,7 @@ class _BatchItemImporter:
         except Unavailable:
             raise
         except JobInterrupted:
-            # Another steward would copy the member again; an uploaded file is needed by it.
+            # Another steward would copy the object again; an uploaded file is needed by it.
             if not uploaded:
                 self._store.delete(key)
             raise
@@ -162,14 +141,16 @@ class _BatchItemImporter:
             fields=item.fields,
         )
 
-    def _copy_to_store(self, job: Job, item: BatchItem, key: str) -> StoredUpload:
-        """Copy the member or object to `key` and validate it meanwhile."""
+    def _copy_to_store(self, item: BatchItem, key: str) -> StoredUpload:
+        """Copy the item's object to `key` and validate it meanwhile."""
+        assert item.object_key is not None
         validator = StreamValidator(self._settings.max_file_size, check_photo_signature)
         writer = self._store.writer(key)
         try:
-            for piece in self._read_item(job, item):
-                validator.add(piece)
-                writer.write(piece)
+            with self._store.open(item.object_key) as file:
+                while piece := file.read(OBJECT_READ_BYTES):
+                    validator.add(piece)
+                    writer.write(piece)
             validator.end()
             if not validator.size_bytes:
                 raise InvalidRequest("empty_file", "The file is empty.")
@@ -184,16 +165,6 @@ class _BatchItemImporter:
             first_bytes=validator.first_bytes,
             fields=item.fields,
         )
-
-    def _read_item(self, job: Job, item: BatchItem) -> Iterator[bytes]:
-        if item.object_key is None:
-            yield from self.open_batch_archive(job).read(
-                member_from_location(item.name, item.source)
-            )
-            return
-        with self._store.open(item.object_key) as file:
-            while piece := file.read(OBJECT_READ_BYTES):
-                yield piece
 
     def _commit(self, job: Job, item: BatchItem, photo: ValidatedPhoto) -> StoreResult:
         with self._catalog.write() as session:
@@ -299,7 +270,7 @@ class BatchWorker:
     def _run_slice(self, job: Job, stop: threading.Event) -> None:
         deadline = time.monotonic() + SLICE_SECONDS
         if not job.params["listed"]:
-            self._list_items(job)
+            self._list_prefix(job)
         elif job.attempts >= MAX_ATTEMPTS:
             self._fail_suspect_item(job)
         try:
@@ -317,16 +288,13 @@ class BatchWorker:
         else:
             self._finish_slice(job)
 
-    def _list_items(self, job: Job) -> None:
-        """Write the items of an archive or prefix; the gateway writes those of files and keys."""
+    def _list_prefix(self, job: Job) -> None:
+        """Write the items of a prefix; the gateway writes those of files and keys."""
         with self._catalog.write() as session:
             for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
                 leased.stage = "list"
-        if job.params["source"] == BatchSource.PREFIX:
-            max_photos = self._settings.max_batch_photos
-            listing = list_prefix_photos(self._store, job.params["prefix"], max_photos)
-        else:
-            listing = list_archive_photos(self._importer.open_batch_archive(job))
+        max_photos = self._settings.max_batch_photos
+        listing = list_prefix_photos(self._store, job.params["prefix"], max_photos)
         with self._catalog.write() as session:
             for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
                 leased.params = {**leased.params, "ignored": listing.ignored}
@@ -378,7 +346,6 @@ class BatchWorker:
                 return
             succeed_job(leased, summarise_batch(session, leased, counts))
             update_batch_progress(leased, counts)
-        self._importer.close_archive(job)
 
     def _pause_seconds(self, session: Session, job: Job) -> float:
         max_queued = self._settings.batch_ahead_photos

@@ -123,20 +123,14 @@ def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    """Delete archives, batch items, and uploaded files that did not become photos."""
+    """Delete batch items, and uploaded files that did not become photos."""
     with catalog.read() as session:
-        params = session.scalars(
-            select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.BATCH)
-        ).all()
         items = session.scalars(
             select(BatchItem)
             .join(Job, Job.id == BatchItem.job_id)
             .where(Job.map_id == map_id)
             .limit(ROWS_PER_TRANSACTION)
         ).all()
-    for job_params in params:
-        if "object_key" in job_params:
-            store.delete(job_params["object_key"])
     for item in items:
         if item.photo_id is None and item.object_key and item.object_key.startswith(ORIGINALS):
             store.delete(item.object_key)

@@ -31,7 +31,6 @@ from shared.config.settings import Settings
 from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
 from shared.storage.keys import (
-    ARCHIVES,
     CHECKPOINTS,
     WORK,
     derived_image_keys,
@@ -280,19 +279,21 @@ def collect_model_change_files(catalog: Catalog, store: ObjectStore) -> None:
             store.delete(key)
 
 
-def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: JobKind) -> None:
-    """Delete files under `prefix` that were uploaded for jobs of this kind which have ended.
+def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
+    """Delete uploaded checkpoints whose jobs have ended.
 
-    A file that no job refers to stays: its upload may still be running.
+    A checkpoint that no job refers to stays: its upload may still be running.
     """
-    keys = [info.key for info in store.list(prefix)]
+    keys = [info.key for info in store.list(CHECKPOINTS)]
     if not keys:
         return
     with catalog.read() as session:
         ended = session.scalars(
-            select(Job.params).where(Job.kind == kind, Job.state.not_in(UNFINISHED_STATES))
+            select(Job.params).where(
+                Job.kind == JobKind.ADD_MODEL, Job.state.not_in(UNFINISHED_STATES)
+            )
         )
-        ended_keys = {params.get("object_key") for params in ended}
+        ended_keys = {params["object_key"] for params in ended}
     for key in keys:
         if key in ended_keys:
             store.delete(key)
@@ -316,5 +317,4 @@ def collect_garbage(
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_model_change_files(catalog, store)
     collect_presigned_uploads(catalog, store)
-    collect_job_files(catalog, store, ARCHIVES, JobKind.BATCH)
-    collect_job_files(catalog, store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_checkpoints(catalog, store)

@@ -34,7 +34,6 @@ from shared.journal.outbox import accept_segments, catalog_lag
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.chunks import codes_key, manifest_key
 from shared.storage.keys import (
-    ARCHIVES,
     CHECKPOINTS,
     FEATURES,
     INCOMING,
@@ -244,16 +243,12 @@ def _referenced_originals(session: Session, keys: list[str]) -> Iterable[str]:
     return [*stored, *filter(None, waiting), *(key for key in keys if not is_original_key(key))]
 
 
-def _referenced_by_unfinished_jobs(kind: JobKind) -> Callable[[Session, list[str]], Iterable[str]]:
-    """Make a lookup of the files that were uploaded for unfinished jobs of this kind."""
-
-    def referenced(session: Session, keys: list[str]) -> Iterable[str]:
-        unfinished = session.scalars(
-            select(Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
-        )
-        return [params["object_key"] for params in unfinished if "object_key" in params]
-
-    return referenced
+def _referenced_checkpoints(session: Session, keys: list[str]) -> Iterable[str]:
+    """Keys of checkpoints whose jobs are unfinished."""
+    unfinished = session.scalars(
+        select(Job.params).where(Job.kind == JobKind.ADD_MODEL, Job.state.in_(UNFINISHED_STATES))
+    )
+    return [params["object_key"] for params in unfinished]
 
 
 def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
@@ -334,8 +329,7 @@ def _parse_uuids(names: Iterable[str]) -> set[UUID]:
 # Prefix -> which of the keys under it a catalog row refers to; more keys may be returned.
 REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     INCOMING: _referenced_incoming,
-    ARCHIVES: _referenced_by_unfinished_jobs(JobKind.BATCH),
-    CHECKPOINTS: _referenced_by_unfinished_jobs(JobKind.ADD_MODEL),
+    CHECKPOINTS: _referenced_checkpoints,
     MODELS: _referenced_by_column(Model.object_key),
     ORIGINALS: _referenced_originals,
     THUMBNAILS: _referenced_derived_images,

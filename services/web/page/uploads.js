@@ -4,6 +4,7 @@ import { Problem, currentMap, get, idempotencyKey, maySucceed, post, send } from
 import { withoutHidden } from "./drop.js";
 import { count, plural } from "./format.js";
 import { stateInWords, watchJob } from "./jobs.js";
+import { readZip } from "./zip.js";
 
 const AT_ONCE = 3; // browsers keep six connections to a server, and each job's events take one
 const ONE_BY_ONE = 24; // more than these go as batches
@@ -11,10 +12,12 @@ const BATCH_PHOTOS = 60;
 const BATCH_BYTES = 120_000_000;
 const ERRORS_SHOWN = 100;
 const BUSY_TRIES = 20;
-const ARCHIVE = /\.(zip|tar|tgz|tar\.gz)$/i;
+const ZIP = /\.zip$/i;
+const TAR = /\.(tar|tgz|tar\.gz)$/i;
+const TABLE = /(^|\/)(photos\.csv|manifest\.jsonl)$/;
 const PHOTO = /\.(jpe?g|png|webp|bmp|tiff?|heic|heif)$/i;
 
-/** One row of the list: a photo, a batch of photos, or an archive. */
+/** One row of the list: a photo, or a batch of photos. */
 class Entry {
   constructor(queue, name, total) {
     this.queue = queue;
@@ -124,16 +127,16 @@ class BatchEntry extends Entry {
     this.fields = fields;
   }
 
-  form() {
+  async form() {
     const form = new FormData();
     const hasFields = Object.keys(this.fields).length > 0;
     if (hasFields) form.append("manifest", this.files.map(({ path }) => JSON.stringify({ filename: path, ...this.fields })).join("\n"));
-    for (const { file, path } of this.files) form.append("file", file, path);
+    for (const { path, read } of this.files) form.append("file", await read(), path);
     return form;
   }
 
   async work() {
-    if (!this.again) this.batch = (await this.sendForm("/upload/batch", this.form())).job_id;
+    if (!this.again) this.batch = (await this.sendForm("/upload/batch", await this.form())).job_id;
     this.set({ phase: "working" });
     const job = await this.watch(this.batch);
     const { done, failed, total } = job.progress;
@@ -164,18 +167,6 @@ class BatchEntry extends Entry {
   }
 }
 
-class ArchiveEntry extends BatchEntry {
-  constructor(queue, { file, path }) {
-    super(queue, path, [{ file, path }], {});
-  }
-
-  form() {
-    const form = new FormData();
-    form.append("archive", this.files[0].file, this.files[0].file.name);
-    return form;
-  }
-}
-
 /** Runs AT_ONCE entries at a time, in their order. */
 export class UploadQueue {
   constructor() {
@@ -185,31 +176,49 @@ export class UploadQueue {
     this.drawing = false;
   }
 
-  /** `files` as [{file, path}]; `fields` are those of POST /upload, and hold for all of them. How many
-   * were left out, because they are neither photos nor archives; hidden files are not counted. */
-  add(chosen, fields) {
+  /** `files` as [{file, path}]; `fields` are those of POST /upload, and hold for all of them. Resolves to sentences
+   * about what was left out; hidden files are not counted. */
+  async add(chosen, fields) {
     const files = withoutHidden(chosen);
-    const archives = files.filter(({ path }) => ARCHIVE.test(path));
-    const photos = files.filter(({ file, path }) => !ARCHIVE.test(path) && (file.type.startsWith("image/") || PHOTO.test(path) || files.length === 1));
-    this.entries.push(...archives.map((one) => new ArchiveEntry(this, one)));
+    const zips = files.filter(({ path }) => ZIP.test(path));
+    const tars = files.filter(({ path }) => TAR.test(path));
+    const photos = files.filter(({ file, path }) => !ZIP.test(path) && !TAR.test(path) && (file.type.startsWith("image/") || PHOTO.test(path) || files.length === 1));
+    let leftOut = files.length - zips.length - tars.length - photos.length;
     if (photos.length <= ONE_BY_ONE) this.entries.push(...photos.map((one) => new PhotoEntry(this, one, fields)));
-    else this.entries.push(...this.#batches(photos, fields));
+    else this.entries.push(...this.#batches(photos.map(({ file, path }) => ({ path, size: file.size, read: () => file })), fields));
     this.start();
-    return files.length - archives.length - photos.length;
+    const notes = tars.map(({ path }) => `${path} left out: unpack it, or run placewise index.`);
+    for (const { file } of zips) {
+      try {
+        const members = withoutHidden(await readZip(file));
+        const inside = members.filter(({ path }) => PHOTO.test(path));
+        const tables = members.filter(({ path }) => TABLE.test(path));
+        if (inside.length) this.entries.push(...this.#batches(inside, fields));
+        else notes.push(`${file.name} has no photos.`);
+        notes.push(...tables.map(({ path }) => `${path} of ${file.name} is not read here: run placewise index.`));
+        leftOut += members.length - inside.length - tables.length;
+      } catch (error) {
+        notes.push(error.message);
+      }
+    }
+    this.start();
+    if (leftOut) notes.push(`${plural(leftOut, "file")} left out: no photos.`);
+    return notes;
   }
 
   #batches(photos, fields) {
     const batches = [[]];
     let size = 0;
     for (const photo of photos) {
-      if (batches.at(-1).length === BATCH_PHOTOS || (size && size + photo.file.size > BATCH_BYTES)) {
+      if (batches.at(-1).length === BATCH_PHOTOS || (size && size + photo.size > BATCH_BYTES)) {
         batches.push([]);
         size = 0;
       }
       batches.at(-1).push(photo);
-      size += photo.file.size;
+      size += photo.size;
     }
-    return batches.map((some) => new BatchEntry(this, `${some[0].path} … ${some.at(-1).path}`, some, fields));
+    const name = (some) => (some.length === 1 ? some[0].path : `${some[0].path} … ${some.at(-1).path}`);
+    return batches.map((some) => new BatchEntry(this, name(some), some, fields));
   }
 
   start() {

@@ -14,14 +14,14 @@ import torch
 from sqlalchemy import select, update
 
 from services.extractor import checkpointed_steps as new_generation_module
-from services.steward.tasks.garbage_collection import collect_job_files
+from services.steward.tasks.garbage_collection import collect_checkpoints
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model, remove_model
 from shared.descriptors.backbones.torchhub import module_fingerprint
-from shared.jobs import InProcessWakeups, JobKind
+from shared.jobs import InProcessWakeups
 from shared.storage.keys import CHECKPOINTS, MODELS
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import same
@@ -216,7 +216,7 @@ def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_noth
     failed(service, started, code)
     assert not (tmp_path / "executed").exists()
     assert service.json("GET", "/models")["models"] == []
-    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_checkpoints(service.catalog, service.store)
     assert keys(service, CHECKPOINTS) == keys(service, MODELS) == []
     again = service("POST", f"/jobs/{started.json()['job_id']}/retry")
     assert "POST /api/v1/models" in problem(again, 409, "job_not_retryable")["detail"]
@@ -224,7 +224,7 @@ def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_noth
 
 def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
     started = send(service, some_checkpoint())
-    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_checkpoints(service.catalog, service.store)
     collect_orphans(service.catalog, service.store, 0)
     assert len(keys(service, CHECKPOINTS)) == 1
     done(service, started)

@@ -28,7 +28,6 @@ from shared.ingest.validation import ValidatedPhoto
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
-from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import RedisServer, start_redis
@@ -212,8 +211,8 @@ def test_photos_of_a_batch_count_too(
     door: Door, catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     key = door.key("write", max_photos=2)["key"]
-    archive = zip_of({f"{number}.jpg": photo_bytes(number) for number in range(4)})
-    started = door(key, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)})
+    sent = [("file", (f"{number}.jpg", photo_bytes(number))) for number in range(4)]
+    started = door(key, "POST", "/upload/batch", files=sent)
     assert started.status_code == 202, started.text
     BatchWorker(catalog, store, InProcessWakeups(), settings, "steward").run_next(Event())
     items = door(ADMIN, "GET", f"/jobs/{started.json()['job_id']}/items").json()["items"]

@@ -22,7 +22,6 @@ from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups
 from shared.telemetry.tracing import configure_tracing
 from tests.integration.in_process_api import Service
-from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_backup_and_verify.py finds the id of a call on SQLite.
@@ -64,12 +63,11 @@ def test_the_id_of_an_upload_is_found_in_the_answer_the_job_and_both_logs(
 
 
 def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
-    archive = zip_of({"a.jpg": photo_bytes(1), "b.jpg": photo_bytes(2)})
     service.json(
         "POST",
         "/upload/batch",
         202,
-        files={"archive": ("photos.zip", archive)},
+        files=[("file", (f"{number}.jpg", photo_bytes(number))) for number in (1, 2)],
         headers={"X-Request-ID": ID},
     )
     worker = BatchWorker(

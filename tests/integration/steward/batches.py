@@ -35,16 +35,22 @@ class Batches:
         return BatchWorker(self.catalog, self.store, InProcessWakeups(), settings, "steward")
 
     def start(self, *files: tuple[str, bytes], **parts: Any) -> UUID:
-        """`POST /upload/batch` with these files, and `archive` or `manifest`; its job."""
+        """`POST /upload/batch` with these files, and a `manifest` or `prefix`; its job."""
         sent: list[tuple[str, Any]] = [("file", file) for file in files]
-        if "archive" in parts:
-            sent.append(("archive", ("photos", parts["archive"])))
         if "manifest" in parts:
             sent.append(("manifest", ("manifest.jsonl", parts["manifest"])))
         if "prefix" in parts:
             sent.append(("prefix", (None, parts["prefix"])))
         started = self.service.json("POST", "/upload/batch", 202, files=sent)
         return UUID(started["job_id"])
+
+    def start_import(self, photos: list[tuple[str, bytes]], *fields: dict[str, Any]) -> UUID:
+        """A batch of objects with these names and bytes, and of the fields of the first ones."""
+        entries = []
+        for number, (name, data) in enumerate(photos):
+            self.store.put(f"imports/{name}", data)
+            entries.append({"key": f"imports/{name}", **(fields[number : number + 1] or [{}])[0]})
+        return self.start(manifest=lines(*entries))
 
     def work(self, worker: BatchWorker | None = None) -> bool:
         """The next slice of a batch, without pauses."""

@@ -12,14 +12,11 @@ from sqlalchemy import func, select
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import cancel_items_of_ended_batches
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_job_files
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.database.session import Catalog
 from shared.jobs import Job, JobKind, JobState
-from shared.storage.keys import ARCHIVES
 from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import ROUNDS, Batches, codes, counts, files, lines
-from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
@@ -27,53 +24,41 @@ from tests.support.problems import problem
 pytestmark = pytest.mark.databases("postgresql")
 
 
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_each_bad_member_has_its_reason_and_the_others_come_in(
-    batches: Batches, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    members = [
-        ("good.jpg", photo_bytes(1)),
-        ("text.jpg", b"not a photo at all, by its content"),
-        ("cut.jpg", b"\xff\xd8\xff" + bytes(1000)),
-        ("inner.zip", zip_of({"a.jpg": photo_bytes(9)})),
-        ("far.jpg", photo_bytes(2)),
-        ("twice.jpg", photo_bytes(3)),
-        ("twice.jpg", photo_bytes(4)),
-        ("../../up.jpg", photo_bytes(5)),
-        ("empty.jpg", b""),
-        ("large.jpg", b"\xff\xd8\xff" + bytes(300_000)),
-        ("same.jpg", photo_bytes(1)),
-        ("__MACOSX/._good.jpg", b"resources"),
-        (".hidden.jpg", photo_bytes(6)),
-        ("folder.jpg/", b""),
-        ("photos.csv", b"file,latitude,longitude\nfar.jpg,95,7\ntwice.jpg,1,2\n"),
-    ]
-    job_id = batches.start(archive=zip_of(members))
-    worker = batches.new_worker(max_file_size=100_000)
-    job = batches.finish(job_id, worker)
+def test_each_bad_object_has_its_reason_and_the_others_come_in(batches: Batches) -> None:
+    job_id = batches.start_import(
+        [
+            ("far.jpg", photo_bytes(2)),
+            ("good.jpg", photo_bytes(1)),
+            ("text.jpg", b"not a photo at all, by its content"),
+            ("archive.jpg", b"PK\x03\x04 and more of a zip"),
+            ("cut.jpg", b"\xff\xd8\xff" + bytes(1000)),
+            ("empty.jpg", b""),
+            ("large.jpg", b"\xff\xd8\xff" + bytes(300_000)),
+            ("same.jpg", photo_bytes(1)),
+        ],
+        {"latitude": 95, "longitude": 7},
+    )
+    job = batches.finish(job_id, batches.new_worker(max_file_size=100_000))
     assert job["state"] == "succeeded"
-    assert counts(job) == (3, 11, 8)
-    assert job["result"]["ignored"] == 3
+    assert counts(job) == (2, 8, 6)
     items = batches.items(job_id)
     assert codes(items) == [
+        "invalid_field",
         None,
         "unsupported_photo",
+        "unsupported_photo",
         "undecodable_photo",
-        "nested_archive",
-        "invalid_field",
-        "ambiguous_name",
-        "ambiguous_name",
-        None,
         "empty_file",
         "file_too_large",
         None,
     ]
-    assert items[4]["error"]["line"] == 2
-    assert items[4]["error"]["detail"].startswith("Line 2: latitude: ")
-    assert items[10]["already_there"]
-    assert items[10]["file_id"] == items[0]["file_id"]
-    assert [photo.filename for photo in batches.photos()] == ["good.jpg", "up.jpg"]
-    assert len(batches.keys("originals/")) == 2, "what is refused leaves no bytes"
+    assert items[0]["error"]["line"] == 1
+    assert items[0]["error"]["detail"].startswith("Line 1: latitude: ")
+    assert "placewise index" in items[3]["error"]["detail"]
+    assert items[7]["already_there"]
+    assert items[7]["file_id"] == items[1]["file_id"]
+    assert [photo.filename for photo in batches.photos()] == ["good.jpg"]
+    assert len(batches.keys("originals/")) == 1, "what is refused leaves no bytes"
     assert codes(batches.items(job_id, state="failed")) == [c for c in codes(items) if c]
 
 
@@ -156,7 +141,7 @@ def queued_photos(catalog: Catalog) -> int:
 
 
 def test_a_batch_brings_in_no_more_than_the_extractors_have_room_for(batches: Batches) -> None:
-    job_id = batches.start(archive=zip_of(dict(files(*range(10)))))
+    job_id = batches.start(*files(*range(10)))
     worker = batches.new_worker(batch_ahead_photos=4)
     for _ in range(3):
         batches.work(worker)
@@ -188,7 +173,7 @@ def test_batches_take_turns(batches: Batches, monkeypatch: pytest.MonkeyPatch) -
 
 def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     batches.service.indexed(0)
-    job_id = batches.start(archive=zip_of(dict(files(*range(8)))))
+    job_id = batches.start(*files(*range(8)))
     worker = batches.new_worker(batch_ahead_photos=3)
     batches.work(worker)
     batches.service.drain()
@@ -200,15 +185,13 @@ def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     assert set(states) == {"succeeded", "cancelled"}
     assert queued_photos(batches.catalog) == 0
     assert not batches.work()
-    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
-    assert batches.keys("archives/") == set()
     problem(batches.service("POST", f"/jobs/{job_id}/cancel"), 409, "job_finished")
 
 
 def test_a_cancelled_batch_cancels_its_photos_in_small_transactions(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(dict(files(*range(7)))))
+    job_id = batches.start(*files(*range(7)))
     batches.work(batches.new_worker(batch_ahead_photos=5))
     monkeypatch.setattr("shared.jobs.transitions.CANCELLED_PER_TRANSACTION", 2)
     cancelled = batches.service.json("POST", f"/jobs/{job_id}/cancel")
@@ -245,7 +228,7 @@ def test_retry_queues_the_failed_items_again_whose_bytes_are_there(batches: Batc
 
 
 def test_retry_describes_the_photos_of_a_cancelled_batch(batches: Batches) -> None:
-    job_id = batches.start(archive=zip_of(dict(files(*range(6)))))
+    job_id = batches.start(*files(*range(6)))
     batches.work(batches.new_worker(batch_ahead_photos=4))
     batches.service.json("POST", f"/jobs/{job_id}/cancel")
     assert set(batches.states(job_id)) == {"cancelled"}
@@ -269,13 +252,13 @@ def test_a_photo_that_is_deleted_meanwhile_ends_its_item(batches: Batches) -> No
 
 
 def test_a_map_that_is_deleted_takes_its_batch_along(batches: Batches) -> None:
-    batches.start(archive=zip_of(dict(files(*range(6)))))
+    batches.start(*files(*range(6)))
     batches.start(*files(7, 8))
     batches.work(batches.new_worker(batch_ahead_photos=3))
     batches.service.json("DELETE", "/maps/default")
     for _ in range(ROUNDS):
         purge_deleted_maps(batches.catalog, batches.store)
-    assert batches.keys("originals/") | batches.keys("archives/") == set()
+    assert batches.keys("originals/") == set()
     with batches.catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
 

@@ -11,7 +11,6 @@ from sqlalchemy import func, select
 
 from services.steward.batches import worker as bring_in_module
 from services.steward.batches.worker import resume_batches
-from services.steward.tasks.garbage_collection import collect_job_files
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.photos import Photo
@@ -20,9 +19,7 @@ from shared.ingest import store_photo as store_photo_module
 from shared.ingest import validation as incoming_module
 from shared.jobs import Job, JobKind, JobState
 from shared.storage import FolderStore, ObjectStore
-from shared.storage.keys import ARCHIVES
-from tests.integration.steward.batches import Batches, Killed, codes, counts, files, lines, restart
-from tests.support.archives import PACKED, zip_of
+from tests.integration.steward.batches import Batches, Killed, codes, counts, files, restart
 from tests.support.catalog_rows import read_job
 
 # tests/e2e/test_batches.py does the same on SQLite.
@@ -43,22 +40,15 @@ def assert_each_is_there_once(batches: Batches, job_id: UUID, photos: int) -> No
 
 
 @pytest.mark.parametrize("step", ["writer", "read_range", "open", "head", "delete"])
-@pytest.mark.parametrize("source", ["zip", "tar.gz", "files", "keys"])
+@pytest.mark.parametrize("source", ["files", "keys"])
 def test_a_steward_killed_at_any_step_leaves_each_photo_once(
     batches: Batches, monkeypatch: pytest.MonkeyPatch, source: str, step: str
 ) -> None:
     """Each life ends at its nth step of a kind with the object store; the next life is longer."""
     photos = files(*range(6))
-    if source == "files":
-        job_id = batches.start(*photos)
-    elif source == "keys":
-        for name, data in photos:
-            batches.store.put(f"imports/{name}", data)
-        job_id = batches.start(manifest=lines(*({"key": f"imports/{n}"} for n, _ in photos)))
-    else:
-        job_id = batches.start(archive=PACKED[source](photos))
+    job_id = batches.start(*photos) if source == "files" else batches.start_import(photos)
     real: Any = getattr(FolderStore, step)
-    for life in (1, 3, 7):  # an archive that kills three while it is looked through is given up
+    for life in (1, 3, 7):
         left = [life]
 
         def die(self: FolderStore, *arguments: Any, left: list[int] = left) -> Any:
@@ -80,7 +70,7 @@ def test_a_steward_killed_at_any_step_leaves_each_photo_once(
 def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(*range(5))))
+    job_id = batches.start_import(files(*range(5)))
     real = store_photo_module.insert_photo
 
     def put_then_die(*arguments: Any) -> Any:
@@ -102,7 +92,7 @@ def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
 def test_a_steward_whose_lease_was_taken_over_commits_nothing(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(*range(4))))
+    job_id = batches.start_import(files(*range(4)))
     real: Any = FolderStore.writer
     slow = batches.worker
 
@@ -120,7 +110,7 @@ def test_a_steward_whose_lease_was_taken_over_commits_nothing(
 def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(*range(4))))
+    job_id = batches.start_import(files(*range(4)))
     real = incoming_module.validate_photo
 
     def die_of_one(store: ObjectStore, received: Any, *rest: Any, **fields: Any) -> Any:
@@ -141,7 +131,7 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
 def test_a_batch_pauses_while_the_store_is_away(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(1, 2)))
+    job_id = batches.start_import(files(1, 2))
     real: Any = FolderStore.writer
 
     def away(self: FolderStore, key: str) -> Any:
@@ -159,7 +149,7 @@ def test_a_batch_pauses_while_the_store_is_away(
 def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(1, 2)))
+    job_id = batches.start_import(files(1, 2))
     free = SimpleNamespace(free=batches.settings.min_free_bytes - 1)
     monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
     assert batches.work()
@@ -177,7 +167,7 @@ def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
 def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = batches.start(archive=zip_of(files(1, 2)))
+    job_id = batches.start_import(files(1, 2))
     real: Any = FolderStore.writer
 
     def full(self: FolderStore, key: str) -> Any:
@@ -191,26 +181,10 @@ def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
     assert_each_is_there_once(batches, job_id, 2)
 
 
-def test_an_archive_that_was_removed_fails_its_batch(batches: Batches) -> None:
-    job_id = batches.start(archive=zip_of(files(1)))
-    [key] = batches.keys("archives/")
-    batches.store.delete(key)
-    job = batches.finish(job_id)
-    assert (job["state"], job["error"]["code"]) == ("failed", "archive_gone")
-
-
 def test_bytes_that_wait_in_a_batch_are_no_orphans(batches: Batches) -> None:
     job_id = batches.start(*files(1, 2))
-    archive_id = batches.start(archive=zip_of(files(3)))
-    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert counts(batches.finish(job_id)) == (2, 2, 0)
-    assert counts(batches.finish(archive_id)) == (1, 1, 0)
-    batches.store.put(f"archives/{UUID(int=7)}", b"of a gateway that was killed")
-    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
-    assert f"archives/{UUID(int=7)}" in batches.keys("archives/")
-    collect_orphans(batches.catalog, batches.store, age_seconds=-60)
-    assert batches.keys("archives/") == set()
 
 
 def test_a_forgotten_batch_takes_its_items_along(batches: Batches) -> None:
@@ -223,19 +197,12 @@ def test_a_forgotten_batch_takes_its_items_along(batches: Batches) -> None:
         assert session.scalar(select(func.count()).select_from(Photo)) == 1
 
 
-@pytest.mark.parametrize("source", ["zip", "tar", "tar.gz", "files", "keys"])
+@pytest.mark.parametrize("source", ["files", "keys"])
 def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
     on_s3: Batches, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
     photos = files(*range(5))
-    if source == "files":
-        job_id = on_s3.start(*photos)
-    elif source == "keys":
-        for name, data in photos:
-            on_s3.store.put(f"imports/{name}", data)
-        job_id = on_s3.start(manifest=lines(*({"key": f"imports/{n}"} for n, _ in photos)))
-    else:
-        job_id = on_s3.start(archive=PACKED[source](photos))
+    job_id = on_s3.start(*photos) if source == "files" else on_s3.start_import(photos)
     real = incoming_module.validate_photo
     left = [3]
 

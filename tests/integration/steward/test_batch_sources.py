@@ -1,4 +1,4 @@
-"""Batches from a prefix, files, archives and keys, and batches that are rejected as a whole."""
+"""Batches from a prefix, files and keys, and batches that are rejected as a whole."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ import pytest
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.routes.batches import validate_prefix
-from services.steward.tasks.garbage_collection import collect_job_files
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
 from shared.errors import Unprocessable
-from shared.jobs import JobKind
 from shared.storage import FolderStore
-from shared.storage.keys import ARCHIVES
 from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import Batches, codes, counts, files, lines
-from tests.support.archives import PACKED, tar_of, zip_of
+from tests.support.archives import tar_of, zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
@@ -114,39 +111,6 @@ def test_files_become_searchable_photos_with_what_the_manifest_says(batches: Bat
     assert stats["searchable_images"] == 3
 
 
-@pytest.mark.parametrize("packed", PACKED.values(), ids=PACKED.keys())
-def test_an_archive_comes_in_with_its_table_and_goes(
-    batches: Batches, packed: Callable[[Any], bytes]
-) -> None:
-    members = {
-        "city/photos.csv": b'filename,latitude,longitude,tags\nin/2.jpg,45.5,7.25,"a,b"\n',
-        "city/1.jpg": photo_bytes(1),
-        "city/in/2.jpg": photo_bytes(2),
-        "city/readme.txt": b"not a photo",
-        "city/@0396544.00@4991543.00@32@T@45.0691@7.6931@@@@@@@@@.jpg": photo_bytes(3),
-    }
-    job_id = batches.start(archive=packed(members))
-    assert len(batches.keys("archives/")) == 1
-    job = batches.finish(job_id)
-    assert job["state"] == "succeeded", job
-    assert job["result"]["ignored"] == 1
-    assert counts(job) == (3, 3, 0)
-    one, two, named = batches.photos()
-    assert (two.filename, two.latitude, two.longitude, two.tags) == (
-        "2.jpg",
-        45.5,
-        7.25,
-        ["a", "b"],
-    )
-    assert (one.filename, one.latitude) == ("1.jpg", None)
-    assert (one.relative_path, two.relative_path) == ("city/1.jpg", "city/in/2.jpg")
-    assert named.latitude == 45.0691
-    assert batches.store.get(two.object_key) == photo_bytes(2)
-    assert [item["line"] for item in batches.items(job_id)] == [None, 2, None]
-    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
-    assert batches.keys("archives/") == set()
-
-
 def test_objects_of_the_store_are_copied_and_stay(batches: Batches) -> None:
     for number in (1, 2):
         batches.store.put(f"imports/day 1/{number}.jpg", photo_bytes(number))
@@ -214,12 +178,9 @@ def test_bad_lines_of_a_manifest_are_named_and_leave_nothing(batches: Batches) -
     [
         ([], 400, "no_file"),
         ([("file", ("a.jpg", b"")), ("colour", (None, b"red"))], 422, "invalid_field"),
-        ([("archive", ("a", zip_of({}))), ("file", ("a.jpg", b"x"))], 400, "several_sources"),
-        ([("archive", ("a", zip_of({}))), ("archive", ("b", zip_of({})))], 400, "several_sources"),
-        ([("archive", ("a.zip", b"no archive" * 100))], 415, "unsupported_archive"),
-        ([("archive", ("a.zip", b"short"))], 415, "unsupported_archive"),
-        ([("archive", ("a.zip", b""))], 400, "empty_file"),
-        ([("archive", (None, b"text"))], 400, "no_file"),
+        ([("file", (None, b"text"))], 400, "no_file"),
+        ([("file", ("a.jpg", b"x")), ("prefix", (None, b"imports/"))], 400, "several_sources"),
+        ([("manifest", ("m", b"")), ("manifest", ("m", b""))], 400, "several_sources"),
         ([("manifest", ("m", b"\n\n"))], 422, "no_photos"),
         (
             [("file", ("a.jpg", b"x")), ("manifest", ("m", b'{"file": "b.jpg"}'))],
@@ -244,7 +205,7 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],
 ) -> None:
-    small = settings.model_copy(update={"max_archive_size": 3000, "max_batch_photos": 2})
+    small = settings.model_copy(update={"max_batch_size": 3000, "max_batch_photos": 2})
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)
     service = Service(catalog, store, small, make_worker)
@@ -254,8 +215,6 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
         assert list(store.list("")) == []
         return str(problem(answer, 413, answer.json()["code"])["code"])
 
-    archive = zip_of({"a.jpg": bytes(range(256)) * 20}, 0)
-    assert refused(files={"archive": ("a.zip", archive)}) == "batch_too_large"
     large = [("file", (f"{n}.jpg", b"\xff\xd8\xff" + bytes(2000))) for n in range(2)]
     assert refused(files=large) == "batch_too_large"
     tiny = [("file", (f"{n}.jpg", b"\xff\xd8\xff")) for n in range(3)]
@@ -266,38 +225,25 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
     problem(service("POST", "/upload/batch?map=nope", content=keys[:20]), 400, "no_file")
 
 
-def test_an_archive_for_a_map_that_is_not_there_leaves_nothing(batches: Batches) -> None:
-    sent = {"archive": ("a.zip", zip_of({"1.jpg": photo_bytes(1)}))}
+def test_an_archive_is_refused_with_the_command_that_reads_it(batches: Batches) -> None:
+    archive = zip_of({"1.jpg": photo_bytes(1)})
+    answer = batches.service("POST", "/upload/batch", files={"archive": ("a.zip", archive)})
+    assert "placewise index" in problem(answer, 422, "invalid_field")["detail"]
+    for data in (archive, tar_of({"1.jpg": photo_bytes(1)}, "w:gz")):
+        answer = batches.service("POST", "/upload", files={"file": ("a.zip", data)})
+        assert "placewise index" in problem(answer, 415, "unsupported_photo")["detail"]
+    assert batches.keys() == set()
+
+
+def test_files_for_a_map_that_is_not_there_leave_nothing(batches: Batches) -> None:
+    sent = [("file", file) for file in files(1)]
     answer = batches.service("POST", "/upload/batch", params={"map": "nope"}, files=sent)
     problem(answer, 404, "map_not_found")
     assert batches.keys() == set()
 
 
-@pytest.mark.parametrize(
-    ("archive", "code"),
-    [
-        (zip_of({"readme.txt": b"hello", "folder/": b""}), "no_photos"),
-        (zip_of({"a.jpg": photo_bytes(1)})[:-30], "damaged_archive"),
-        (tar_of({"a.jpg": photo_bytes(1)})[:1000], "damaged_archive"),
-        (zip_of({"a.jpg": b"x", "photos.csv": b"latitude,longitude\n1,2\n"}), "bad_table"),
-        (zip_of({"a.jpg": b"x", "photos.csv": b"file,place\nb.jpg,hall\n"}), "bad_table"),
-        (zip_of({"a.jpg": b"x", "manifest.jsonl": b'{"file": "a.jpg"}\noops'}), "bad_manifest"),
-        (
-            zip_of({"a.jpg": b"x", "manifest.jsonl": b"", "photos.csv": b"file\n"}),
-            "several_manifests",
-        ),
-    ],
-)
-def test_an_archive_that_makes_no_sense_fails_and_brings_in_nothing(
-    batches: Batches, archive: bytes, code: str
-) -> None:
-    job_id = batches.start(archive=archive)
-    job = batches.finish(job_id)
-    assert (job["state"], job["error"]["code"]) == ("failed", code)
-    assert batches.items(job_id) == []
-    assert batches.photos() == []
+def test_a_batch_without_bytes_to_try_again_says_so(batches: Batches) -> None:
+    job_id = batches.start(("text.jpg", b"no photo"))
+    batches.finish(job_id)
     answer = batches.service("POST", f"/jobs/{job_id}/retry")
     assert "Upload them again" in problem(answer, 409, "job_not_retryable")["detail"]
-    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
-    assert batches.keys("archives/") == set()
-    assert not batches.work()

@@ -44,7 +44,6 @@ from tests.integration.steward.webhook_receiver import (
     receiving,
 )
 from tests.integration.workplace import Workplace
-from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
@@ -469,9 +468,8 @@ def test_a_failed_job_and_a_finished_batch_are_delivered(
     hooks: WebhookSetup, settings: Settings
 ) -> None:
     batches = hooks.add("batch.finished")
-    archive = zip_of({"1.jpg": photo_bytes(1)})
     started = hooks.door(
-        ADMIN, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)}
+        ADMIN, "POST", "/upload/batch", files={"file": ("1.jpg", photo_bytes(1))}
     ).json()
     store = hooks.door.store
     worker = BatchWorker(hooks.door.catalog, store, InProcessWakeups(), settings, "steward")

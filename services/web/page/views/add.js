@@ -1,4 +1,4 @@
-// Add photos: a few one by one, many in batches, archives as they are.
+// Add photos: a few one by one, many and those of zips in batches.
 
 import { bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
@@ -16,9 +16,9 @@ export async function showAdd(view, { signal }) {
   const details = detailsForm();
   const list = h("ul", { class: "queue" });
   const summary = h("div", { class: "summary" });
-  const take = (files) => {
-    const leftOut = queue.add(files, details.read());
-    if (leftOut) note(`${plural(leftOut, "file")} left out: neither photos nor archives.`);
+  const take = async (files) => {
+    const notes = await queue.add(files, details.read());
+    if (notes.length) note(notes.join(" "));
   };
   const zone = addZone(settings, take);
   takesPastes(take, signal);
@@ -56,7 +56,7 @@ function addZone(settings, take) {
     });
     return input;
   };
-  const files = chooser({ "data-use": "add", accept: "image/*,.zip,.tar,.tgz,.gz" });
+  const files = chooser({ "data-use": "add", accept: "image/*,.zip" });
   const folder = chooser({ webkitdirectory: true });
   const zone = h("section", { class: "drop", "aria-label": "Add photos" },
     h("div", { class: "drop-words" },
@@ -123,7 +123,7 @@ class QueueRow {
     this.progress = h("div", { class: "row-progress" });
     this.retry = button("Try again", () => entry.retry().catch(noteError));
     this.element = h("li", { class: "queue-row" },
-      entry.picture ? localPicture(entry.picture, { alt: "", width: "72", height: "54" }) : h("span", { class: "pile", "aria-hidden": "true" }, entry.total > 1 ? count(entry.total) : "zip"),
+      entry.picture ? localPicture(entry.picture, { alt: "", width: "72", height: "54" }) : h("span", { class: "pile", "aria-hidden": "true" }, count(entry.total)),
       h("div", { class: "queue-words" }, h("p", { class: "queue-name" }, entry.name), this.state, this.progress, this.errors), this.retry);
   }
 

@@ -1,1 +1,0 @@
-"""Readers for uploaded zip and tar archives in the object store."""
