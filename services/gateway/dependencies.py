@@ -31,7 +31,7 @@ from shared.config.settings import Settings
 from shared.errors import NotFound, PlacewiseError, invalid_field_error
 from shared.jobs import Job, Wakeups
 from shared.search_api.protocol import SearchBackend
-from shared.storage import ObjectStore
+from shared.storage import OwnedStore
 
 MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
@@ -220,7 +220,7 @@ class GatewayContext:
     """The stores, clients and settings that the routes use."""
 
     catalog: Catalog
-    store: ObjectStore
+    store: OwnedStore
     wakeups: Wakeups
     search: SearchBackend
     settings: Settings

@@ -1,7 +1,7 @@
 """Registry and heartbeats of running processes and of search workers.
 
-The registry of gateways, extractors and stewards is informational, for `GET /health`, `placewise
-doctor` and operators; leases decide which worker owns a job.
+The registry of gateways, extractors and stewards is informational, for `GET /health` and operators;
+leases decide which worker owns a job.
 
 Search workers have a registry of their own with their shard and the versions that they have
 loaded, updated about every second or two. A generation is activated only once every live worker has

@@ -4,8 +4,8 @@ Orphans are moved to the trash and deleted after TRASH_DAYS. Objects that a user
 moved there: they are deleted immediately, so that their space is free.
 
 The hold is a note in the store that gives the reason why orphans are not collected until an
-operator decides. The steward writes it, `placewise doctor` reads it, and
-`placewise storage collect --confirm` ends it.
+operator decides. The steward writes it, GET /health tells it, and `placewise storage
+collect --confirm` ends it.
 """
 
 from __future__ import annotations

@@ -452,18 +452,31 @@ def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("indexed")
-@pytest.mark.usefixtures("indexed")
 def test_doctor_finds_the_running_server(server: ServerProcess, placewise: CommandLine) -> None:
-    findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json(code=1)}
+    findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
     assert set(findings) == {
-        *("python", "settings", "folder", "permissions", "uploads", "collection"),
-        *("server", "vocabulary", "journal", "photos"),
-        *("device", "memory", "extractor"),
+        *("versions", "settings", "folder", "permissions", "device", "memory", "extractor"),
+        *("server", "server catalog", "server object store", "server search"),
+        *("server extractors", "server uploads"),
     }
-    assert [part for part, finding in findings.items() if not finding["ok"]] == ["photos"]
-    assert "1 in the map default" in findings["photos"]["detail"], "cut-off.jpg"
+    assert all(finding["ok"] for finding in findings.values()), findings
+    assert "1 in the map default" in findings["server extractors"]["detail"], "cut-off.jpg"
     assert str(server.client.base_url).rstrip("/") in findings["server"]["detail"]
     assert "test-tiny-avg" in findings["extractor"]["detail"]
+
+
+def test_doctor_names_a_server_that_does_not_tell_its_health(
+    placewise: CommandLine, server: ServerProcess
+) -> None:
+    elsewhere = f"{str(server.client.base_url).rstrip('/')}/elsewhere"
+    for url, words in (
+        ("http://127.0.0.1:1", "http://127.0.0.1:1 does not answer"),
+        (elsewhere, f"{elsewhere} answers: "),
+    ):
+        findings = placewise("doctor", "--server", url, "--json").json(code=1)
+        (found,) = [each for each in findings if each["part"] == "server"]
+        assert not found["ok"]
+        assert words in found["detail"]
 
 
 def test_doctor_says_what_needs_attention(tmp_path: Path) -> None:
@@ -473,6 +486,7 @@ def test_doctor_says_what_needs_attention(tmp_path: Path) -> None:
     assert [part for part, finding in findings.items() if not finding["ok"]] == ["extractor"]
     assert "Three ways to get the weights of dinov2-vits14" in findings["extractor"]["detail"]
     assert "not running" in findings["server"]["detail"]
+    assert findings["catalog file"]["detail"] == "nothing is stored yet"
     shown = command("doctor")
     assert shown.code == 1
     assert f"DINO_WEIGHTS={tmp_path}/[gone].pth does not exist" in shown.stdout

@@ -126,8 +126,8 @@ def test_the_published_env_and_calls_work_and_health_names_the_missing_weights(
         assert (tmp_path / "uploads").is_dir()
         doctor = run_command("doctor", "--json", env=server._environment, cwd=tmp_path)
         details = {each["part"]: each["detail"] for each in json.loads(doctor.stdout)}
-        assert "default (1 photos) can't be described" in details["vocabulary"]
-        assert f"DINO_WEIGHTS={tmp_path}/nowhere.pth does not exist" in details["vocabulary"]
+        assert "can't be loaded (weights_missing)" in details["server extractors"]
+        assert f"DINO_WEIGHTS={tmp_path}/nowhere.pth does not exist" in details["extractor"]
         assert "waiting for a vocabulary" not in doctor.stdout
         assert call("DELETE", f"/api/v1/uploads/{file_id}").is_success
         assert call("GET", "/docs").is_success

@@ -80,10 +80,10 @@ def test_the_answer_to_a_waiting_upload_says_how_it_ended(server: ServerProcess)
 
 
 def test_doctor_writes_nothing(tmp_path: Path) -> None:
-    from services.cli.operations.installation_checks import _check_home, _check_server
+    from services.cli.operations.installation_checks import _check_catalog_file, _check_home
     from shared.config.settings import Settings
 
     settings = Settings(placewise_home=tmp_path / "not" / "there")
     assert "can be created" in _check_home(settings)
-    assert "nothing is stored" in _check_server(settings)
+    assert "nothing is stored" in _check_catalog_file(settings)
     assert not (tmp_path / "not").exists()

@@ -184,7 +184,7 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
         assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
         assert filled.originals() == originals
         findings = json.loads(filled.command("doctor", "--json").stdout)
-        (found,) = [one for one in findings if one["part"] == "collection"]
+        (found,) = [one for one in findings if one["part"] == "server object store"]
         assert not found["ok"]
         assert "storage collect" in found["detail"]
         listed = json.loads(filled.command("storage", "collect", "--json").stdout)

@@ -91,11 +91,8 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         shutil.copy(file, home)
     before = objects(home)
     with ServerProcess(home, **SETTINGS) as server:
-        (journal,) = (one for one in run(home, "doctor", code=1) if one["part"] == "journal")
-        assert not journal["ok"]
+        assert "verify --repair" in run(home, "verify", code=1)["lag"]
         assert before <= objects(home)
-        assert "verify --repair" in journal["detail"]
-        assert run(home, "verify", code=1)["lag"] == journal["detail"]
         taken = run(home, "verify", "--repair", code=1)["taken_in"]
         assert (taken["photos"], taken["deleted_photos"]) == (1, 1)
         assert objects(home, "originals/") == originals

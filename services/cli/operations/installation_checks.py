@@ -1,57 +1,29 @@
-"""The checks of `placewise doctor`.
+"""The checks of `placewise doctor` that need no server.
 
 Each check is a function of the settings that returns a summary, or raises a PlacewiseError whose
-`detail` says what is wrong and what to do. This module contains the checks of the embedded
-installation, of stored files and of the extractor (device, memory, weights); `deployment_checks`
-contains those of separate services.
+`detail` says what is wrong and what to do. What a running server knows is in its GET /health.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
 import shutil
 import sys
 from collections.abc import Callable
-from functools import partial
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn
-from uuid import UUID
 
-from sqlalchemy import func, select
-
-from placewise.answers import Map
-from placewise.client import Client
 from services.cli.descriptors.local_weights import find_dinov2_weights, suggest_extractor
-from services.cli.operations.deployment_checks import (
-    check_gateway,
-    check_object_store,
-    check_postgres,
-    check_processes,
-    check_redis,
-    check_search,
-    check_steward,
-    open_for_check,
-    read_health,
-)
-from shared.catalog.database.schema import check_pages, check_schema
-from shared.catalog.installation import Installation
-from shared.catalog.maps import count_failed_photos
-from shared.catalog.photos import Photo
+from shared.catalog.database.schema import check_pages
 from shared.catalog.tables import open_catalog
-from shared.config.command_line import command_line
-from shared.config.embedded_home import find_running_server
 from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, ExtractorConfig
-from shared.journal.outbox import catalog_lag
-from shared.storage import FolderStore, OwnedStore
-from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner, store_taken_error
-from shared.storage.trash import read_hold
+from shared.extractor_config.configs import ExtractorConfig
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -59,45 +31,22 @@ BYTES_PER_PARAMETER = 4  # float32
 BYTES_PER_BATCH_PHOTO = 40_000_000
 PROCESS_OVERHEAD_BYTES = 1_000_000_000  # PyTorch or the CUDA context, without weights
 
-CHECK_FILE = "Check its permissions, or restore it from a backup."
-
 Check = Callable[[Settings], str]
 
 
-def list_checks(settings: Settings, server: str | None, key: str | None) -> list[tuple[str, Check]]:
+def list_checks(settings: Settings, *, has_server: bool) -> list[tuple[str, Check]]:
     """Return the checks of this installation, each with the name of the part that it checks.
 
-    A gateway at the URL `server` is checked as well, with the API key `key`.
+    The catalog's file is not checked while a server uses it: the check reads all of it.
     """
-    checks: list[tuple[str, Check]] = [
-        ("python", lambda _: f"Python {sys.version.split()[0]}"),
-        ("settings", _check_settings),
-    ]
+    checks: list[tuple[str, Check]] = [("versions", _check_versions), ("settings", _check_settings)]
     if settings.s3_endpoint is None or settings.database_url is None:
         checks.append(("folder", _check_home))  # other services need no writable folder
         checks.append(("permissions", check_permissions))
-    if settings.s3_endpoint is None:
-        checks.append(("uploads", _check_upload_dir))
-    else:
-        checks.append(("objects", check_object_store))
-    checks += [
-        ("collection", _check_collection),
-        ("journal", _check_journal),
-        ("photos", _check_photos),
-    ]
-    if settings.database_url is None:
-        checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
-    else:
-        checks += [
-            ("postgresql", check_postgres),
-            ("redis", check_redis),
-            ("search", check_search),
-            ("gateways", partial(check_processes, role="gateway")),
-            ("extractors", partial(check_processes, role="extractor")),
-            ("stewards", check_steward),
-        ]
-    if server is not None:
-        checks.append(("gateway", lambda _: check_gateway(server, key)))
+    if settings.upload_dir is not None and settings.s3_endpoint is None:
+        checks.append(("UPLOAD_DIR", _check_upload_dir))
+    if settings.database_url is None and not has_server:
+        checks.append(("catalog file", _check_catalog_file))
     checks += [("device", check_device), ("memory", check_memory), ("extractor", check_extractor)]
     return checks
 
@@ -216,6 +165,10 @@ def _default_extractor_config(settings: Settings) -> ExtractorConfig:
 MIN_FREE_DISK_BYTES = 1_000_000_000
 
 
+def _check_versions(_: Settings) -> str:
+    return f"Placewise {version('placewise')}, Python {sys.version.split()[0]}"
+
+
 def _check_settings(settings: Settings) -> str:
     """Report the settings; they are valid, or no check would run."""
     if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
@@ -248,148 +201,21 @@ def _check_home(settings: Settings) -> str:
 
 def _check_upload_dir(settings: Settings) -> str:
     folder = settings.upload_dir
-    if folder is None:
-        return "originals are stored in PLACEWISE_HOME"
+    assert folder is not None, "the check is listed only with a folder"
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise OSError(errno.EACCES, "UPLOAD_DIR: no write permission for this user", str(existing))
-    return f"UPLOAD_DIR {folder} is writable"
+        raise OSError(errno.EACCES, "no write permission for this user", str(existing))
+    return f"{folder} is writable"
 
 
-def _check_journal(settings: Settings) -> str:
-    """Check that the catalog contains every change recorded in the object store's journal."""
-    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
+def _check_catalog_file(settings: Settings) -> str:
+    """Check every page of the SQLite catalog, of any size."""
+    file = _sqlite_file(settings)
+    if file is None or not file.exists():
         return "nothing is stored yet"
-    with open_for_check(settings, CHECK_FILE) as catalog:
-        check_schema(catalog)
-        lag = catalog_lag(catalog, open_store(settings, exclusive=False))
-    if lag is not None:
-        raise Misconfigured("catalog_behind", lag.detail)
-    return "the catalog is up to date with the object store"
-
-
-def _check_photos(settings: Settings) -> str:
-    """Check that no stored photo is left out of searches because its description failed."""
-    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
-        return "nothing is stored yet"
-    with open_for_check(settings, CHECK_FILE) as catalog:
-        check_schema(catalog)
-        with catalog.read() as session:
-            failed = count_failed_photos(session)
-    if not failed:
-        return "no photo is left out of searches because its description failed"
-    named = ", ".join(f"{number} in the map {name}" for name, number in failed.items())
-    raise Misconfigured(
-        "photos_failed",
-        f"Stored photos can't be searched for, because their description failed: {named}. List "
-        "them with GET /api/v1/search?failed=true&map=NAME; the page shows the reason with each. "
-        "Delete or replace photos that can't be decoded; the next model change describes all "
-        "others again.",
-    )
-
-
-def _check_vocabulary(settings: Settings) -> str:
-    running = find_running_server(settings.placewise_home)
-    if running is None:
-        return "checked only while a server runs"
-    extractors = read_health(running.url, running.key)["parts"].get("extractors", {})
-    with Client(running.url, key=running.key) as client:
-        maps = client.maps()
-    unloadable = {
-        name: code
-        for each in extractors.get("processes", ())
-        for name, code in each["errors"].items()
-    }
-    for each in maps:
-        if each.photos and each.generation_id is None and each.extractor in unloadable:
-            _raise_unloadable(each, unloadable[each.extractor], settings)
-    waiting = extractors.get("waiting_for_vocabulary")
-    if waiting:
-        names = ", ".join(f"{m.name} ({m.photos} photos)" for m in maps if m.name in waiting)
-        raise Misconfigured(
-            "vocabulary_missing",
-            f"Photos are waiting for a vocabulary: {names}. Fit one (placewise vocabulary fit "
-            "--map NAME) or import one (placewise vocabulary import FILE --map NAME).",
-        )
-    pending = [m.name for m in maps if m.vocabulary == "pending"]
-    if pending:
-        return (
-            f"no vocabulary yet in {', '.join(pending)}: their descriptors are GeM-pooled until "
-            "one is fitted (placewise vocabulary fit --map NAME), which starts by itself at "
-            f"{MIN_PHOTOS_TO_FIT} photos"
-        )
-    provisional = [m.name for m in maps if m.vocabulary == "provisional"]
-    if provisional:
-        return (
-            f"vocabulary fitted on too few photos in {', '.join(provisional)}: another one is "
-            f"fitted by itself at {MIN_PHOTOS_TO_FIT} photos"
-        )
-    foreign = [m.name for m in maps if m.vocabulary == "foreign"]
-    if foreign:
-        return (
-            f"foreign vocabulary in {', '.join(foreign)}: one is fitted by itself at "
-            f"{MIN_PHOTOS_TO_FIT} photos unless a map's auto_fit is off, or with `placewise "
-            "vocabulary fit`"
-        )
-    return "no map uses a foreign vocabulary"
-
-
-def _raise_unloadable(map_: Map, code: str, settings: Settings) -> NoReturn:
-    """Say why the extractor of a map can't be loaded; it needs no vocabulary before."""
-    try:
-        _check_weights(settings.extractor_config(map_.extractor), settings)
-        reason = "The server's log has the details."
-    except Misconfigured as error:
-        reason = error.detail
-    raise Misconfigured(
-        code,
-        f"{map_.name} ({map_.photos} photos) can't be described: its extractor {map_.extractor} "
-        f"can't be loaded ({code}). {reason}",
-    )
-
-
-def _check_server(settings: Settings) -> str:
-    running = find_running_server(settings.placewise_home)
-    if running is not None:
-        check_gateway(running.url, running.key)
-        with Client(running.url, key=running.key) as client:
-            maps = client.maps()
-        searchable, stored = sum(m.searchable for m in maps), sum(m.photos for m in maps)
-        names = ", ".join(m.name for m in maps)
-        return f"running on {running.url}: {searchable} of {stored} photos searchable ({names})"
-    start = command_line("serve", home=settings.placewise_home)
-    if not (settings.placewise_home / "catalog.sqlite").exists():
-        return f"not running, nothing is stored yet. Start it: {start}"
-    with open_for_check(settings, CHECK_FILE) as catalog:
+    with contextlib.closing(open_catalog(settings, "doctor")) as catalog:
         check_pages(catalog, max_bytes=None)
-        with catalog.read() as session:
-            photos = session.scalar(select(func.count()).where(Photo.deleted_at.is_(None)))
-    return f"not running; {photos} photos are stored. Start it: {start}"
-
-
-def _check_collection(settings: Settings) -> str:
-    """Check that this catalog owns the store and that orphans are collected.
-
-    Raises:
-        Misconfigured: Another catalog owns the store, or `collection_held`.
-    """
-    folder = settings.placewise_home / "objects"
-    store: OwnedStore
-    if settings.s3_endpoint is not None:
-        store = open_store(settings, exclusive=False)
-    elif folder.exists():
-        store = FolderStore(folder, exclusive=False)  # UPLOAD_DIR has no owner record
-    else:
-        return "nothing is stored yet"
-    owner = read_owner(store)
-    if owner is None:
-        return "the object store has no owner yet; the next start assigns it"
-    if str(_installation_id(settings)) != owner:
-        raise store_taken_error(store, "belongs to another catalog than this one")
-    hold = read_hold(store)
-    if hold is not None:
-        raise Misconfigured("collection_held", hold.describe())
-    return "the object store belongs to this catalog, and orphans are collected"
+    return f"{file} has no damaged page"
 
 
 def check_permissions(settings: Settings) -> str:
@@ -425,12 +251,3 @@ def _sqlite_file(settings: Settings) -> Path | None:
     catalog = open_catalog(settings, "doctor")  # opens no connection
     catalog.close()
     return Path(catalog.url.database) if catalog.is_sqlite and catalog.url.database else None
-
-
-def _installation_id(settings: Settings) -> UUID | None:
-    """None for a catalog that does not exist."""
-    file = _sqlite_file(settings)
-    if file is not None and not file.exists():
-        return None
-    with open_for_check(settings, CHECK_FILE) as catalog, catalog.read() as session:
-        return session.scalar(select(Installation.id))

@@ -25,6 +25,7 @@ from shared.catalog.maps import (
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
+from shared.storage.trash import read_hold
 
 probe_router = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"], dependencies=[NO_PARAMETERS, ALL_MAPS])
@@ -153,14 +154,17 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 
-    `degraded`: chunks or shards can't be searched, photos can't be described, or uploads are
-    refused because the disk or the job queue is full.
+    `degraded`: chunks or shards can't be searched, photos can't be described, uploads are refused
+    because the disk or the job queue is full, no steward is running, or orphans are not collected.
     """
     components: dict[str, ExtractorsStatus | ComponentStatus] = {
         **_check_components(gateway, admission),
     }
     if components["catalog"].status == "healthy":
         components["extractors"] = _check_extractors(gateway)
+        components |= _check_stewards(gateway)
+    if components["object_store"].status == "healthy":
+        components["object_store"] = _check_collection(gateway)
     statuses = {component.status for component in components.values()}
     response.status_code = 200 if statuses == {"healthy"} else 503
     return HealthResponse(
@@ -220,6 +224,17 @@ def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) ->
         return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
+    return ComponentStatus(status="healthy")
+
+
+def _check_collection(gateway: GatewayContext) -> ComponentStatus:
+    """Return whether orphans of the object store are collected; the store is reachable."""
+    try:
+        hold = read_hold(gateway.store)
+    except PlacewiseError as error:
+        return ComponentStatus(status="unhealthy", detail=error.detail)
+    if hold is not None:
+        return ComponentStatus(status="degraded", detail=hold.describe())
     return ComponentStatus(status="healthy")
 
 
@@ -294,3 +309,19 @@ def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
         waiting_for_vocabulary=waiting,
         failed_photos=failed,
     )
+
+
+def _check_stewards(gateway: GatewayContext) -> dict[str, ComponentStatus]:
+    """Return the part of the stewards; none where no separate steward has ever registered."""
+    with gateway.catalog.read() as session:
+        stewards = [p for p in list_processes(session) if p.role == "steward"]
+    live = sum(process.is_live for process in stewards)
+    if not stewards:
+        return {}
+    if not live:
+        detail = (
+            "no steward is running: batches, webhooks and model changes wait, and photos of dead "
+            "extractors are not described"
+        )
+        return {"stewards": ComponentStatus(status="degraded", detail=detail)}
+    return {"stewards": ComponentStatus(status="healthy", detail=f"{live} running")}

@@ -37,6 +37,7 @@ from shared.errors import Misconfigured, PlacewiseError, Unavailable
 log = logging.getLogger(__name__)
 
 MIGRATIONS = Path(__file__).parent.parent / "migrations"
+MIN_POSTGRES_VERSION = (14,)
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
 # While a migration waits for a table's exclusive lock, all later statements on the table wait, too:
@@ -61,7 +62,8 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
 
     Raises:
         Unavailable: `catalog_unavailable`, or `catalog_busy` after `timeout_seconds`.
-        Misconfigured: As `opening` raises, for an SQLite file that can't be used.
+        Misconfigured: As `opening` raises, for an SQLite file that can't be used;
+            `postgres_too_old`.
     """
     try:
         if catalog.is_sqlite:
@@ -69,6 +71,7 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
                 check_pages(catalog)
                 _migrate_sqlite(catalog)
         else:
+            _check_postgres_version(catalog)
             _migrate_postgres(catalog, time.monotonic() + timeout_seconds)
     except SQLAlchemyError as error:
         unavailable = explain_outage(error)
@@ -161,6 +164,17 @@ def _migrate_sqlite(catalog: Catalog) -> None:
         return
     with catalog.engine.execution_options(placewise_write=True).begin() as connection:
         _upgrade(connection)
+
+
+def _check_postgres_version(catalog: Catalog) -> None:
+    with catalog.engine.connect() as connection:
+        present = connection.dialect.server_version_info or ()
+    if present < MIN_POSTGRES_VERSION:
+        raise Misconfigured(
+            "postgres_too_old",
+            f"PostgreSQL {'.'.join(map(str, present))} is too old. Upgrade to "
+            f"{MIN_POSTGRES_VERSION[0]} or newer.",
+        )
 
 
 def _migrate_postgres(catalog: Catalog, deadline: float) -> None:

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import event, text
+from sqlalchemy import event, inspect, text
+from sqlalchemy.dialects.postgresql.base import PGDialect
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
@@ -29,6 +30,7 @@ from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
 from tests.support.problems import problem
 from tests.support.server import environment, run_command
+from tests.support.servers import PostgresServer
 
 PAGE_BYTES = 4096
 
@@ -110,6 +112,22 @@ def test_a_large_catalog_is_read_whole_by_the_doctor_only(file: Path, catalog: C
     check_pages(catalog, max_bytes=PAGE_BYTES)
     with pytest.raises(Misconfigured, match="placewise restore"):
         check_pages(catalog, max_bytes=None)
+
+
+def test_a_postgresql_that_is_too_old_is_refused_before_anything_is_created(
+    postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalog = Catalog(postgres.new_database())
+    with monkeypatch.context() as context:
+        context.setattr(PGDialect, "_get_server_version_info", lambda *_: (13, 4))
+        with pytest.raises(
+            Misconfigured, match=r"PostgreSQL 13\.4 is too old. Upgrade to 14"
+        ) as old:
+            migrate(catalog)
+    assert old.value.code == "postgres_too_old"
+    with catalog.read() as session:
+        assert inspect(session.connection()).get_table_names() == []
+    catalog.close()
 
 
 @pytest.mark.parametrize("command", ["serve", "doctor"])

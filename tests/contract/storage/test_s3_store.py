@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 from urllib3.exceptions import ProtocolError
 
 from services.cli.main import build_app
-from services.cli.operations.deployment_checks import check_object_store
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, Unavailable
 from shared.storage import FolderStore, ObjectStore
@@ -283,13 +282,6 @@ def test_the_folder_is_the_store_unless_an_endpoint_is_set(
     assert isinstance(store, S3Store)
     store.put("a", b"x")
     assert S3Store(bucket).get("a") == b"x"
-
-
-def test_the_doctor_looks_at_the_bucket(s3: S3Server, bucket: Bucket) -> None:
-    assert bucket.name in check_object_store(Settings(**s3.variables(bucket.name)))
-    assert not list(bucket.client.list_objects(bucket.name, recursive=True)), "it tidied up"
-    with pytest.raises(Unavailable, match="create-bucket"):
-        check_object_store(Settings(**s3.variables("never-made")))
 
 
 def test_the_client_needs_its_settings(settings: Settings) -> None:

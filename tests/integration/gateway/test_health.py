@@ -11,6 +11,7 @@ import pytest
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
+from shared.storage.trash import Hold, HoldReason, end_hold, write_hold
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_map, set_columns
 from tests.support.photos import photo_bytes
@@ -25,17 +26,39 @@ def extractors(service: Service, status: int) -> Any:
     return service.json("GET", "/health", status)["parts"]["extractors"]
 
 
-def register(service: Service, seconds_ago: float = 0, **state: Any) -> None:
+def register(
+    service: Service, seconds_ago: float = 0, *, role: str = "extractor", **state: Any
+) -> None:
     with service.catalog.write() as session:
         session.add(
             RegisteredProcess(
-                role="extractor",
+                role=role,
                 name="one",
                 release="1",
                 state=state or None,
                 seen_at=db_now_plus(-seconds_ago),
             )
         )
+
+
+def test_health_is_degraded_when_every_separate_steward_was_killed(service: Service) -> None:
+    assert "stewards" not in service.json("GET", "/health")["parts"], "none has ever registered"
+    register(service, seconds_ago=60, role="steward")
+    health = service.json("GET", "/health", 503)
+    assert health["status"] == health["parts"]["stewards"]["status"] == "degraded"
+    register(service, role="steward")
+    part = service.json("GET", "/health")["parts"]["stewards"]
+    assert part == {"status": "healthy", "detail": "1 running"}
+
+
+def test_health_says_why_orphans_are_not_collected(service: Service) -> None:
+    write_hold(service.store, Hold(HoldReason.ADOPTED, 3, 2_000_000, 9))
+    part = service.json("GET", "/health", 503)["parts"]["object_store"]
+    assert part["status"] == "degraded"
+    assert "3 of 9 objects" in part["detail"]
+    assert "placewise storage collect" in part["detail"]
+    end_hold(service.store)
+    assert service.json("GET", "/health")["parts"]["object_store"]["status"] == "healthy"
 
 
 def test_extractors_that_are_scaled_to_zero_are_healthy_until_a_job_is_overdue(

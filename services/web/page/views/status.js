@@ -40,7 +40,7 @@ function drawUnreachable(card, error) {
     h("p", { class: "soft" }, "What you see here is of the last answer. The page keeps trying."));
 }
 
-const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", extractors: "Extractors", uploads: "Uploads" };
+const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", extractors: "Extractors", uploads: "Uploads", stewards: "Stewards" };
 
 function drawHealth(card, health) {
   const { load } = health;
