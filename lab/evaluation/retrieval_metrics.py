@@ -25,13 +25,9 @@ from shared.evaluation.bootstrap import (
     ConfidenceInterval,
     bootstrap_intervals,
 )
-from shared.evaluation.calibration import (
-    auroc,
-    expected_calibration_error,
-    fit_confidence,
-    recall_at_precision,
-)
-from shared.evaluation.places.evidence import PlaceEvidence
+from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
+from shared.evaluation.places.fit import RegressionTable, fit_map_estimate
+from shared.evaluation.places.probability import PlacePrior, sigmoid
 
 
 def hits_at_k(hits: Hits, ks: Sequence[int]) -> NDArray[np.float64]:
@@ -154,6 +150,9 @@ def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
 
 TARGET_PRECISION = 0.99
 FOLDS = 5
+MIN_QUERIES_PER_CLASS = 8  # correct and wrong queries each; with fewer the slope is unreliable
+MIN_QUERIES = 40
+L2_PENALTY = 0.1  # on the standardised score; keeps the slope finite on separable data
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +183,7 @@ def calibrate_scores(
         clusters: clusters of correlated queries; a cluster is never split between folds.
     """
     values, target = scores.astype(np.float64).tolist(), correct.tolist()
-    confidence = _cross_validated_confidence(values, target, clusters)
+    confidence = _cross_validated_confidence(scores.astype(np.float64), correct, clusters)
     return ScoreCalibration(
         auroc=auroc(values, target),
         recall_at_99_precision=recall_at_precision(
@@ -197,22 +196,30 @@ def calibrate_scores(
 
 
 def _cross_validated_confidence(
-    scores: list[float], correct: list[bool], clusters: QueryClusters
+    scores: NDArray[np.float64], correct: NDArray[np.bool_], clusters: QueryClusters
 ) -> list[float] | None:
-    """Predict P(correct) of each query by cross-validation, without splitting clusters."""
+    """Predict P(correct) of each query by cross-validation, without splitting clusters.
+
+    The model is a logistic regression on the score (Platt 1999).
+    """
     fold = np.random.default_rng(0).permutation(int(clusters.labels.max(initial=-1)) + 1) % FOLDS
     folds = fold[clusters.labels] if len(scores) else np.empty(0, np.int64)
-    evidence = [PlaceEvidence(score, 0.0) for score in scores]  # the score is the only feature
-    predictions = [0.0] * len(scores)
+    predictions = np.zeros(len(scores))
     for held_out in range(FOLDS):
-        model = fit_confidence(
-            [(e, c) for e, c, f in zip(evidence, correct, folds, strict=True) if f != held_out]
-        )
-        if model is None:
+        known = folds != held_out
+        right = int(correct[known].sum())
+        wrong = int(known.sum()) - right
+        if right + wrong < MIN_QUERIES or min(right, wrong) < MIN_QUERIES_PER_CLASS:
             return None
-        for query in np.flatnonzero(folds == held_out):
-            predictions[query] = model.probability(evidence[query])
-    return predictions
+        mean, scale = float(scores[known].mean()), float(scores[known].std())
+        standard = PlacePrior(means=(mean,), scales=(scale or 1.0,), level=(), not_in_map=())
+        table = RegressionTable(
+            scores[known, None], correct[known].astype(np.float64), np.ones(right + wrong)
+        )
+        fitted = fit_map_estimate(table, (0.0, 0.0), standard, L2_PENALTY)
+        predictions[~known] = sigmoid(standard.design(scores[~known, None]) @ np.array(fitted))
+    probabilities: list[float] = predictions.tolist()
+    return probabilities
 
 
 MAX_CURVE_POINTS = 400  # points of a curve in metrics.json

@@ -1,6 +1,6 @@
 """Worker for evaluation and word-weight jobs, which search a live map with its own photos.
 
-An evaluation measures the active generation and stores the calibration of its scores. The jobs run
+An evaluation measures the active generation and stores the model of its estimates. The jobs run
 in a thread of their own, parallel to the periodic tasks, and load the search tier only: they
 describe no photos. A job whose steward died starts from the beginning.
 """
@@ -25,8 +25,8 @@ from shared.catalog.maps import Map, decide_label_paths
 from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
 from shared.config.settings import Settings
 from shared.errors import Conflict
-from shared.evaluation.calibration import Calibration
 from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
@@ -162,11 +162,9 @@ class EvaluationWorker:
                 if map_ is not None and map_.place_labels_are_automatic:
                     map_.place_labels_are_paths = evaluation.scheme.labels_are_paths
                 current = session.get_one(Generation, generation.id)
-                current.calibration = unweighted.calibration.model_dump()
+                current.calibration = unweighted.model.model_dump(mode="json")
                 if weighted:
-                    _store_weighted_calibration(
-                        session, generation.id, weights, weighted.calibration
-                    )
+                    _store_weighted_calibration(session, generation.id, weights, weighted.model)
                 session.add(
                     Evaluation(
                         id=evaluation_id,
@@ -226,9 +224,9 @@ def _count_words(session: Session, generation: Generation) -> int:
 
 
 def _store_weighted_calibration(
-    session: Session, generation_id: UUID, weights: tuple[float, ...], calibration: Calibration
+    session: Session, generation_id: UUID, weights: tuple[float, ...], calibration: PlaceModel
 ) -> None:
-    """Store the calibration of scores with these weights, unless the weights changed meanwhile."""
+    """Store the place model of rankings by these weights, unless the weights changed meanwhile."""
     generation = session.get_one(Generation, generation_id)
     record = parse_word_weights(generation.word_weights)
     if record and record.applied == weights:

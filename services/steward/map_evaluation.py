@@ -1,12 +1,12 @@
-"""Map evaluation: recall, calibration and false accepts of a live map, through the search tier.
+"""Map evaluation: recall and place estimates of a live map, through the search tier.
 
 *Leave-one-out*: each photo of a sample of the map is searched, itself excluded. The frames before
 and after it are easy matches, so the recall is optimistic; it is measured a second time without the
 photos of its sequence. Use both to compare two generations of a map. *Labelled queries* (photos of
 role `query`) were taken at another time: their recall is what users see.
 
-Word weights change the ranking and the meaning of its scores: a calibration is valid only for
-results with the weights that it was measured with.
+Word weights change the ranking: a place model is valid only for rankings by the weights that it
+was fitted with.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from functools import partial
 from itertools import filterfalse, islice
 from statistics import median
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 
@@ -33,21 +32,17 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
-from shared.evaluation.calibration import Calibration, fit_threshold
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
-    PhotoLocation,
-    PlaceEvidence,
     RankedPhoto,
-    compute_evidence,
     distance_between_m,
     estimate_location,
-    is_different_place,
     is_same_place,
 )
-from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
+from shared.evaluation.places.figures import evaluate_places
 from shared.evaluation.places.fit import PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.probability import PlaceModel
 from shared.evaluation.places.samples import SAME_SESSION_PERIOD, IndexRanking, OwnPhotoSampler
 from shared.search_api.protocol import SearchBackend, SearchHit
 
@@ -110,11 +105,9 @@ class QueryOutcome:
     """Whether the estimate shows its place."""
     error_m: float | None
     same_session: bool
-    """Taken within SAME_SESSION_PERIOD of the photo that it matched: excluded from calibration."""
-    accepted: bool | None
-    truth: PhotoLocation
-    ranking: list[RankedPhoto]
-    best_photo_id: UUID | None
+    """Taken within SAME_SESSION_PERIOD of the photo that it matched: not used for the fit."""
+    sample: PlaceSample | None
+    """its levels; None if no photo with a place was found"""
 
 
 @dataclass(slots=True)
@@ -124,11 +117,12 @@ class _LabelledQueryMetrics:
     recall: RecallCounter = field(default_factory=RecallCounter)
     outcomes: list[QueryOutcome] = field(default_factory=list)
 
-    def figures(self) -> dict[str, Any]:
-        """Return the metrics as JSON.
+    def figures(self, model: PlaceModel) -> dict[str, Any]:
+        """Return the metrics as JSON; queries are accepted by the model's `in_map`.
 
         Recall is over queries whose place is in the map, the other metrics are over all.
         """
+        accepted = [o for o in self.outcomes if o.sample and model.accepts(o.sample.levels)]
         inside = [o for o in self.outcomes if o.in_map]
         outside = [o for o in self.outcomes if not o.in_map]
         errors = [o.error_m for o in inside if o.is_correct and o.error_m is not None]
@@ -137,12 +131,9 @@ class _LabelledQueryMetrics:
             "out_of_map": len(outside),
             "same_session": sum(o.same_session for o in self.outcomes),
             "median_error_of_right_ones_m": median(errors) if errors else None,
-            "accepted_in_map": ratio(sum(bool(o.accepted) for o in inside), len(inside)),
-            "right_of_accepted": ratio(
-                sum(o.is_correct for o in self.outcomes if o.accepted),
-                sum(bool(o.accepted) for o in self.outcomes),
-            ),
-            "false_accepts": ratio(sum(bool(o.accepted) for o in outside), len(outside)),
+            "accepted_in_map": ratio(sum(o.in_map for o in accepted), len(inside)),
+            "right_of_accepted": ratio(sum(o.is_correct for o in accepted), len(accepted)),
+            "false_accepts": ratio(sum(not o.in_map for o in accepted), len(outside)),
         }
 
 
@@ -156,10 +147,10 @@ MAX_RANKS = 800  # depth of the search for other places where hundreds of photos
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluationResult:
-    """The metrics of an evaluation, as JSON, and the calibration fitted on it."""
+    """The metrics of an evaluation, as JSON, and the place model fitted on it."""
 
     figures: dict[str, Any]
-    calibration: Calibration
+    model: PlaceModel
 
 
 class MapEvaluation:
@@ -215,33 +206,29 @@ class MapEvaluation:
             self.radius_m,
             partial(self._rank_own_photo, rank_photo),
         )
-        recalls, impostors = self._leave_one_out(sample, own_photos)
-        threshold = fit_threshold(impostors)
-        calibration = Calibration(
-            radius_m=self.radius_m, support_threshold=threshold, impostors=len(impostors)
+        recalls = self._leave_one_out(sample, own_photos)
+        indices = [self._index_of[photo.photo_id] for photo in sample]
+        spread = own_photos.spread(indices)
+        labelled = self._evaluate_labelled_queries(rank_photo, own_photos, spread)
+        places = evaluate_places(
+            list(own_photos.samples(indices, spread)),
+            [o.sample for o in labelled.outcomes if o.sample and not o.same_session],
+            self.scheme,
+            spread,
         )
-        labelled = self._evaluate_labelled_queries(calibration, rank_photo)
-        places = self._evaluate_places(sample, own_photos, labelled)
-        calibration = calibration.model_copy(update={"places": places.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
-            "labelled_queries": labelled.figures() if self.queries else None,
-            "estimate": {"support_threshold": threshold, "impostors": len(impostors)},
+            "labelled_queries": labelled.figures(places.model) if self.queries else None,
             "places": places.figures,
         }
-        return MapEvaluationResult(figures, calibration)
+        return MapEvaluationResult(figures, places.model)
 
     def _leave_one_out(
         self, sample: Sequence[GeotaggedPhoto], own_photos: OwnPhotoSampler
-    ) -> tuple[dict[str, Any], list[PlaceEvidence]]:
-        """Return recall with and without the photos of a query's sequence, and the evidence of
-        impostors.
-
-        An impostor is the best match at another place: what a query outside the map would find.
-        """
+    ) -> dict[str, Any]:
+        """Return recall with and without the photos of a query's sequence."""
         recall, apart = _OwnPhotoRecall(self.radius_m), _OwnPhotoRecall(self.radius_m)
-        impostors = []
         photos = self.database.photos
         for query in sample:
             found = own_photos.ranking(self._index_of[query.photo_id])
@@ -253,19 +240,10 @@ class MapEvaluation:
             recall.add(query, ranked, at_place)
             is_apart = partial(filterfalse, query.is_same_sequence)
             apart.add(query, is_apart(ranked), is_apart(at_place))
-            others = [
-                RankedPhoto(float(score), photo.spot)
-                for photo, score in zip(ranked, found[1], strict=True)
-                if is_different_place(query.spot, photo.spot)
-            ]
-            evidence = compute_evidence(others[:EVIDENCE_DEPTH], self.radius_m)
-            if evidence is not None:
-                impostors.append(evidence)
-        figures = {
+        return {
             "leave_one_out": recall.figures(),
             "leave_one_out_without_sequence": apart.figures(),
         }
-        return figures, impostors
 
     def _rank_own_photo(self, rank_photo: RankPhoto, index: int) -> IndexRanking | None:
         """Rank the photos with a location by their similarity to one of them."""
@@ -276,36 +254,11 @@ class MapEvaluation:
         indices = np.array([self._index_of[hit.photo_id] for hit, _ in ranking], dtype=np.int64)
         return indices, np.array([hit.ranked_by for hit, _ in ranking], dtype=np.float64)
 
-    def _evaluate_places(
-        self,
-        sample: Sequence[GeotaggedPhoto],
-        own_photos: OwnPhotoSampler,
-        labelled: _LabelledQueryMetrics,
-    ) -> PlaceEvaluation:
-        """Fit the probabilities of the levels, and measure them by cross-validation."""
-        photos = [self._index_of[photo.photo_id] for photo in sample]
-        spread = own_photos.spread(photos)
-        queries = []
-        for number, outcome in enumerate(labelled.outcomes):
-            if outcome.same_session or not outcome.ranking:
-                continue
-            best = self._index_of.get(outcome.best_photo_id) if outcome.best_photo_id else None
-            neighbours = own_photos.neighbours(best) if best is not None else []
-            levels = candidate_levels(
-                outcome.ranking, neighbours, self.scheme, spread, self.radius_m
-            )
-            if levels:
-                right = [level.is_right(outcome.truth) for level in levels]
-                queries.append(PlaceSample(number, levels, right))
-        return evaluate_places(
-            list(own_photos.samples(photos, spread)), queries, self.scheme, spread
-        )
-
     def _evaluate_labelled_queries(
-        self, calibration: Calibration, rank_photo: RankPhoto
+        self, rank_photo: RankPhoto, own_photos: OwnPhotoSampler, spread: float
     ) -> _LabelledQueryMetrics:
         labelled = _LabelledQueryMetrics()
-        for query in self.queries:
+        for number, query in enumerate(self.queries):
             ranking = rank_photo(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
@@ -319,18 +272,18 @@ class MapEvaluation:
                 RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
                 for hit, spot in ranking
             ]
-            evidence = compute_evidence(ranked, self.radius_m)
-            estimate = estimate_location(ranked, self.radius_m) if evidence else UNKNOWN_LOCATION
+            best = self._index_of.get(ranking[0][0].photo_id) if ranking else None
+            neighbours = own_photos.neighbours(best) if best is not None else []
+            levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)
+            right = [level.is_right(query.spot) for level in levels]
+            estimate = estimate_location(ranked, self.radius_m) if levels else UNKNOWN_LOCATION
             labelled.outcomes.append(
                 QueryOutcome(
                     in_map=in_map,
                     is_correct=is_same_place(query.spot, estimate, self.radius_m),
                     error_m=distance_between_m(query.spot, estimate),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
-                    accepted=calibration.accepts(evidence) if evidence else None,
-                    truth=query.spot,
-                    ranking=ranked,
-                    best_photo_id=ranking[0][0].photo_id if ranking else None,
+                    sample=PlaceSample(number, levels, right) if levels else None,
                 )
             )
         return labelled

@@ -174,7 +174,7 @@ class WordWeightsFit:
         )
         if is_better:
             result = self.evaluation.evaluate(sample, weights)
-            record = record.model_copy(update={"calibration": result.calibration})
+            record = record.model_copy(update={"calibration": result.model})
         return record
 
     def _fit_halves(self, split: PairSplit) -> tuple[PairStatistics, PairStatistics]:

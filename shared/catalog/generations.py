@@ -45,7 +45,7 @@ class RowType(StrEnum):
 class Generation(Journaled, Base):
     """A generation. `spec` has everything that determines a descriptor's value.
 
-    `calibration` is that of its scores, fitted by evaluations (`shared.evaluation`); `word_weights`
+    `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations; `word_weights`
     is a record of `shared.word_weights.record`. New chunks go into `open_slot`, which has
     `open_slot_rows` rows so far.
     """

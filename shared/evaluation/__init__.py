@@ -1,6 +1,5 @@
-"""Evaluation of place recognition in a map: location estimates, calibration, bootstrap intervals.
+"""Evaluation of place recognition in a map.
 
-Estimates of a query's place: `places.evidence` decides when two photos show the same place and how
-strongly a ranking supports a place; `calibration` turns this evidence into an accept threshold and
-a confidence, and measures how good the confidence is.
+`places` estimates where a query was taken, from a ranking; `calibration` measures how good its
+probabilities are; `bootstrap` gives intervals of shares.
 """

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.probability import PlaceModel
 from shared.word_weights.training_pairs import PairSource
 
 
@@ -57,8 +57,8 @@ class WordWeights(BaseModel):
     """one per word, 0 or more, of any scale; empty if none were fitted"""
     held_out: HeldOut | None = None
     """cross-validation; None if no weights were fitted"""
-    calibration: Calibration | None = None
-    """calibration of weighted scores; None unless the outcome is `kept`"""
+    calibration: PlaceModel | None = None
+    """place model of weighted rankings; None unless the outcome is `kept`"""
 
     @property
     def applied(self) -> tuple[float, ...]:

@@ -13,9 +13,9 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess
 
-AUTOMATIC = 24  # located photos from which a map is evaluated by itself
+AUTOMATIC = 64  # located photos from which a map is evaluated by itself
 SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
-ENOUGH = 22  # to tell one in twenty, and not evaluated by itself
+ENOUGH = 60  # to tell one in twenty, and not evaluated by itself
 MANY = 60  # more than an estimate looks at
 ESTIMATE_FIELDS = {
     "in_map",
@@ -131,7 +131,9 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
         assert estimate["reason"].startswith("Probably not in this map")
     assert got(server.client.get("/api/v1/maps/streets"))["measurement"] == "measured"
     ask(server, "streets", re_encoded(streets[3]), history=False)
-    history = got(server.client.get("/api/v1/searches", params={"map": "streets"}))["searches"]
+    history = got(server.client.get("/api/v1/searches", params={"map": "streets", "limit": 100}))[
+        "searches"
+    ]
     assert [(search["in_map"], search["has_place"]) for search in history][::-1] == [
         (estimate["in_map"], estimate["has_place"]) for estimate in [before, *copies, *strangers]
     ]

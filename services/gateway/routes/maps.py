@@ -34,9 +34,9 @@ from shared.catalog.models import check_model_registered
 from shared.catalog.vocabularies import next_fit_photos, vocabulary_standing
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, invalid_field_error
-from shared.evaluation.calibration import Calibration
 from shared.evaluation.places.fit import MIN_OWN_PHOTOS
 from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import PlaceModel
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import cancel_jobs
@@ -283,7 +283,7 @@ def _measurement(
     """Return whether estimates have probabilities, or what it takes."""
     if generation is None:
         return "too_few_photos"
-    stored = generation.calibration and Calibration.model_validate(generation.calibration).places
+    stored = generation.calibration and PlaceModel.model_validate(generation.calibration)
     scheme = LevelScheme(
         labels_are_paths=map_.place_labels_are_paths, radii_m=settings.level_radii_m
     )

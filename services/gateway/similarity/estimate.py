@@ -7,18 +7,15 @@ from uuid import UUID
 
 from services.gateway.schemas import EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
-from shared.evaluation.calibration import Calibration
-from shared.evaluation.places.evidence import (
-    PhotoLocation,
-    RankedPhoto,
-    compute_evidence,
-    estimate_location,
-)
+from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto, estimate_location
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
 from shared.search_api.protocol import SearchHit
 
-MIN_GUESS_PROBABILITY = 0.1
-"""of the finest level of a guess that is named although its support is below the threshold"""
+MIN_GUESS_PROBABILITY = 0.1  # of the finest level; a less probable place is not named as a guess
+NOT_MEASURED = (
+    "How certain this place is, and whether it is in the map, is not measured yet: the map has not "
+    "been evaluated with 20 or more photos that have coordinates or a label."
+)
 
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
@@ -30,48 +27,41 @@ def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list
 
 
 def estimate_place(
-    calibration: Calibration | None,
     ranking: Sequence[RankedPhoto],
-    unfiltered_ranking: Sequence[RankedPhoto],
+    estimate: PlaceEstimate | None,
+    model: PlaceModel,
+    certainty: float,
     radius_m: float,
     no_place_reason: str,
 ) -> EstimateResponse:
-    """Estimate the place that a ranking points to.
+    """Return the place that a ranking points to, and how certain it is.
 
     Args:
-        calibration: That of this kind of ranking (plain, or by word weights).
         ranking: The photos that have a place and match the filter, best first.
-        unfiltered_ranking: The same without the filter. The evidence is computed from it, because
-            the calibration was learnt on photos with a place and without filters.
-        radius_m: Photos within this distance in metres show the same place.
-        no_place_reason: The reason if a ranking is empty.
+        estimate: The model's estimate for them; None if the best one has no location.
+        model: That of this kind of ranking (plain, or by word weights). Before the map's first
+            evaluation, the place is named without probabilities.
+        certainty: Share of the answers that must be right.
+        radius_m: Photos within this distance in metres of the best one determine the position.
+        no_place_reason: The reason if there is no estimate.
     """
-    evidence = (
-        compute_evidence(unfiltered_ranking, radius_m, ranking[0].location) if ranking else None
-    )
-    if evidence is None:
+    if estimate is None:
         return EstimateResponse(reason=no_place_reason)
-    accepted = calibration.accepts(evidence) if calibration else None
+    in_map = estimate.in_map
     spot = (
-        estimate_location(ranking, radius_m)
-        if accepted is not False
-        else PhotoLocation(None, None, None)
+        PhotoLocation(None, None, None) if in_map is False else estimate_location(ranking, radius_m)
     )
-    return EstimateResponse(
-        in_map=accepted,
+    response = EstimateResponse(
+        in_map=in_map,
         latitude=spot.latitude,
         longitude=spot.longitude,
         radius_m=None if spot.latitude is None else radius_m,
         place=spot.place,
-        has_place=accepted is not False,
-        reason=_estimate_reason(accepted, evidence.support, calibration),
+        has_place=in_map is not False,
+        reason=NOT_MEASURED,
     )
-
-
-def add_levels(
-    response: EstimateResponse, estimate: PlaceEstimate, model: PlaceModel, certainty: float
-) -> EstimateResponse:
-    """Return the response with the levels of the estimate and their probabilities."""
+    if not model.is_fitted:
+        return response
     return response.model_copy(
         update={
             "levels": [
@@ -94,21 +84,19 @@ def add_levels(
             "radius_68_m": estimate.radius_68_m,
             "radius_95_m": estimate.radius_95_m,
             "calibration_source": model.calibration_source,
+            "reason": _reason(estimate, model),
         }
     )
 
 
-def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
-    if accepted is None or calibration is None or calibration.support_threshold is None:
-        return (
-            "How certain this place is, and whether it is in the map, is not measured yet: the map "
-            "has not been evaluated with 20 or more photos that have coordinates or a label."
-        )
+def _reason(estimate: PlaceEstimate, model: PlaceModel) -> str:
+    if model.in_map_limit is None:
+        return "Too few photos were evaluated to tell whether the place is in the map."
     compared = (
-        f"The support of the first ten photos for the place is {support:.4f}; 5 % of the queries "
-        f"outside the map reach {calibration.support_threshold:.4f}."
+        f"The probability that the map has no photo of the place is {estimate.not_in_map:.4f}; "
+        f"that of 5 % of the queries outside the map is below {model.in_map_limit:.4f}."
     )
-    return compared if accepted else f"Probably not in this map. {compared}"
+    return compared if estimate.in_map else f"Probably not in this map. {compared}"
 
 
 def _photo_location(photo: Photo) -> PhotoLocation:

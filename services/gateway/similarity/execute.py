@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,12 +22,13 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
+    EstimateResponse,
     PhotoResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
     job_url,
 )
-from services.gateway.similarity.estimate import add_levels, estimate_place, locate_hits
+from services.gateway.similarity.estimate import estimate_place, locate_hits
 from services.gateway.similarity.neighbours import Neighbours
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
@@ -38,7 +39,6 @@ from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
 from shared.errors import Conflict, Gone, StorageFull
-from shared.evaluation.calibration import Calibration
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
@@ -54,7 +54,7 @@ WITH_PLACE = PhotoFilter(has_place=True)
 
 @dataclass(frozen=True, slots=True)
 class _RankingWeights:
-    """Word weights of a search, and the calibration that belongs to them."""
+    """Word weights of a search, and the place model that belongs to them."""
 
     generation: Generation
     record: WordWeights | None
@@ -67,12 +67,12 @@ class _RankingWeights:
             return "applied" if self._ranked_by_weights(hits) else "none"
         return "off" if self.record and self.record.applied else "none"
 
-    def calibration(self, hits: Sequence[SearchHit]) -> Calibration | None:
-        """Return the calibration for this kind of ranking; None if there is none."""
+    def calibration(self, hits: Sequence[SearchHit]) -> PlaceModel | None:
+        """Return the place model for this kind of ranking; None if there is none."""
         if self.values and self.record and self._ranked_by_weights(hits):
             return self.record.calibration
         stored = self.generation.calibration
-        return Calibration.model_validate(stored) if stored else None
+        return PlaceModel.model_validate(stored) if stored else None
 
     def _ranked_by_weights(self, hits: Sequence[SearchHit]) -> bool:
         return not hits or hits[0].weighted_score is not None
@@ -100,6 +100,18 @@ class SimilarityQuery:
     filename: str
     background: tuple[RowReference, ...] = ()
     """Descriptors whose mean is subtracted from the query"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Live photos that a search found."""
+
+    hits: list[SearchHit]
+    """most similar first"""
+    photos: dict[UUID, Photo]
+    response: SearchResponse
+    ranking: list[RankedPhoto]
+    """the hits with the locations of their photos"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,61 +234,97 @@ def write_to_map(gateway: GatewayContext, map_: Map) -> Iterator[Session]:
 def run_similarity_search(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> SimilarityResult:
-    """Query the search tier and compute the estimate. The caller adds the history row."""
+    """Query the search tier and estimate the place. The caller adds the history row.
+
+    One search answers most queries. Further ones are made for photos without a place among the
+    first, for a filter (the estimate is that of the whole map), for the neighbours of a best photo
+    that are not cached, and for `min_score` with word weights.
+    """
     started = time.perf_counter()
     weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
+    search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
     depth = max(search_params.top_k, search_params.rerank or 0)
     # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
-    search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
-    hits, photos, response = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
-    ranked_hits, ranking = hits, locate_hits(hits, photos)
-    if not all(ranked.location.is_known for ranked in ranking):
-        # Photos without a place would hide those that have one.
-        with_place = search_params.photos.model_copy(update={"has_place": True})
-        ranked_hits, ranked_photos, _ = search(with_place, len(hits))
-        ranking = locate_hits(ranked_hits, ranked_photos)
-    unfiltered_hits, unfiltered_ranking = ranked_hits, ranking
-    if not search_params.photos.is_empty:
-        unfiltered_hits, unfiltered_photos, _ = search(WITH_PLACE, EVIDENCE_DEPTH)
-        unfiltered_ranking = locate_hits(unfiltered_hits, unfiltered_photos)
-    calibration = weights.calibration(hits)
-    estimate = estimate_place(
-        calibration,
-        ranking,
-        unfiltered_ranking,
-        gateway.settings.estimate_radius_m,
-        _no_place_reason(hits, search_params.photos),
-    )
+    found = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
+    located = _find_located(search, found, search_params.photos)
+    whole_map = located if search_params.photos.is_empty else search(WITH_PLACE, EVIDENCE_DEPTH)
     scheme = LevelScheme(
         labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
     )
-    model = ((calibration and calibration.places) or PlaceModel()).for_scheme(scheme)
+    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
     certainty = search_params.certainty or gateway.settings.certainty
     places = model.estimate(
-        unfiltered_ranking,
-        _rank_neighbours(gateway, query, search_params, unfiltered_hits, weights.values),
+        whole_map.ranking,
+        _rank_neighbours(gateway, query, search_params, whole_map.hits, weights.values),
         scheme,
         certainty,
         gateway.settings.estimate_radius_m,
-        ranking,
+        located.ranking,
     )
-    match_probabilities: dict[UUID, float] = {}
-    if places is not None and model.is_fitted:
-        estimate = add_levels(estimate, places, model, certainty)
-        match_probabilities = dict(
-            zip((hit.photo_id for hit in ranked_hits), places.match_probabilities, strict=True)
-        )
-    similar = hits[:depth]
-    if search_params.min_score is not None and weights.values:
-        # `min_score` applies to the plain cosine similarity, but the ranking is by weighted scores:
-        # matching photos may be anywhere in it.
-        similar, photos, response = search(
-            search_params.photos, depth, min_score=search_params.min_score
-        )
-    elif search_params.min_score is not None:
-        similar = [hit for hit in similar if hit.score >= search_params.min_score]
+    estimate = estimate_place(
+        located.ranking,
+        places,
+        model,
+        certainty,
+        gateway.settings.estimate_radius_m,
+        _no_place_reason(found.hits, search_params.photos),
+    )
+    similar = _apply_min_score(search, found, search_params, depth, weights.values)
     elapsed_ms = (time.perf_counter() - started) * 1000
-    response_without_photos = SimilarityResponse(
+    return SimilarityResult(
+        response_without_photos=_make_response(
+            query, similar.response, estimate, weights.state(found.hits), elapsed_ms
+        ),
+        hits=similar.hits,
+        photos=similar.photos,
+        places=places,
+        match_probabilities=dict(
+            zip((hit.photo_id for hit in located.hits), places.match_probabilities, strict=True)
+        )
+        if places is not None and model.is_fitted
+        else {},
+        word_weights=weights.values
+        if any(hit.weighted_score is not None for hit in similar.hits)
+        else (),
+        history=(_make_history(query, search_params, found, similar, estimate, elapsed_ms),)
+        if search_params.history
+        else (),
+    )
+
+
+def _find_located(
+    search: Callable[[PhotoFilter, int], _Found], found: _Found, photo_filter: PhotoFilter
+) -> _Found:
+    """Return the found photos; if some have no place and would hide others, only those with one."""
+    if all(ranked.location.is_known for ranked in found.ranking):
+        return found
+    return search(photo_filter.model_copy(update={"has_place": True}), len(found.hits))
+
+
+def _apply_min_score(
+    search: Callable[..., _Found],
+    found: _Found,
+    search_params: SearchParams,
+    depth: int,
+    weights: tuple[float, ...],
+) -> _Found:
+    """Return the first `depth` photos whose plain cosine similarity reaches `min_score`."""
+    first = replace(found, hits=found.hits[:depth])
+    if search_params.min_score is None:
+        return first
+    if weights:  # matching photos may be anywhere in the ranking by weighted scores
+        return search(search_params.photos, depth, min_score=search_params.min_score)
+    return replace(first, hits=[h for h in first.hits if h.score >= search_params.min_score])
+
+
+def _make_response(
+    query: SimilarityQuery,
+    response: SearchResponse,
+    estimate: EstimateResponse,
+    word_weights: str,
+    elapsed_ms: float,
+) -> SimilarityResponse:
+    return SimilarityResponse(
         query_file_id=query.photo_id,
         query_filename=query.filename,
         processing_time_ms=elapsed_ms,
@@ -284,7 +332,7 @@ def run_similarity_search(
         similar_images=[],
         estimate=estimate,
         vocabulary=query.vocabulary,
-        word_weights=weights.state(hits),
+        word_weights=word_weights,
         generation_id=query.generation.id,
         rows=RowType(query.generation.row_type),
         certificate=response.certificate,
@@ -295,29 +343,29 @@ def run_similarity_search(
         degraded=bool(response.missing),
         missing=list(response.missing),
     )
-    history = Search(
+
+
+def _make_history(
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    found: _Found,
+    similar: _Found,
+    estimate: EstimateResponse,
+    elapsed_ms: float,
+) -> Search:
+    return Search(
         map_id=query.map.id,
         generation_id=query.generation.id,
         query_photo_id=query.photo_id,
         query_filename=query.filename,
         top_k=search_params.top_k,
-        results=min(len(similar), search_params.top_k),
+        results=min(len(similar.hits), search_params.top_k),
         processing_ms=elapsed_ms,
-        best_score=hits[0].score if hits else None,
+        best_score=found.hits[0].score if found.hits else None,
         in_map=estimate.in_map,
         answer_level=estimate.answer_level,
         not_in_map_probability=estimate.not_in_map_probability,
         has_place=estimate.has_place,
-    )
-    weighted = any(hit.weighted_score is not None for hit in similar)
-    return SimilarityResult(
-        response_without_photos,
-        similar,
-        photos,
-        places,
-        match_probabilities,
-        weights.values if weighted else (),
-        (history,) if search_params.history else (),
     )
 
 
@@ -333,10 +381,9 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
     """Return the first `k` live photos of the map, most similar first, without an estimate."""
     weights = select_ranking_weights(query.generation, True, gateway.settings)
-    hits, _, _ = _search_live_photos(
+    return _search_live_photos(
         gateway, query, SearchParams(), NO_FILTER, k, weights=weights.values
-    )
-    return hits
+    ).hits
 
 
 def _rank_neighbours(
@@ -372,12 +419,12 @@ def _search_neighbours(
     descriptor, chunk = located
     photo = replace(query, object_key=chunk.object_key, row=descriptor.row, photo_id=photo_id)
     try:
-        hits, photos, response = _search_live_photos(
+        found = _search_live_photos(
             gateway, photo, search_params, WITH_PLACE, EVIDENCE_DEPTH + 1, weights=weights
         )
     except Gone:  # its chunk was merged into another one between the two reads
         return (), False
-    return tuple(locate_hits(hits, photos)), not response.missing
+    return tuple(found.ranking), not found.response.missing
 
 
 def _search_live_photos(
@@ -389,7 +436,7 @@ def _search_live_photos(
     *,
     weights: tuple[float, ...],
     min_score: float | None = None,
-) -> tuple[list[SearchHit], dict[UUID, Photo], SearchResponse]:
+) -> _Found:
     """Return the first `depth` live photos; fewer if there are no more."""
     k = depth
     while True:
@@ -413,7 +460,8 @@ def _search_live_photos(
             live = get_live_photos(session, [hit.photo_id for hit in response.hits])
         hits = [hit for hit in response.hits if hit.photo_id in live]
         if len(hits) >= depth or len(response.hits) < k:
-            return hits[:depth], live, response
+            hits = hits[:depth]
+            return _Found(hits, live, response, locate_hits(hits, live))
         k *= 2
 
 

@@ -18,7 +18,7 @@ from shared.catalog.generations import Generation, active_generation, latest_eva
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
 from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
 from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
-from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.word_weights.record import parse_word_weights
@@ -151,7 +151,7 @@ def _levels_changed(session: Session, generation: Generation) -> bool:
     """Return whether labels have become paths, or names, since the place model was fitted."""
     if generation.calibration is None or _failed_job_params(session, generation, JobKind.EVALUATE):
         return False
-    model = Calibration.model_validate(generation.calibration).places
+    model = PlaceModel.model_validate(generation.calibration)
     are_paths = session.get_one(Map, generation.map_id).place_labels_are_paths
     return bool(model and model.scheme and model.scheme.labels_are_paths != are_paths)
 

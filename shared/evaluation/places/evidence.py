@@ -1,4 +1,4 @@
-"""Evidence for a place: same-place predicates, support and agreement of a ranking, location.
+"""Photos of a ranking with their locations: same-place predicates, and the position they point to.
 
 Two photos show the same place if they are close to each other or have the same place label.
 """
@@ -47,21 +47,8 @@ def is_same_place(a: PhotoLocation, b: PhotoLocation, radius_m: float) -> bool:
     return distance is not None and distance <= radius_m
 
 
-def is_different_place(a: PhotoLocation, b: PhotoLocation) -> bool:
-    """Return whether two locations are certainly different places.
-
-    They are if they are more than 100 m apart and do not have the same label, or, without
-    coordinates, if their labels differ.
-    """
-    distance = distance_between_m(a, b)
-    labels_differ = a.place is not None and b.place is not None and a.place != b.place
-    if a.place is not None and a.place == b.place:
-        return False
-    return labels_differ if distance is None else distance > DIFFERENT_PLACE_M
-
-
 EVIDENCE_DEPTH = 50  # ranks needed; a rival place below them scores at most what the last rank does
-VOTING_PHOTOS = 10  # first ranks that count towards support and agreement
+VOTING_PHOTOS = 10  # first ranks that determine the position
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,52 +59,6 @@ class RankedPhoto:
     location: PhotoLocation
     photo: Hashable = None
     """identifies the photo in other rankings of the same map; None if it is not known"""
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceEvidence:
-    """Evidence of the first ten photos of a ranking for the place of the best one.
-
-    `support` is the sum, over those of them that show this place, of the margin of their cosine
-    over the best cosine of any other place. `agreement` is their share of the ten. On generated
-    places, these two separated correct from wrong estimates best among the statistics that were
-    tried (best score, margin, z-score of the margin, softmax share of the place). They carry over
-    to photos of other days, which lower all scores alike.
-    """
-
-    support: float
-    agreement: float
-
-
-def compute_evidence(
-    ranking: Sequence[RankedPhoto], radius_m: float, place: PhotoLocation | None = None
-) -> PlaceEvidence | None:
-    """Compute the evidence of a ranking for a place.
-
-    A search filter removes competing places, which makes the remaining ranking look too certain.
-    For a filtered search, pass the unfiltered ranking of the map, and the place that the filtered
-    search found.
-
-    Args:
-        ranking: photos of the map, best first, `EVIDENCE_DEPTH` ranks if there are as many.
-        radius_m: radius of a place, in metres.
-        place: the place in question; by default that of the best photo.
-
-    Returns:
-        The evidence; None if the ranking is empty or the place is unknown.
-    """
-    if not ranking:
-        return None
-    target = place or ranking[0].location
-    if not target.is_known:
-        return None
-    rival_score = next(
-        (r.score for r in ranking if is_different_place(target, r.location)), ranking[-1].score
-    )
-    voters = ranking[:VOTING_PHOTOS]
-    agreeing = [r.score for r in voters if is_same_place(target, r.location, radius_m)]
-    support = sum(max(0.0, score - rival_score) for score in agreeing)
-    return PlaceEvidence(support, len(agreeing) / len(voters))
 
 
 def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoLocation:

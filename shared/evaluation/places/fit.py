@@ -8,6 +8,9 @@ searched as if the map had no photo of a place that shows them. Impostors have t
 `OUT_OF_MAP_SHARE`: that share of queries from outside the map is assumed. Labelled queries, if
 there are enough, refine the coefficients, with those of the own photos as the prior. Thresholds are
 chosen on predictions of samples that the model was not fitted on (cross-validation).
+
+An own photo that is alone at its place teaches nothing about "in the map": searched without itself,
+it is an impostor.
 """
 
 from __future__ import annotations
@@ -27,7 +30,12 @@ from shared.evaluation.places.probability import (
     shipped_prior,
     sigmoid,
 )
-from shared.evaluation.places.thresholds import CERTAINTIES, HeldOutEstimate, choose_thresholds
+from shared.evaluation.places.thresholds import (
+    CERTAINTIES,
+    HeldOutEstimate,
+    choose_in_map_limit,
+    choose_thresholds,
+)
 
 MIN_OWN_PHOTOS = 20
 MIN_LABELLED_QUERIES = 40
@@ -48,6 +56,8 @@ class PlaceSample:
     """for each level; None if the truth does not say"""
     left_out: str | None = None
     """what was left out of the map to make the photo an impostor; None if it is none"""
+    is_alone: bool = False
+    """whether no other photo that the sample may find shows its place"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +100,11 @@ def fit_place_model(
         for certainty in CERTAINTIES
     )
     model = _fit_coefficients(samples, labelled, scheme, spread).model_copy(
-        update={"thresholds": thresholds, "own_photos": own}
+        update={
+            "thresholds": thresholds,
+            "in_map_limit": choose_in_map_limit(impostors),
+            "own_photos": own,
+        }
     )
     in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
     return FittedPlaceModel(model, in_map, impostors)
@@ -151,6 +165,7 @@ def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTab
 
 def not_in_map_table(samples: Sequence[PlaceSample]) -> RegressionTable:
     """Return the samples of "not in the map", half of them impostors by weight."""
+    samples = [s for s in samples if s.left_out is not None or not s.is_alone]
     weights = sample_weights(samples, 0.5)
     return RegressionTable.of_rows(
         (sample.levels[0].features, sample.left_out is not None, weight)

@@ -8,16 +8,15 @@ in a map of few photos. `thresholds` decides which level is the answer.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict
 
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import (
@@ -34,11 +33,8 @@ from shared.evaluation.places.thresholds import CERTAINTIES, Thresholds
 
 CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
 
-log = logging.getLogger(__name__)
-
 OUT_OF_MAP_SHARE = 0.02
 SMALL_MAP_PHOTOS = 200  # with fewer, the coefficients stay near the prior's
-MODEL_VERSION = 3
 PRIOR_FILE = Path(__file__).with_name("prior.json")
 
 Coefficients = tuple[float, ...]
@@ -80,6 +76,8 @@ class PlaceEstimate:
     """index of the finest level that is certain enough"""
     not_in_map: float
     """probability that the map has no photo of the place"""
+    in_map: bool | None
+    """whether the map has a photo of the place; None if the model has no limit"""
     radius_68_m: float | None
     radius_95_m: float | None
     match_probabilities: Sequence[float]
@@ -87,11 +85,10 @@ class PlaceEstimate:
 
 
 class PlaceModel(BaseModel):
-    """Probability model of the estimates of one map and generation, stored with its calibration."""
+    """Probability model of the estimates of one map and generation. It is stored with it."""
 
     model_config = ConfigDict(frozen=True)
 
-    version: int = MODEL_VERSION
     source: CalibrationSource = "prior"
     """what the coefficients and thresholds were fitted on"""
     scheme: LevelScheme | None = None
@@ -103,6 +100,8 @@ class PlaceModel(BaseModel):
     not_in_map: Coefficients | None = None
     thresholds: tuple[Thresholds, ...] = ()
     """for each of CERTAINTIES"""
+    in_map_limit: float | None = None
+    """queries with a lower probability of "not in the map" show a place of the map"""
     own_photos: int = 0
     labelled_queries: int = 0
 
@@ -117,16 +116,6 @@ class PlaceModel(BaseModel):
         prior that they are shrunk towards."""
         is_small = self.source == "own_photos" and self.own_photos < SMALL_MAP_PHOTOS
         return "prior" if is_small else self.source
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_other_version(cls, stored: Any) -> Any:
-        """Read a model with the features of another release as the prior."""
-        version = stored.get("version", MODEL_VERSION) if isinstance(stored, dict) else None
-        if version in (None, MODEL_VERSION):
-            return stored
-        _log_dropped_version(version)
-        return {}
 
     def for_scheme(self, scheme: LevelScheme) -> PlaceModel:
         """Return this model, or the prior if the map's levels changed since it was fitted."""
@@ -157,6 +146,13 @@ class PlaceModel(BaseModel):
         stored = zip(CERTAINTIES, self.thresholds, strict=False)
         thresholds = next((t for known, t in stored if known >= certainty - 1e-9), Thresholds())
         return thresholds.answer(probabilities, not_in_map, certainty)
+
+    def accepts(self, levels: Sequence[CandidateLevel]) -> bool | None:
+        """Return whether a query with these levels shows a place of the map."""
+        return self._is_in_map(self.probabilities(levels)[1])
+
+    def _is_in_map(self, not_in_map: float) -> bool | None:
+        return None if self.in_map_limit is None else not_in_map < self.in_map_limit
 
     def unit(self, ranking: Sequence[RankedPhoto]) -> float:
         """Return the unit of score differences for a ranking."""
@@ -202,23 +198,13 @@ class PlaceModel(BaseModel):
             probabilities=probabilities,
             answer=self.answer(probabilities, not_in_map, certainty),
             not_in_map=not_in_map,
+            in_map=self._is_in_map(not_in_map),
             radius_68_m=error_radius_m(levels, probabilities, 0.68),
             radius_95_m=error_radius_m(levels, probabilities, 0.95),
             match_probabilities=_match_probabilities(
                 shown, levels[0], probabilities[0], not_in_map, vote_weights(shown, unit)
             ),
         )
-
-
-@cache
-def _log_dropped_version(version: object) -> None:
-    """Log once per process that models of another version are not used."""
-    log.warning(
-        "stored place models of version %s are not used (this release: %d); estimates in their "
-        "maps have no levels until the next evaluation",
-        version,
-        MODEL_VERSION,
-    )
 
 
 def error_radius_m(

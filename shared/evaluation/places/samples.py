@@ -105,13 +105,14 @@ class OwnPhotoSampler:
         """
         for photo in photos:
             visible = self._visible(photo)
+            is_alone = not (visible & self._at_place(photo)).any()
             levels: list[CandidateLevel] = []
             left_out = None
             for left_out, missing in self._kinds(photo):
                 levels = self._levels(photo, visible & ~missing, spread)
                 if levels:
                     right = [level.is_right(self._locations[photo]) for level in levels]
-                    yield PlaceSample(photo, levels, right, left_out)
+                    yield PlaceSample(photo, levels, right, left_out, is_alone)
             if levels and left_out is not None:
                 yield PlaceSample(photo, levels, [False] * len(levels), "everything near")
 

@@ -11,6 +11,9 @@ conformal prediction, Vovk et al. 2005). This holds with LIMIT_CONFIDENCE over t
 impostors, not on average (Vovk 2012), so that it takes n impostors with c^n <= 1 - LIMIT_CONFIDENCE
 (59 for c = 0.95): with fewer, as in a map of one place, the level is never the answer. Too few
 samples for a threshold leave c itself.
+
+A query shows a place of the map if its probability of "not in the map" is below a limit, below
+which at most the share FALSE_ACCEPT_RATE of the impostors of each kind is.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses those of the next higher one."""
 MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
+FALSE_ACCEPT_RATE = 0.05  # of queries outside the map that are said to be in it
 LIMIT_CONFIDENCE = 0.95  # that no more impostors exceed a limit than are allowed
 MIN_PROBABILITY = 1e-9  # of "not in the map"; bounds the odds
 UNREACHABLE_ODDS = 2 / MIN_PROBABILITY
@@ -89,6 +93,23 @@ def choose_thresholds(
         for position in range(max(min(depth, 1), depth - 1))
     )
     return Thresholds(probability=probability, odds=odds)
+
+
+def choose_in_map_limit(impostors: Sequence[HeldOutEstimate]) -> float | None:
+    """Choose the limit that "not in the map" must stay below for a query in the map.
+
+    At most the share FALSE_ACCEPT_RATE of new impostors of each kind stays below it, on average
+    over the choice of the impostors (conformal prediction, Vovk et al. 2005).
+
+    Returns:
+        The limit; None if no kind has the 19 impostors that tell one in twenty.
+    """
+    kinds: dict[str | None, list[float]] = defaultdict(list)
+    for impostor in impostors:
+        kinds[impostor.left_out].append(impostor.not_in_map)
+    ranks = {kind: int((len(kinds[kind]) + 1) * FALSE_ACCEPT_RATE + 1e-9) for kind in kinds}
+    limits = [sorted(kinds[kind])[rank - 1] for kind, rank in ranks.items() if rank > 0]
+    return min(limits, default=None)
 
 
 def _odds_in_map(probability: float, not_in_map: float) -> float:

@@ -8,7 +8,6 @@ import pytest
 
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.evaluation.calibration import Calibration
 from shared.evaluation.places.probability import PlaceModel
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
@@ -28,16 +27,11 @@ def ask(service: Service, number: int, map_name: str = "default", **params: Any)
 
 def fit(service: Service, map_name: str = "default") -> None:
     """Store a place model as an evaluation of 20 photos would, with the prior's coefficients."""
-    calibration = Calibration(
-        radius_m=25.0,
-        support_threshold=None,
-        impostors=0,
-        places=PlaceModel(source="own_photos", own_photos=20),
-    )
+    model = PlaceModel(source="own_photos", own_photos=20)
     with service.catalog.write() as session:
         generation = active_generation(session, get_map(session, map_name).id)
         assert generation is not None
-        generation.calibration = calibration.model_dump(mode="json")
+        generation.calibration = model.model_dump(mode="json")
 
 
 @pytest.fixture

@@ -165,7 +165,7 @@ def test_words_that_distinguish_places_are_weighted(city: City, spots: Any) -> N
     )
     assert held_out.chance < 0.05
     assert record.calibration is not None
-    assert record.calibration.support_threshold is not None
+    assert record.calibration.in_map_limit is not None
     assert record.near_pairs >= 100
     assert record.seed == 0
 
@@ -341,8 +341,7 @@ def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
     assert renewed.calibration is not None
     assert renewed.weights == record.weights
     assert plain is not None
-    assert renewed.calibration.support_threshold != plain["support_threshold"]
-    assert renewed.calibration.support_threshold == weighted["estimate"]["support_threshold"]
+    assert renewed.calibration.in_map_limit != plain["in_map_limit"]
 
 
 # --- over HTTP -------------------------------------------------------------------------------
@@ -398,9 +397,9 @@ def test_the_estimate_is_judged_by_what_its_own_ranking_has_taught(
     city.publish(rows_of_places(40, 3, reported=True), street(40))
     record = city.learn()
     assert record.calibration is not None
-    threshold = f"{record.calibration.support_threshold:.4f}"
+    limit = f"below {record.calibration.in_map_limit:.4f}"
     path = f"/similarity/{city.photos[7]}"
-    assert threshold in service.json("POST", path)["estimate"]["reason"]
+    assert limit in service.json("POST", path)["estimate"]["reason"]
     off = service.json("POST", path, params={"word_weights": False})["estimate"]
     assert off["in_map"] is None, "no evaluation has seen the plain ranking yet"
 

@@ -1,10 +1,7 @@
-"""How good a confidence is, counted by hand, and what may be learnt from how little."""
+"""How good stated probabilities are, counted by hand; which photos show one place."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
@@ -12,16 +9,11 @@ from hypothesis import strategies as some
 from shared.evaluation.calibration import (
     auroc,
     expected_calibration_error,
-    fit_confidence,
-    fit_threshold,
     recall_at_precision,
 )
 from shared.evaluation.places.evidence import (
-    DIFFERENT_PLACE_M,
     PhotoLocation,
-    PlaceEvidence,
     distance_between_m,
-    is_different_place,
     is_same_place,
 )
 
@@ -105,61 +97,6 @@ def test_recall_at_a_precision_is_the_best_over_all_cuts(
     assert found == pytest.approx(best / len(judged))
 
 
-# --- what may be learnt ----------------------------------------------------------------------
-
-
-def some_evidence(count: int, seed: int = 0, shift: float = 0.0) -> list[PlaceEvidence]:
-    rows = np.random.default_rng(seed).normal(shift, 1, (count, len(fields(PlaceEvidence))))
-    return [PlaceEvidence(*row) for row in rows.tolist()]
-
-
-def test_a_threshold_wants_enough_impostors() -> None:
-    assert fit_threshold(some_evidence(19)) is None
-    assert fit_threshold(some_evidence(20)) is not None
-    assert fit_threshold([]) is None
-
-
-@pytest.mark.parametrize("impostors", [20, 39, 60, 300])
-def test_about_one_in_twenty_strangers_is_accepted_and_no_more(impostors: int) -> None:
-    """On average over many maps; of a uniform figure a share of 1 - t exceeds the threshold t."""
-    chance = np.random.default_rng(impostors)
-    exceeding = []
-    for _ in range(400):
-        drawn = chance.uniform(0, 1, impostors)
-        threshold = fit_threshold([PlaceEvidence(*[x] * len(fields(PlaceEvidence))) for x in drawn])
-        assert threshold is not None
-        exceeding.append(1 - threshold)
-    assert 0.03 < np.mean(exceeding) < 0.055
-
-
-def test_no_confidence_is_learnt_from_too_few_or_of_one_kind() -> None:
-    evidence = some_evidence(60)
-    for judged in (
-        [(e, n % 2 == 0) for n, e in enumerate(evidence[:39])],
-        [(e, True) for e in evidence],
-        [(e, False) for e in evidence],
-        [(e, n >= 7) for n, e in enumerate(evidence)],
-        [(e, n < 7) for n, e in enumerate(evidence)],
-        [],
-    ):
-        assert fit_confidence(judged) is None
-    assert fit_confidence([(e, n % 2 == 0) for n, e in enumerate(evidence)]) is not None
-
-
-def test_a_confidence_separates_right_from_wrong_and_stays_between_0_and_1() -> None:
-    """Also where both kinds are apart, which a fit without a ridge would follow for ever."""
-    for apart in (1.0, 50.0):
-        judged = [(e, True) for e in some_evidence(40, 1, apart)]
-        judged += [(e, False) for e in some_evidence(40, 2, -apart)]
-        learnt = fit_confidence(judged)
-        assert learnt is not None
-        reported = [learnt.probability(e) for e, _ in judged]
-        assert all(0 < p < 1 for p in reported)
-        found = auroc(reported, [ok for _, ok in judged])
-        assert found is not None
-        assert found > 0.9
-
-
 # --- places ----------------------------------------------------------------------------------
 
 DEGREE_M = 111_195.08
@@ -167,72 +104,60 @@ metres_north = some.floats(0, 300)
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "same", "apart"),
+    ("one", "other", "same"),
     [
-        pytest.param(
-            PhotoLocation(0, 0, None), PhotoLocation(0, 0, None), True, False, id="one spot"
-        ),
+        pytest.param(PhotoLocation(0, 0, None), PhotoLocation(0, 0, None), True, id="one spot"),
         pytest.param(
             PhotoLocation(0, 0, "a"),
             PhotoLocation(50, 0, "a"),
             True,
-            False,
             id="one label, far apart",
         ),
         pytest.param(
             PhotoLocation(0, 0, "a"),
             PhotoLocation(0, 0, "b"),
             True,
-            False,
             id="two labels, one spot",
         ),
         pytest.param(
             PhotoLocation(0, 0, "a"),
             PhotoLocation(1, 0, "b"),
             False,
-            True,
             id="two labels, two spots",
         ),
         pytest.param(
             PhotoLocation(None, None, "a"),
             PhotoLocation(None, None, "b"),
             False,
-            True,
             id="two rooms",
         ),
         pytest.param(
             PhotoLocation(None, None, "a"),
             PhotoLocation(0, 0, None),
             False,
-            False,
             id="incomparable",
         ),
         pytest.param(
-            PhotoLocation(None, None, None), PhotoLocation(0, 0, "a"), False, False, id="unknown"
+            PhotoLocation(None, None, None), PhotoLocation(0, 0, "a"), False, id="unknown"
         ),
         pytest.param(
             PhotoLocation(None, None, None),
             PhotoLocation(None, None, None),
-            False,
             False,
             id="nothing",
         ),
     ],
 )
-def test_which_photos_show_one_place(
-    one: PhotoLocation, other: PhotoLocation, same: bool, apart: bool
-) -> None:
+def test_which_photos_show_one_place(one: PhotoLocation, other: PhotoLocation, same: bool) -> None:
     for here, there in ((one, other), (other, one)):
         assert is_same_place(here, there, 25) == same
-        assert is_different_place(here, there) == apart
 
 
 @settings(max_examples=50)
 @given(metres_north)
-def test_between_near_and_far_is_neither(metres: float) -> None:
+def test_photos_within_the_radius_show_one_place(metres: float) -> None:
     here, there = PhotoLocation(0, 7, None), PhotoLocation(metres / DEGREE_M, 7, None)
     found = distance_between_m(here, there)
     assert found == pytest.approx(metres, abs=0.01)
-    if abs(metres - 25) > 0.1 and abs(metres - DIFFERENT_PLACE_M) > 0.1:
+    if abs(metres - 25) > 0.1:
         assert is_same_place(here, there, 25) == (metres < 25)
-        assert is_different_place(here, there) == (metres > DIFFERENT_PLACE_M)

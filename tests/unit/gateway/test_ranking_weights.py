@@ -9,7 +9,7 @@ import pytest
 from services.gateway.similarity.execute import select_ranking_weights
 from shared.catalog.generations import Generation
 from shared.config.settings import Settings
-from shared.evaluation.calibration import Calibration
+from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.search_api.protocol import SearchHit
 from shared.word_weights.record import Outcome, WordWeights
@@ -19,16 +19,12 @@ PLAIN = SearchHit(photo_id=new_id(), score=0.5)
 WEIGHTED = SearchHit(photo_id=new_id(), score=0.5, weighted_score=0.7)
 
 
-def calibration(threshold: float) -> Calibration:
-    return Calibration(
-        radius_m=25.0,
-        support_threshold=threshold,
-        impostors=100,
-    )
+def model(limit: float) -> PlaceModel:
+    return PlaceModel(source="own_photos", in_map_limit=limit)
 
 
 def generation(outcome: Outcome | None) -> Generation:
-    """One whose plain threshold is 0.1, and 0.2 with its weights."""
+    """One whose plain limit is 0.1, and 0.2 with its weights."""
     record: dict[str, Any] | None = None
     if outcome is not None:
         record = WordWeights(
@@ -40,13 +36,13 @@ def generation(outcome: Outcome | None) -> Generation:
             seed=0,
             searchable=100,
             weights=(1.0, 0.0),
-            calibration=calibration(0.2),
+            calibration=model(0.2),
         ).model_dump(mode="json")
-    return Generation(calibration=calibration(0.1).model_dump(mode="json"), word_weights=record)
+    return Generation(calibration=model(0.1).model_dump(mode="json"), word_weights=record)
 
 
 @pytest.mark.parametrize(
-    ("outcome", "expected", "setting", "first", "state", "threshold"),
+    ("outcome", "expected", "setting", "first", "state", "limit"),
     [
         (Outcome.KEPT, True, True, WEIGHTED, "applied", 0.2),
         (Outcome.KEPT, True, True, None, "applied", 0.2),
@@ -64,7 +60,7 @@ def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
     setting: bool,
     first: SearchHit | None,
     state: str,
-    threshold: float,
+    limit: float,
 ) -> None:
     settings = Settings(_env_file=None).model_copy(update={"word_weights": setting})
     chosen = select_ranking_weights(generation(outcome), expected, settings)
@@ -73,4 +69,4 @@ def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
     assert chosen.state(hits) == state
     judged_by = chosen.calibration(hits)
     assert judged_by is not None
-    assert judged_by.support_threshold == threshold
+    assert judged_by.in_map_limit == limit

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.evaluation.calibration import Calibration
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.figures import evaluate_places
-from shared.evaluation.places.fit import MIN_LABELLED_QUERIES, PlaceSample, fit_place_model
+from shared.evaluation.places.fit import (
+    MIN_LABELLED_QUERIES,
+    PlaceSample,
+    fit_place_model,
+    not_in_map_table,
+)
 from shared.evaluation.places.levels import (
     FEATURES,
     CandidateLevel,
@@ -22,6 +26,7 @@ from shared.evaluation.places.thresholds import (
     CERTAINTIES,
     HeldOutEstimate,
     Thresholds,
+    choose_in_map_limit,
     choose_thresholds,
 )
 from shared.place_paths import is_within_level, label_levels, look_like_paths
@@ -281,6 +286,38 @@ def test_the_odds_exclude_impostors_of_each_kind_at_every_level_but_the_coarsest
     assert choose_thresholds(right, floors, 0.95).answer([0.97, 0.98, 0.99], 0.02, 0.95) == 2
 
 
+@pytest.mark.parametrize("count", [19, 39, 60, 300])
+def test_one_new_impostor_in_twenty_is_below_the_limit_on_average(count: int) -> None:
+    """Of a uniform probability, the share t is below the limit t."""
+    rng = np.random.default_rng(count)
+    limits = []
+    for _ in range(400):
+        impostors = [held_out([0.5], [False], x, "level 0") for x in rng.uniform(0, 1, count)]
+        limit = choose_in_map_limit(impostors)
+        assert limit is not None
+        limits.append(limit)
+    assert 0.03 < np.mean(limits) < 0.055
+
+
+def test_the_limit_is_that_of_the_kind_of_impostors_that_looks_most_like_the_map() -> None:
+    easy = [held_out([0.5], [False], 0.5 + n / 1000, "everything near") for n in range(200)]
+    hard = [held_out([0.5], [False], 0.1 + n / 1000, "level 0") for n in range(19)]
+    assert choose_in_map_limit([*easy, *hard]) == 0.1
+    assert choose_in_map_limit([*easy, *hard[1:]]) == easy[9].not_in_map, "18 give no limit"
+    assert choose_in_map_limit(hard[1:]) is None
+    assert choose_in_map_limit([]) is None
+
+
+def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the_map() -> None:
+    alone = list(sampler(8, 1, 0.1).samples(range(8), 0.5))
+    together = list(sampler(8, 2, 0.1).samples(range(16), 0.5))
+    assert {s.is_alone for s in alone if s.left_out is None} == {True}
+    assert {s.is_alone for s in together if s.left_out is None} == {False}
+    assert not_in_map_table(alone).weights.sum() == 0, "the prior is left as it is"
+    table = not_in_map_table([*alone, *together])
+    assert (table.target == 0).sum() == 16
+
+
 def held_out(
     probabilities: list[float],
     right: list[bool | None],
@@ -406,21 +443,3 @@ def test_labelled_queries_refine_the_model() -> None:
     assert abs(np.mean(refined) - 0.5) < abs(np.mean(sure) - 0.5)
     too_few = fit_place_model(samples, wrong[: MIN_LABELLED_QUERIES - 1], PATHS, 0.5)
     assert too_few.model == before
-
-
-def test_a_calibration_of_an_earlier_release_has_no_probabilities_or_those_of_the_prior(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    stored = {
-        "radius_m": 25.0, "support_threshold": 0.1, "impostors": 30, "labelled_queries": 0,
-        "confidence": None,
-    }  # fmt: skip
-    assert Calibration.model_validate(stored).places is None
-    model = fit_place_model(own_samples(), [], PATHS, 0.5).model
-    places = model.model_dump(mode="json")
-    assert Calibration.model_validate({**stored, "places": places}).places == model
-    earlier = {**places, "version": 1, "thresholds": [{"not_in_map": 0.1, "levels": [0.9, None]}]}
-    for _ in range(2):
-        assert Calibration.model_validate({**stored, "places": earlier}).places == PlaceModel()
-    logged = [r.getMessage() for r in caplog.records if "place models of version 1" in r.message]
-    assert len(logged) == 1
