@@ -35,6 +35,7 @@ POOL_POLL_SECONDS = 1.0  # interval at which a waiting batch checks that the poo
 SCHEDULED_PER_PROCESS = 2
 
 DECODE_TIMEOUT_SECONDS = 30.0
+DECODE_MEMORY_BYTES = 2_000_000_000  # of one process: a JPEG of 200 megapixels takes less
 
 # A process may be killed for other reasons than its photo, so each photo gets a second attempt.
 MAX_DECODE_ATTEMPTS = 2
@@ -45,9 +46,15 @@ Decode = Callable[[bytes], DecodedPhoto]
 class DecoderPool:
     """Decodes photos in parallel processes; results are in the order of the photos."""
 
-    def __init__(self, settings: Settings, timeout_seconds: float = DECODE_TIMEOUT_SECONDS) -> None:
-        """Start the processes; a photo that takes longer than the timeout is refused."""
+    def __init__(
+        self,
+        settings: Settings,
+        timeout_seconds: float = DECODE_TIMEOUT_SECONDS,
+        memory_bytes: int = DECODE_MEMORY_BYTES,
+    ) -> None:
+        """Start the processes; a photo that takes more time or memory is refused."""
         self._settings = settings
+        self._memory_bytes = memory_bytes
         self._timeout_seconds = timeout_seconds
         self._restart_lock = threading.Lock()
         self._pool = self._start_pool()
@@ -95,7 +102,7 @@ class DecoderPool:
             # Forking is not safe in a process with torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
             initializer=limit_memory,
-            initargs=[self._settings.decode_memory_bytes],
+            initargs=[self._memory_bytes],
         )
 
     def _schedule(self, data: bytes, decode: Decode) -> ProcessFuture[DecodedPhoto]:

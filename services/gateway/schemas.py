@@ -218,7 +218,7 @@ class SimilarityResponse(ResponseModel):
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
-        "or the query has no words with weights; `off`: disabled by the request or by WORD_WEIGHTS"
+        "or the query has no words with weights; `off`: disabled by the request"
     )
     generation_id: UUID
     rows: RowType = Field(

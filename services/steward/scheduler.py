@@ -38,7 +38,11 @@ from services.steward.tasks.model_changes import (
     advance_model_changes,
     remove_dead_search_workers,
 )
-from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
+from services.steward.tasks.orphans import (
+    CollectionHeld,
+    collect_orphans,
+    empty_expired_trash,
+)
 from services.steward.tasks.reindex_jobs import QueuedChunks, cancel_jobs_of_abandoned_generations
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.schema import sqlite_file
@@ -207,9 +211,7 @@ class Scheduler:
             PeriodicTask(
                 "evaluate changed maps",
                 2.0,
-                lambda: evaluate_changed_maps(
-                    catalog, settings.auto_evaluate_photos, settings.word_weights
-                ),
+                lambda: evaluate_changed_maps(catalog, settings.auto_evaluate_photos),
             ),
             PeriodicTask(
                 "collect orphans",
@@ -284,9 +286,7 @@ def _collect_orphans(
 ) -> None:
     """Move orphans to the trash and delete expired trash, unless collection is held."""
     try:
-        moved = collect_orphans(
-            catalog, store, settings.orphan_age_seconds, max_share=settings.collect_max_share
-        )
+        moved = collect_orphans(catalog, store, settings.orphan_age_seconds)
     except CollectionHeld as error:
         metrics.collection_held.set(1)
         log.error("orphan collection is held: %s", error.detail)

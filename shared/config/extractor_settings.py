@@ -8,7 +8,6 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.values import Size
 from shared.errors import Misconfigured
 from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
 from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
@@ -69,9 +68,6 @@ class ExtractorSettings(BaseSettings):
     )
     batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
     decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
-    decode_memory_bytes: Size = Field(
-        2_000_000_000, ge=500_000_000, description="memory limit of one decoding process, bytes"
-    )
     batch_ahead_photos: int = Field(
         500, ge=1, description="queued photos at which batch uploads wait for the extractors"
     )

@@ -16,27 +16,16 @@ from shared.config.values import Size, split_list
 class SearchSettings(BaseSettings):
     """How search workers follow the catalog, share the rows among them and rank results."""
 
-    estimate_radius_m: float = Field(
-        25.0,
-        gt=0,
-        description="distance to the true position within which an estimate counts as correct, "
-        "metres",
-    )
     estimate_radii_m: str = Field(
         "25,100,500,2000",
         description="radii of the levels of an estimate by coordinates, metres, separated by "
-        "commas",
+        "commas; photos within the first one show the same place",
     )
     certainty: float = Field(
         0.95,
         gt=0,
         le=1,
         description="share of the answers that must be right, unless a search has `certainty`",
-    )
-    word_weights: bool = Field(
-        True,
-        description="rank by visual word weights where a map has them, and learn them for maps "
-        "with a vocabulary of their own",
     )
     search_wait_seconds: float = Field(
         5.0, gt=0, description="maximum wait for `min_version`, seconds"
@@ -98,6 +87,11 @@ class SearchSettings(BaseSettings):
     def level_radii_m(self) -> tuple[float, ...]:
         """The radii of the levels of an estimate in metres, ascending."""
         return tuple(sorted({float(radius) for radius in split_list(self.estimate_radii_m)}))
+
+    @property
+    def estimate_radius_m(self) -> float:
+        """Distance to the true position within which an estimate counts as correct, in metres."""
+        return self.level_radii_m[0]
 
     @property
     def shard(self) -> Shard:

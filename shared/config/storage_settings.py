@@ -72,13 +72,6 @@ class StorageSettings(BaseSettings):
         description="days after which an orphan in the trash is deleted; earlier when the disk is "
         "nearly full",
     )
-    collect_max_share: float = Field(
-        0.1,
-        ge=0,
-        le=1,
-        description="maximum share of orphans among all objects; above it (and above 100 orphans), "
-        "none is moved to the trash before `placewise storage collect --confirm`",
-    )
 
     @field_validator("placewise_home", "upload_dir")
     @classmethod

@@ -119,8 +119,8 @@ def decode_photo(
     except MemoryError as error:
         raise Unprocessable(
             "undecodable_photo",
-            "Decoding the photo needs more memory than the limit for one photo "
-            "(DECODE_MEMORY_BYTES). Send a smaller photo, or a JPEG.",
+            "Decoding the photo needs more memory than the limit for one photo. "
+            "Send a smaller photo, or a JPEG.",
         ) from error
 
 

@@ -88,7 +88,7 @@ class HoldReason(StrEnum):
     """Why garbage collection is suspended."""
 
     SHARE = "share"
-    """More than COLLECT_MAX_SHARE of all objects are orphans."""
+    """More than MAX_ORPHAN_SHARE of all objects are orphans."""
     ADOPTED = "adopted"
     """A catalog adopted the store without knowing some of its objects."""
     CATALOG_BEHIND = "catalog_behind"
@@ -108,7 +108,7 @@ class Hold:
     def describe(self) -> str:
         """Return sentences for the operator: what happened, why, and what to do."""
         why = {
-            HoldReason.SHARE: "they are a larger share than COLLECT_MAX_SHARE allows",
+            HoldReason.SHARE: "they are more than a tenth of all objects",
             HoldReason.ADOPTED: "this catalog adopted the store without knowing them",
             HoldReason.CATALOG_BEHIND: "the catalog is older than the store",
         }[self.reason]

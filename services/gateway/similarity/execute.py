@@ -37,7 +37,6 @@ from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.maps import Map, Search, get_map, map_not_found_error
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
-from shared.config.settings import Settings
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
@@ -78,12 +77,9 @@ class _RankingWeights:
         return not hits or hits[0].weighted_score is not None
 
 
-def select_ranking_weights(
-    generation: Generation, enabled: bool, settings: Settings
-) -> _RankingWeights:
-    """Select the word weights of the generation, unless the request or a setting disables them."""
+def select_ranking_weights(generation: Generation, enabled: bool) -> _RankingWeights:
+    """Select the word weights of the generation, unless the request disables them."""
     record = parse_word_weights(generation.word_weights)
-    enabled = enabled and settings.word_weights
     return _RankingWeights(generation, record, record.applied if record and enabled else ())
 
 
@@ -241,7 +237,7 @@ def run_similarity_search(
     that are not cached, and for `min_score` with word weights.
     """
     started = time.perf_counter()
-    weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
+    weights = select_ranking_weights(query.generation, search_params.word_weights)
     search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
     depth = max(search_params.top_k, search_params.rerank or 0)
     # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
@@ -380,7 +376,7 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
 
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
     """Return the first `k` live photos of the map, most similar first, without an estimate."""
-    weights = select_ranking_weights(query.generation, True, gateway.settings)
+    weights = select_ranking_weights(query.generation, True)
     return _search_live_photos(
         gateway, query, SearchParams(), NO_FILTER, k, weights=weights.values
     ).hits

@@ -31,24 +31,20 @@ DueJob = tuple[JobKind, dict[str, Any]]
 """Kind and params of an evaluation or word-weight job that a map needs now."""
 
 
-def evaluate_changed_maps(catalog: Catalog, min_photos: int, word_weights: bool) -> None:
+def evaluate_changed_maps(catalog: Catalog, min_photos: int) -> None:
     """Queue an evaluation for each idle map that has changed enough since its last one.
 
     Maps with fewer geotagged photos than `min_photos` are skipped; 0 turns automatic evaluation
-    off. With `word_weights`, these are fitted, too, once the evaluation is up to date.
+    off. Word weights are fitted once the evaluation is up to date.
     """
     if not min_photos:
         return
     with catalog.read() as session:
-        due = [
-            map_.id
-            for map_ in list_maps(session)
-            if _due_job(session, map_.id, min_photos, word_weights)
-        ]
+        due = [map_.id for map_ in list_maps(session) if _due_job(session, map_.id, min_photos)]
     for map_id in due:
         with catalog.write() as session:
             lock_map(session, map_id)
-            due_job = _due_job(session, map_id, min_photos, word_weights)
+            due_job = _due_job(session, map_id, min_photos)
             if due_job is None:
                 continue  # another steward has queued it
             kind, params = due_job
@@ -57,7 +53,7 @@ def evaluate_changed_maps(catalog: Catalog, min_photos: int, word_weights: bool)
             session.add(job)
 
 
-def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool) -> DueJob | None:
+def _due_job(session: Session, map_id: UUID, min_photos: int) -> DueJob | None:
     """Return the job that the map needs now, if any."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
@@ -84,7 +80,7 @@ def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool
         or _levels_changed(session, generation)
     ):
         return JobKind.EVALUATE, params
-    if not word_weights or not _has_own_vocabulary(session, generation):
+    if not _has_own_vocabulary(session, generation):
         return None
     weighted_count = _last_weighted_count(session, generation)
     if weighted_count is None or _changed_enough(searchable, weighted_count):

@@ -66,6 +66,7 @@ log = logging.getLogger(__name__)
 
 OBJECTS_PER_LOOKUP = 500  # keys looked up in one query
 MAX_REMEMBERED_ORPHANS = 10_000  # with more, the store is walked a second time to move the rest
+MAX_ORPHAN_SHARE = 0.1  # of all objects; a larger one is held until it is confirmed
 HOLD_MIN_ORPHANS = 100  # so few are never held: in a small store they are a large share
 
 
@@ -93,7 +94,6 @@ def collect_orphans(
     store: OwnedStore,
     age_seconds: float,
     *,
-    max_share: float = 1.0,
     confirmed: bool = False,
 ) -> int:
     """Move objects that no catalog row refers to to the trash.
@@ -102,8 +102,6 @@ def collect_orphans(
         catalog: The catalog that refers to the objects.
         store: The catalog's object store.
         age_seconds: Younger objects stay, because their rows may not be committed yet.
-        max_share: Largest share of all objects that may be moved without a confirmation. Up to
-            HOLD_MIN_ORPHANS orphans are moved in any case.
         confirmed: Move the orphans also where collection would be held. Also ends the lag of a
             catalog that is older than its store: the objects that only newer catalogs knew are in
             the trash then, and the journal continues.
@@ -114,7 +112,7 @@ def collect_orphans(
     Raises:
         CollectionHeld: Nothing was moved, because the catalog is older than its store, because it
             adopted a store whose objects it does not know, or because the orphans exceed
-            `max_share`. A note in the store records the hold.
+            MAX_ORPHAN_SHARE of all objects. A note in the store records the hold.
     """
     count, first_orphans = StoreCount(), list[ObjectInfo]()
     for info in find_orphans(catalog, store, age_seconds, count):
@@ -127,7 +125,7 @@ def collect_orphans(
             reason = HoldReason.ADOPTED
         elif catalog_lag(catalog, store) is not None:
             reason = HoldReason.CATALOG_BEHIND
-        elif orphans > max(HOLD_MIN_ORPHANS, max_share * count.objects):
+        elif orphans > max(HOLD_MIN_ORPHANS, MAX_ORPHAN_SHARE * count.objects):
             reason = HoldReason.SHARE
         if reason is not None:
             hold = Hold(reason, orphans, count.orphan_bytes.total(), count.objects)

@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from services.extractor.decoder_pool import (
+    DECODE_MEMORY_BYTES,
     DECODE_TIMEOUT_SECONDS,
     MAX_DECODE_ATTEMPTS,
     SCHEDULED_PER_PROCESS,
@@ -62,10 +63,13 @@ POISONED = Poisoned(
 
 @contextlib.contextmanager
 def pool_with(
-    settings: Settings, timeout_seconds: float = DECODE_TIMEOUT_SECONDS, **changes: Any
+    settings: Settings,
+    timeout_seconds: float = DECODE_TIMEOUT_SECONDS,
+    memory_bytes: int = DECODE_MEMORY_BYTES,
+    **changes: Any,
 ) -> Iterator[DecoderPool]:
     changed = settings.model_copy(update={"decode_processes": 1, **changes})
-    pool = DecoderPool(changed, timeout_seconds)
+    pool = DecoderPool(changed, timeout_seconds, memory_bytes)
     try:
         yield pool
     finally:
@@ -117,7 +121,6 @@ def test_a_jpeg_of_200_megapixels_is_decoded_within_the_memory_limit(
     with pool_with(
         settings,
         max_image_pixels=limits["max_image_pixels"].default,
-        decode_memory_bytes=limits["decode_memory_bytes"].default,
         timeout_seconds=500.0,
     ) as pool:
         buffer = io.BytesIO()
@@ -129,7 +132,7 @@ def test_a_jpeg_of_200_megapixels_is_decoded_within_the_memory_limit(
         peak_kib = int(
             in_child(pool, "open('/proc/self/status').read()").split("VmHWM:")[1].split()[0]
         )
-    assert 1024 * peak_kib < limits["decode_memory_bytes"].default
+    assert 1024 * peak_kib < DECODE_MEMORY_BYTES
 
 
 def test_photos_are_read_as_they_are_decoded(
@@ -191,7 +194,7 @@ def test_photo_of_allowed_size_but_too_large_for_the_memory_is_refused(
 ) -> None:
     buffer = io.BytesIO()
     Image.new("L", (7000, 7000)).save(buffer, "PNG", compress_level=1)
-    with pool_with(settings, decode_memory_bytes=250_000_000) as pool:
+    with pool_with(settings, memory_bytes=250_000_000) as pool:
         large, small = pool.decode([buffer.getvalue(), GOOD], SQUARE)
     assert "memory" in refusal(large)
     assert is_good(small)

@@ -39,7 +39,7 @@ def automatic(town: Town, least_photos: int = LEAST) -> bool:
     """Whether the steward queues an evaluation now; it is done at once."""
     before = len(town.evaluation_jobs())
     for _ in range(2):  # the second time there is always one under way
-        evaluate_changed_maps(town.catalog, least_photos, word_weights=True)
+        evaluate_changed_maps(town.catalog, least_photos)
     jobs = town.evaluation_jobs()[before:]
     assert len(jobs) <= 1
     if jobs:
@@ -121,13 +121,13 @@ def test_an_evaluation_that_came_to_nothing_is_not_tried_again_before_the_next_c
         assert automatic(town)
         town.publish([(100 + n, at(40 + n)) for n in range(LEAST)])
     done = len(town.evaluation_jobs())
-    evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
+    evaluate_changed_maps(town.catalog, LEAST)
     job = town.evaluation_jobs()[-1]
     with town.catalog.write() as session:
         mine = get_job(session, town.map_id, job.id, lock=True)
         cancel_job(mine) if end == "is cancelled" else fail_job(mine, {"code": "out_of_luck"})
     for _ in range(3):
-        evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
+        evaluate_changed_maps(town.catalog, LEAST)
     assert len(town.evaluation_jobs()) == done + 1
     town.publish([(200 + n, at(-40 + n)) for n in range(2 * LEAST)])
     assert automatic(town)
@@ -155,7 +155,7 @@ def test_two_stewards_queue_one_evaluation(town: Town) -> None:
     def look() -> None:
         together.wait()
         for _ in range(3):
-            evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
+            evaluate_changed_maps(town.catalog, LEAST)
 
     with ThreadPoolExecutor(4) as pool:
         for look_ in [pool.submit(look) for _ in range(4)]:

@@ -13,6 +13,7 @@ from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
 from services.steward.tasks import orphans as orphans_module
 from services.steward.tasks.orphans import (
+    MAX_ORPHAN_SHARE,
     CollectionHeld,
     collect_orphans,
     empty_expired_trash,
@@ -144,8 +145,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     metrics = StewardMetrics(CollectorRegistry())
     steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings, metrics)
     (duty,) = [duty for duty in steward.tasks if duty.name == "collect orphans"]
-    share = settings.collect_max_share
-    assert share * len(live | orphans) < 4
+    assert MAX_ORPHAN_SHARE * len(live | orphans) < 4
 
     duty.run()
     assert chunk_map.objects() == live | orphans
@@ -157,7 +157,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     assert hold is not None
     assert (hold.reason, hold.orphans, hold.orphan_bytes) == (HoldReason.SHARE, 4, 24)
     with pytest.raises(CollectionHeld):
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=share)
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
 
     assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 4
     assert chunk_map.objects() == live
@@ -178,9 +178,9 @@ def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
     chunk_map.age({key}, 2 * DAY_SECONDS)
     chunk_map.change(Photo, photo_id, object_key="originals/other")
     with pytest.raises(CollectionHeld):
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=0.1)
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
     chunk_map.change(Photo, photo_id, object_key=key)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, max_share=0.1) == 0
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
     assert read_hold(chunk_map.store) is None
 
 

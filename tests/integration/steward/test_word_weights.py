@@ -271,9 +271,9 @@ def small_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(auto_evaluate, "AUTO_SAMPLE_PHOTOS", TRIED)
 
 
-def queued(city: City, word_weights: bool = True) -> str | None:
+def queued(city: City) -> str | None:
     """The kind of job that the steward queues now; it is done at once."""
-    evaluate_changed_maps(city.catalog, 20, word_weights)
+    evaluate_changed_maps(city.catalog, 20)
     with city.catalog.read() as session:
         job = session.query(Job).filter(Job.state == JobState.QUEUED).one_or_none()
     if job is None:
@@ -289,7 +289,6 @@ def test_weights_are_learnt_by_themselves_after_the_evaluation_and_when_the_map_
 ) -> None:
     city.publish(rows_of_places(40, 3, reported=True), street(40))
     assert queued(city) == JobKind.EVALUATE
-    assert queued(city, word_weights=False) is None
     assert queued(city) == JobKind.WORD_WEIGHTS
     assert queued(city) is None
     more = [{**spot, "longitude": 8.0} for spot in street(20)]

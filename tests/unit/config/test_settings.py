@@ -87,7 +87,6 @@ def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) 
         ("DEVICE", "tpu"),
         ("LEASE_SECONDS", "-1"),
         ("BATCH_PHOTOS", "many"),
-        ("DECODE_MEMORY_BYTES", "1000"),
         ("MAX_QUEUED_JOBS", "0"),
         ("MAX_CONCURRENT_UPLOADS", "0"),
         ("MIN_FREE_BYTES", "-1"),

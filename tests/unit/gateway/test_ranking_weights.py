@@ -8,7 +8,6 @@ import pytest
 
 from services.gateway.similarity.execute import select_ranking_weights
 from shared.catalog.generations import Generation
-from shared.config.settings import Settings
 from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.search_api.protocol import SearchHit
@@ -42,30 +41,27 @@ def generation(outcome: Outcome | None) -> Generation:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "expected", "setting", "first", "state", "limit"),
+    ("outcome", "expected", "first", "state", "limit"),
     [
-        (Outcome.KEPT, True, True, WEIGHTED, "applied", 0.2),
-        (Outcome.KEPT, True, True, None, "applied", 0.2),
-        (Outcome.KEPT, True, True, PLAIN, "none", 0.1),  # the query has none of the words
-        (Outcome.KEPT, False, True, PLAIN, "off", 0.1),
-        (Outcome.KEPT, True, False, PLAIN, "off", 0.1),
-        (Outcome.NOT_KEPT, True, True, PLAIN, "none", 0.1),
-        (Outcome.NOT_KEPT, False, True, PLAIN, "none", 0.1),
-        (None, True, True, PLAIN, "none", 0.1),
+        (Outcome.KEPT, True, WEIGHTED, "applied", 0.2),
+        (Outcome.KEPT, True, None, "applied", 0.2),
+        (Outcome.KEPT, True, PLAIN, "none", 0.1),  # the query has none of the words
+        (Outcome.KEPT, False, PLAIN, "off", 0.1),
+        (Outcome.NOT_KEPT, True, PLAIN, "none", 0.1),
+        (Outcome.NOT_KEPT, False, PLAIN, "none", 0.1),
+        (None, True, PLAIN, "none", 0.1),
     ],
 )
 def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
     outcome: Outcome | None,
     expected: bool,
-    setting: bool,
     first: SearchHit | None,
     state: str,
     limit: float,
 ) -> None:
-    settings = Settings(_env_file=None).model_copy(update={"word_weights": setting})
-    chosen = select_ranking_weights(generation(outcome), expected, settings)
+    chosen = select_ranking_weights(generation(outcome), expected)
     hits = [first] if first else []
-    assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and expected and setting else ())
+    assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and expected else ())
     assert chosen.state(hits) == state
     judged_by = chosen.calibration(hits)
     assert judged_by is not None
