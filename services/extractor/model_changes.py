@@ -181,8 +181,7 @@ class VocabularyFitJob:
             photos=params["described"],
             seed=params["seed"],
         )
-        # A fit that the previous release has planned does not have the parameter.
-        provenance["provisional"] = params.get("provisional", False)
+        provenance["provisional"] = params["provisional"]
         start_generation_with_new_vocabulary(
             self.catalog,
             self.store,

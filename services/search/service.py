@@ -71,7 +71,7 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     def search(request: SearchRequest) -> Response:
         """Search this shard for the rows that are most similar to the referenced one."""
         # Serialised here, because FastAPI would validate the response again.
-        return Response(metrics.search(request).as_json(), media_type="application/json")
+        return Response(metrics.search(request).model_dump_json(), media_type="application/json")
 
     # Async like the probes, so that it answers while all threads of the pool are searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)

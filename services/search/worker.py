@@ -39,7 +39,6 @@ from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
-    BACKGROUND_FEATURE,
     RowReference,
     SearchRequest,
     SearchResponse,
@@ -274,7 +273,6 @@ class SearchWorker:
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.replication_lag.current_lags(versions),
             devices=self._residency.status(snapshots.values()),
-            features=(BACKGROUND_FEATURE,),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:

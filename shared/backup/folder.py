@@ -29,7 +29,6 @@ from shared.catalog.database.base import Base, from_json, to_json
 from shared.catalog.installation import Installation
 from shared.catalog.photos import PresignedUpload
 from shared.catalog.processes import RegisteredProcess, RegisteredSearchWorker
-from shared.catalog.tables import SchemaCompatibility
 from shared.config.private_files import FILE_MODE, FOLDER_MODE, make_private_folder, write_private
 from shared.errors import Conflict, Misconfigured
 from shared.storage import ObjectStore
@@ -245,8 +244,7 @@ GZIP_LEVEL = 1  # reduces rows to a fifth, and is faster than the disk
 
 # Not backed up: running processes, presigned uploads that expire, the schema's compatibility.
 EXCLUDED_TABLES = frozenset(
-    table.__tablename__
-    for table in (RegisteredSearchWorker, RegisteredProcess, PresignedUpload, SchemaCompatibility)
+    table.__tablename__ for table in (RegisteredSearchWorker, RegisteredProcess, PresignedUpload)
 )
 # The target has its own row (`shared.backup.restore`).
 NOT_RESTORED_TABLES = frozenset({Installation.__tablename__})

@@ -1,13 +1,8 @@
-"""Imports every table, for Alembic and for foreign keys, and opens the configured catalog.
-
-Also the table of the schema's compatibility with older releases, written by migrations.
-"""
+"""Imports every table, for the schema and for foreign keys, and opens the configured catalog."""
 
 from __future__ import annotations
 
-from sqlalchemy import String
 from sqlalchemy.exc import ArgumentError
-from sqlalchemy.orm import Mapped, mapped_column
 
 # A foreign key may refer to a table whose module a service does not import itself.
 from shared.catalog import (  # noqa: F401
@@ -26,7 +21,6 @@ from shared.catalog import (  # noqa: F401
     vocabularies,
     webhooks,
 )
-from shared.catalog.database.base import Base
 from shared.catalog.database.session import (
     BACKGROUND_TIMEOUTS,
     Catalog,
@@ -35,14 +29,6 @@ from shared.catalog.database.session import (
 )
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-
-
-class SchemaCompatibility(Base):
-    """The single row has the oldest revision whose release works with the current schema."""
-
-    __tablename__ = "schema_compatibility"
-
-    understood_from: Mapped[str] = mapped_column(String(32), primary_key=True)
 
 
 def open_catalog(

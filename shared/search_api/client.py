@@ -23,7 +23,6 @@ from shared.config.settings import Settings
 from shared.config.shards import Shard
 from shared.errors import Misconfigured, Unavailable
 from shared.search_api.protocol import (
-    BACKGROUND_FEATURE,
     CERTIFICATES,
     NONE,
     SearchHit,
@@ -181,9 +180,6 @@ class HttpSearchClient:
         if not layout:  # no worker has answered yet
             self._workers.refresh()
             layout = self._workers.layout(request.generation_id, request.min_version)
-        if request.background and not self._workers.all_know(BACKGROUND_FEATURE):
-            # All shards rank by the same query, so that their scores can be merged.
-            request = request.model_copy(update={"background": ()})
         calls = {
             shard: self._submit_call(shard, urls, request, deadline)
             for shard, urls in layout.items()

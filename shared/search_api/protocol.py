@@ -4,10 +4,6 @@ A query is a reference to one descriptor row in the object store, never the vect
 vector passes through the gateway. `SearchBackend` is implemented in process by
 `services.search.worker.SearchWorker`, and over HTTP by `shared.search_api.client.HttpSearchClient`,
 which spreads a map's slots over shards.
-
-Messages are serialised without fields that have their default value (`as_json`), so that a worker
-of the previous release accepts every request that uses none of the new fields. A field that the
-gateway uses on its own account is sent only to workers that list it in `SearchStatus.features`.
 """
 
 from __future__ import annotations
@@ -24,8 +20,6 @@ from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 STATISTICAL = "statistical"  # no other row can be among them, but with odds of about 1 in 10^8
 NONE = "none"  # a part of the map is missing: better rows may exist
-BACKGROUND_FEATURE = "background"
-"""Feature of workers that know `SearchRequest.background`."""
 
 CERTIFICATES = (EXHAUSTIVE, STATISTICAL, NONE)
 """Guarantees of a result's completeness, strongest first."""
@@ -41,10 +35,6 @@ class Mode(StrEnum):
 class _Message(BaseModel):
     # Unknown fields of a response are ignored: a newer worker may add some.
     model_config = ConfigDict(frozen=True)
-
-    def as_json(self) -> str:
-        """Serialise without default values, so that a peer needs to know only the fields in use."""
-        return self.model_dump_json(exclude_defaults=True)
 
 
 class RowReference(_Message):
@@ -70,8 +60,7 @@ class SearchRequest(_Message):
 
     The mean of the rows of `background` is subtracted from the query first
     (`shared.search_api.background`); scores are the cosines to what is left. Rows that no longer
-    exist are left out of the mean. While a worker of a release without BACKGROUND_FEATURE runs,
-    `HttpSearchClient` leaves the background out, as for the first frame of a track.
+    exist are left out of the mean.
     """
 
     # Unknown fields of a request are refused: ignoring a filter would give a wrong result.
@@ -185,8 +174,6 @@ class SearchStatus(_Message):
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
     devices: tuple[DeviceStatus, ...] = ()
     """GPUs in use; empty where the CPU searches everything."""
-    features: tuple[str, ...] = ()
-    """Optional fields of a request that the worker knows; () for several workers together."""
     away: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 

@@ -52,7 +52,7 @@ def call_search(
         WorkerUnavailable: The worker could not be reached, or failed.
         PlacewiseError: As the worker answered it.
     """
-    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.as_json())
+    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.model_dump_json())
     return _read(SearchResponse, url, body)
 
 
@@ -186,13 +186,6 @@ class WorkerDirectory:
                 shard: [w.url for w in order if w.shard == shard and not w.silent]
                 for shard in _shards_of(best)
             }
-
-    def all_know(self, feature: str) -> bool:
-        """Return whether every worker that has ever answered lists the feature."""
-        with self._lock:
-            return all(
-                feature in worker.status.features for worker in self._workers if worker.status
-            )
 
     def statuses(self) -> tuple[dict[Shard, SearchStatus], list[Shard]]:
         """Return the state of each shard's most advanced worker, and the shards without one."""

@@ -38,8 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 class _Frozen(BaseModel):
-    # Stored evidence of an earlier release has fields that are not used any more.
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Hit(_Frozen):

@@ -15,7 +15,7 @@ from shared.catalog.database.base import Base
 from tests.support.servers import PostgresServer
 
 # What migrations have written, and no test changes but in a database of its own.
-KEPT = {"alembic_version", "schema_compatibility"}
+KEPT = {"alembic_version"}
 LEAVE_SECONDS = 0.5  # a closed connection is gone a moment later
 LOCK_TIMEOUT = "SET lock_timeout = '1s'"
 OTHERS = """SELECT count(*) FROM pg_stat_activity
@@ -30,8 +30,7 @@ SHAPE = """SELECT
     (SELECT count(*) FROM pg_trigger),
     (SELECT string_agg(setconfig::text, ',') FROM pg_db_role_setting s
         JOIN pg_database d ON d.oid = s.setdatabase WHERE d.datname = current_database()),
-    (SELECT string_agg(version_num, ',') FROM alembic_version),
-    (SELECT string_agg(s::text, ',') FROM schema_compatibility s)"""
+    (SELECT string_agg(version_num, ',') FROM alembic_version)"""
 
 
 class SpareDatabases:

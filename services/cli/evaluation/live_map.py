@@ -83,8 +83,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
     for evaluation in evaluations:
         figures = evaluation.figures
         rows = _recall_rows(figures)
-        # Evaluations of earlier releases have no `with_word_weights`.
-        if weighted := figures.get("with_word_weights"):
+        if weighted := figures["with_word_weights"]:
             rows += [(f"{kind}, word weights", recall) for kind, recall in _recall_rows(weighted)]
         for kind, recall in rows:
             table.add_row(
@@ -96,10 +95,10 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
             )
     print_table(table)
     figures = evaluations[0].figures
-    # Evaluations of earlier releases have no `places`.
-    if places := (figures.get("with_word_weights") or figures).get("places"):
+    used = figures["with_word_weights"] or figures
+    if places := used["places"]:
         print_table(answers_table(places))
-    for line in _estimate_lines(figures.get("with_word_weights") or figures):
+    for line in _estimate_lines(used):
         print_message(line)
 
 
@@ -155,10 +154,10 @@ def _format_share(figure: Json) -> str:
 
 
 def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
-    rows = [("own photos", figures["leave_one_out"])]
-    # Evaluations of earlier releases have no `leave_one_out_without_sequence`.
-    if without_sequence := figures.get("leave_one_out_without_sequence"):
-        rows.append(("without sequence", without_sequence))
+    rows = [
+        ("own photos", figures["leave_one_out"]),
+        ("without sequence", figures["leave_one_out_without_sequence"]),
+    ]
     if figures["labelled_queries"]:
         rows.append(("labelled queries", figures["labelled_queries"]))
     return rows

@@ -284,12 +284,12 @@ def steward() -> None:
 
 
 def migrate() -> None:
-    """Migrate the catalog's schema (DATABASE_URL) to this release.
+    """Create the catalog's tables in an empty database (DATABASE_URL).
 
-    Run it once per release, before the new services start. Services of the previous release keep
-    working during the migration.
+    Run it before the services start. It changes nothing where they exist, and refuses the tables of
+    another version.
     """
     from services.service_process import migrate_catalog
 
     installation_id = migrate_catalog(read_settings())
-    print_note(f"The catalog's schema is up to date (installation {installation_id})")
+    print_note(f"The catalog has its tables (installation {installation_id})")

@@ -57,6 +57,5 @@ def describe_query_job(
 
 
 def query_job_search_params(job: Job) -> SearchParams:
-    """The parameters that `describe_query_job` has stored, also under their name before 0.1.0."""
-    stored = job.params.get("search_params") or job.params["wanted"]
-    return SearchParams.model_validate(stored)
+    """Return the parameters that `describe_query_job` has stored."""
+    return SearchParams.model_validate(job.params["search_params"])

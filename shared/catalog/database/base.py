@@ -65,7 +65,7 @@ JsonValue = sa.JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "p
 
 
 class Base(DeclarativeBase):
-    """Declarative base of all tables; constraints get fixed names, which migrations refer to."""
+    """Declarative base of all tables; constraints get fixed names."""
 
     metadata = sa.MetaData(
         naming_convention={
@@ -117,8 +117,8 @@ class json_array_has_part(FunctionElement[bool]):
 class filename_trigrams(FunctionElement[Any]):
     """The case-folded trigrams of a text, for an index that serves substring searches.
 
-    PostgreSQL only. A migration creates the SQL function, so that the extension pg_trgm is not
-    required.
+    PostgreSQL only. The SQL function is created with the tables, so that the extension pg_trgm is
+    not required.
     """
 
     type = ARRAY(Text())
@@ -188,6 +188,19 @@ def _json_array_has_part_sqlite(element: json_array_has_part, compiler: Any, **k
         f"EXISTS (SELECT 1 FROM json_each({array}) WHERE "  # noqa: S608  (compiled SQL, no text of users)
         f"instr(lower(json_each.value), lower({part})) > 0)"
     )
+
+
+sa.event.listen(
+    Base.metadata,
+    "before_create",
+    sa.DDL(  # type: ignore[no-untyped-call]
+        "CREATE OR REPLACE FUNCTION placewise_trigrams(text) RETURNS text[] "
+        "LANGUAGE sql IMMUTABLE STRICT PARALLEL SAFE AS $$"
+        "SELECT array_agg(substr(lower($1), i, 3))"
+        " FROM generate_series(1, length(lower($1)) - 2) AS i"
+        "$$"
+    ).execute_if(dialect="postgresql"),
+)
 
 
 @compiles(filename_trigrams)

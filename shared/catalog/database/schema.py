@@ -1,8 +1,9 @@
-"""Schema migrations while services run, and the check that a release fits the schema.
+"""Creation of the catalog's tables, and the check that they are those of this version.
 
-`placewise migrate` runs once per release, before its services start; the embedded Placewise
-migrates at startup. Services only check the schema (`wait_for_schema`). The rules for migrations
-are in docs/how-to/postgresql.md.
+`placewise migrate` creates them before the services start; the embedded Placewise does at startup.
+Services only check them (`wait_for_schema`). Versions before the first release do not read each
+other's catalogs: a catalog of another one is refused, and `placewise rebuild-catalog` creates a new
+one from the object store.
 
 Errors of an SQLite file while a process starts name the file, the cause and the remedies
 (`opening`).
@@ -11,28 +12,26 @@ Errors of an SQLite file while a process starts name the file, the cause and the
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import os
-import random
 import shutil
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from sqlalchemy import Connection, inspect, text
-from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.dialects import postgresql
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
 
-from shared.catalog.database.errors import (
-    DAMAGED,
-    explain_outage,
-    get_sqlstate,
-    is_permanent,
-    reason_of,
-)
+from shared.catalog.database.base import Base
+from shared.catalog.database.errors import DAMAGED, explain_outage, is_permanent, reason_of
 from shared.catalog.database.session import Catalog, TransactionTimeouts
 from shared.config.disk_space import RELEASE_BELOW_BYTES
 from shared.config.private_files import FILE_MODE, make_private_folder
-from shared.errors import Misconfigured, PlacewiseError, Unavailable
+from shared.errors import Misconfigured, PlacewiseError
 
 log = logging.getLogger(__name__)
 
@@ -40,29 +39,18 @@ MIGRATIONS = Path(__file__).parent.parent / "migrations"
 MIN_POSTGRES_VERSION = (14,)
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
-# While a migration waits for a table's exclusive lock, all later statements on the table wait, too:
-# its lock timeout has to be shorter than that of requests. A statement that has its lock may take
-# any time.
-MIGRATION_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=1.0)
-LOCK_NOT_AVAILABLE = "55P03"
-DEADLOCK = "40P01"
-MIGRATION_TIMEOUT_SECONDS = 300.0
-LOCK_RETRY_SECONDS = 1.0
+# Only other processes that create the tables are waited for.
+MIGRATION_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=60.0)
+VERSION_TABLE = "alembic_version"
 SCHEMA_POLL_SECONDS = 0.5
 
 
-def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS) -> None:
-    """Migrate the schema to this release's; safe to run from several processes, while others serve.
-
-    On PostgreSQL each migration is a transaction of its own, with a lock timeout of one second
-    after which it is retried, so that traffic continues.
-
-    Args:
-        timeout_seconds: Time after which a migration that can't get a lock is not retried.
+def migrate(catalog: Catalog) -> None:
+    """Create the tables in an empty database; safe to run from several processes at once.
 
     Raises:
-        Unavailable: `catalog_unavailable`, or `catalog_busy` after `timeout_seconds`.
-        Misconfigured: As `opening` raises, for an SQLite file that can't be used;
+        Unavailable: `catalog_unavailable`, or `catalog_busy` if another process does not finish.
+        Misconfigured: As `opening` raises, for an SQLite file that can't be used; `schema_differs`;
             `postgres_too_old`.
     """
     try:
@@ -72,7 +60,7 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
                 _migrate_sqlite(catalog)
         else:
             _check_postgres_version(catalog)
-            _migrate_postgres(catalog, time.monotonic() + timeout_seconds)
+            _migrate_postgres(catalog)
     except SQLAlchemyError as error:
         unavailable = explain_outage(error)
         if unavailable is None:
@@ -81,45 +69,28 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
 
 
 def check_schema(catalog: Catalog) -> None:
-    """Check that this release can work with the catalog's schema.
+    """Check that the catalog has the tables of this version.
 
     Raises:
-        Misconfigured: `schema_outdated`: the schema is older than this release needs.
-            `schema_too_new`: a later release has changed it incompatibly; additions are compatible.
+        Misconfigured: `schema_missing`: the database is empty. `schema_differs`: another version
+            created the tables.
     """
-    known = _known_revisions()
-    head = known[-1]
-    present, understood_from = _read_schema_revision(catalog)
-    if present == head:
-        return
-    if present is None or present in known:
-        raise Misconfigured(
-            "schema_outdated",
-            f"The catalog's schema is {present or 'missing'}, but this release needs {head}. "
-            "Run `placewise migrate` once.",
-            present=present,
-            needed=head,
-        )
-    if understood_from not in known:
-        raise Misconfigured(
-            "schema_too_new",
-            f"The catalog's schema is {present}, which requires a release with schema "
-            f"{understood_from} or later; this one has {head}. Start the newer release.",
-            present=present,
-            needed=head,
-        )
-    log.info("the catalog's schema is %s, newer than this release's %s", present, head)
+    with catalog.read() as session:
+        if not _is_current(catalog, session.connection()):
+            raise Misconfigured(
+                "schema_missing", "The catalog has no tables. Run `placewise migrate` once."
+            )
 
 
 def wait_for_schema(catalog: Catalog, seconds: float) -> None:
-    """Wait until the catalog is reachable and has a schema that this release can work with.
+    """Wait until the catalog is reachable and has the tables of this version.
 
-    An SQLite catalog, which only processes of one machine share, is migrated instead.
+    In an SQLite catalog, which only processes of one machine share, they are created instead.
 
     Raises:
         Unavailable: The catalog is not reachable after `seconds`; at once if that will not change,
             as after a wrong password.
-        Misconfigured: As `check_schema` raises, after `seconds`; `schema_too_new` at once.
+        Misconfigured: As `check_schema` raises, after `seconds`; `schema_differs` at once.
     """
     if catalog.is_sqlite:
         migrate(catalog)
@@ -131,10 +102,10 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
             return
         except (Misconfigured, SQLAlchemyError) as error:
             reason = explain_outage(error) or error
-            too_new = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
+            differs = isinstance(reason, Misconfigured) and reason.code == "schema_differs"
             if not isinstance(reason, PlacewiseError):
                 raise
-            if too_new or is_permanent(error) or time.monotonic() > deadline:
+            if differs or is_permanent(error) or time.monotonic() > deadline:
                 raise reason from error
             if not has_warned:
                 has_warned = True
@@ -142,28 +113,59 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
         time.sleep(SCHEMA_POLL_SECONDS)
 
 
-def _read_schema_revision(catalog: Catalog) -> tuple[str | None, str | None]:
-    """Return the schema's revision, and the oldest revision whose release works with it."""
-    with catalog.read() as session:
-        tables = set(inspect(session.connection()).get_table_names())
-        if "alembic_version" not in tables:
-            return None, None
-        present = session.scalar(text("SELECT version_num FROM alembic_version"))
-        if "schema_compatibility" not in tables:
-            return present, None
-        return present, session.scalar(text("SELECT understood_from FROM schema_compatibility"))
+@cache
+def schema_revision() -> str:
+    """Return a name of the tables of this version: a hash of the statements that create them."""
+    import shared.catalog.tables  # noqa: F401  (registers every table)
+
+    dialect = postgresql.dialect()  # type: ignore[no-untyped-call]
+    statements: list[DDLElement] = []
+    for table in Base.metadata.sorted_tables:
+        statements.append(CreateTable(table))
+        statements += [CreateIndex(i) for i in sorted(table.indexes, key=lambda i: str(i.name))]
+    created = "\n".join(str(statement.compile(dialect=dialect)) for statement in statements)
+    return hashlib.sha256(created.encode()).hexdigest()[:12]
+
+
+def _is_current(catalog: Catalog, connection: Connection) -> bool:
+    """Return whether the tables of this version exist; False in an empty database.
+
+    Raises:
+        Misconfigured: `schema_differs`.
+    """
+    if not inspect(connection).has_table(VERSION_TABLE):
+        return False
+    present = connection.scalar(text(f"SELECT version_num FROM {VERSION_TABLE}"))  # noqa: S608
+    if present == schema_revision():
+        return True
+    file = sqlite_file(catalog)
+    remedy = (
+        "let DATABASE_URL name an empty database, run `placewise migrate`"
+        if file is None
+        else f"move {file} (and its -wal and -shm files) away without deleting it"
+    )
+    raise Misconfigured(
+        "schema_differs",
+        f"The catalog was created by another version of Placewise (schema {present}; this version "
+        f"has {schema_revision()}), and versions before the first release do not read each other's "
+        "catalogs. Nothing was changed. Start that version again; or create a new catalog from the "
+        f"object store, which stays as it is: {remedy}, and run `placewise rebuild-catalog`.",
+        present=present,
+        needed=schema_revision(),
+    )
 
 
 def _migrate_sqlite(catalog: Catalog) -> None:
-    """Run all migrations in one transaction, which excludes every other process."""
+    """Create the tables in one transaction, which excludes every other process."""
     if catalog.url.database:
         file = Path(catalog.url.database)
         make_private_folder(file.parent)
         file.touch(FILE_MODE)  # SQLite gives its -wal and -shm files the same mode
-    if _read_schema_revision(catalog)[0] == _known_revisions()[-1]:
-        return
+    with catalog.read() as session:
+        if _is_current(catalog, session.connection()):
+            return
     with catalog.engine.execution_options(placewise_write=True).begin() as connection:
-        _upgrade(connection)
+        _create_tables(catalog, connection)
 
 
 def _check_postgres_version(catalog: Catalog) -> None:
@@ -177,48 +179,17 @@ def _check_postgres_version(catalog: Catalog) -> None:
         )
 
 
-def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
+def _migrate_postgres(catalog: Catalog) -> None:
     engine = catalog.engine.execution_options(placewise_limits=MIGRATION_TIMEOUTS)
-    with _migration_lock(catalog, deadline):
-        while True:
-            try:
-                with engine.connect() as connection:
-                    _upgrade(connection)
-                return
-            except DBAPIError as error:
-                is_retryable = get_sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
-                if not is_retryable or time.monotonic() > deadline:
-                    raise
-                log.info("a migration could not get a lock because of traffic: retrying")
-            time.sleep(LOCK_RETRY_SECONDS * random.uniform(0.5, 1.5))  # noqa: S311
+    with engine.begin() as connection:
+        connection.execute(text(f"SELECT pg_advisory_xact_lock({ADVISORY_LOCK_ID})"))
+        _create_tables(catalog, connection)
 
 
-@contextlib.contextmanager
-def _migration_lock(catalog: Catalog, deadline: float) -> Iterator[None]:
-    """Hold the advisory lock that allows one migration at a time.
-
-    The lock is polled: a waiting statement would hold a snapshot, and `CREATE INDEX CONCURRENTLY`
-    waits for every snapshot to end.
-    """
-    while True:
-        with catalog.engine.connect() as connection:
-            # Without a bound parameter, with which the portal keeps its snapshot until the next
-            # statement.
-            acquired = connection.exec_driver_sql(
-                f"SELECT pg_try_advisory_xact_lock({ADVISORY_LOCK_ID})"
-            )
-            if acquired.scalar():
-                yield
-                return
-        if time.monotonic() > deadline:
-            raise Unavailable(
-                "catalog_busy", "Another migration is running. Wait for it, then run this again."
-            )
-        time.sleep(SCHEMA_POLL_SECONDS)
-
-
-def _upgrade(connection: Connection) -> None:
-    # Imported here: most starts find the current schema, and loading Alembic takes a while.
+def _create_tables(catalog: Catalog, connection: Connection) -> None:
+    if _is_current(catalog, connection):  # another process was faster
+        return
+    # Imported here: most starts find the tables, and loading Alembic takes a while.
     from alembic import command
     from alembic.config import Config
 
@@ -226,11 +197,6 @@ def _upgrade(connection: Connection) -> None:
     config.set_main_option("script_location", str(MIGRATIONS))
     config.attributes["connection"] = connection
     command.upgrade(config, "head")
-
-
-def _known_revisions() -> list[str]:
-    """Return the revisions of the migrations, oldest first: a file's name begins with its own."""
-    return sorted(path.name.partition("_")[0] for path in MIGRATIONS.glob("versions/[0-9]*.py"))
 
 
 # Only `placewise doctor` checks larger catalogs: the check reads the whole file, at about 1 GB/s.

@@ -1,4 +1,4 @@
-"""The migrated schema is the one that the tables describe, on every database."""
+"""The tables that are created are those that the classes describe, on every database."""
 
 from __future__ import annotations
 

@@ -25,7 +25,6 @@ from shared.catalog.installation import Installation, get_or_create_installation
 from shared.catalog.jobs import Job
 from shared.catalog.maps import Map, get_or_create_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.tables import SchemaCompatibility
 from shared.config.settings import Settings
 from shared.errors import Conflict, StorageFull
 from shared.ids import new_id
@@ -63,8 +62,7 @@ def lose_catalog(catalog: Catalog) -> None:
     """Every row is gone, as from a database that is made anew."""
     with catalog.write() as session:
         for table in reversed(Base.metadata.sorted_tables):
-            if table.name != SchemaCompatibility.__tablename__:
-                session.execute(delete(table))
+            session.execute(delete(table))
 
 
 def rebuilt(service: Service) -> tuple[Service, RecoveryReport]:

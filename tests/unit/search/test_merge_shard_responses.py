@@ -17,7 +17,6 @@ from shared.search_api.protocol import (
     NONE,
     ReplicationLag,
     SearchHit,
-    SearchRequest,
     SearchResponse,
     SearchStatus,
 )
@@ -70,17 +69,6 @@ def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
 def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() -> None:
     shards = [weighted((4, 0.1, 0.9), (1, 0.8, 0.3)), weighted((3, 0.2, 0.9), (2, 0.9, 0.5))]
     assert ranked(merge_responses(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
-
-
-def test_a_message_without_weights_is_one_that_the_release_before_understands() -> None:
-    searched = SearchRequest(
-        map_id=new_id(), generation_id=new_id(), object_key="q", row=0, min_version=0, k=5
-    )
-    assert "word_weights" not in searched.as_json()
-    assert SearchRequest.model_validate_json(searched.as_json()) == searched
-    plain = answer((1, 0.5), missing=("chunks/a",))
-    assert "weighted_score" not in plain.as_json()
-    assert SearchResponse.model_validate_json(plain.as_json()) == plain
 
 
 def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:

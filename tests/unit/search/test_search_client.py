@@ -1,4 +1,4 @@
-"""`HttpSearchClient` during a rolling upgrade and while its process stops."""
+"""`HttpSearchClient` while its process stops."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.search_api.client import HttpSearchClient
 from shared.search_api.protocol import (
-    BACKGROUND_FEATURE,
-    RowReference,
     SearchRequest,
     SearchResponse,
     SearchStatus,
@@ -33,11 +31,9 @@ RESPONSE = SearchResponse(
 class FakeWorker(ThreadingHTTPServer):
     """A search worker of one shard that records the requests and answers when `released`."""
 
-    def __init__(self, features: tuple[str, ...] = ()) -> None:
+    def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.status = SearchStatus(
-            rows=0, resident_bytes=0, versions={}, missing=(), features=features
-        )
+        self.status = SearchStatus(rows=0, resident_bytes=0, versions={}, missing=())
         self.received: list[dict[str, object]] = []
         self.released = threading.Event()
         self.released.set()
@@ -78,18 +74,6 @@ def worker() -> Iterator[FakeWorker]:
         server.released.set()
         server.shutdown()
         thread.join()
-
-
-@pytest.mark.parametrize("features", [(), (BACKGROUND_FEATURE,)])
-def test_the_background_is_sent_only_to_workers_that_know_it(
-    worker: FakeWorker, features: tuple[str, ...]
-) -> None:
-    worker.status = worker.status.model_copy(update={"features": features})
-    background = (RowReference(object_key="queries/b.npy", row=0),)
-    with HttpSearchClient([worker.url], 10.0) as client:
-        assert client.search(REQUEST.model_copy(update={"background": background})) == RESPONSE
-    (received,) = worker.received
-    assert ("background" in received) == bool(features)
 
 
 def test_a_search_of_a_closed_client_is_unavailable(worker: FakeWorker) -> None:

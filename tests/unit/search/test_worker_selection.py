@@ -11,7 +11,7 @@ import pytest
 from shared.config.shards import Shard
 from shared.errors import Gone, NotFound, Unavailable
 from shared.ids import new_id
-from shared.search_api.protocol import BACKGROUND_FEATURE, SearchRequest, SearchStatus
+from shared.search_api.protocol import SearchRequest, SearchStatus
 from shared.search_api.workers import WorkerDirectory, WorkerUnavailable, call_search, fetch_status
 
 GENERATION = new_id()
@@ -63,25 +63,6 @@ REQUEST = SearchRequest(
     min_version=0,
     k=1,
 )
-
-
-def test_a_feature_counts_once_every_worker_that_ever_answered_lists_it(
-    fake: FakeWorkers,
-) -> None:
-    new = holding("0/1").model_copy(update={"features": (BACKGROUND_FEATURE,)})
-    fake.answers = {
-        "http://old": holding("0/1"),
-        "http://new": new,
-        "http://away": httpx2.ConnectError("refused"),
-    }
-    workers = fake.seen()
-    assert not workers.all_know(BACKGROUND_FEATURE)
-    fake.answers["http://old"] = httpx2.ConnectError("refused")
-    workers.refresh()
-    assert not workers.all_know(BACKGROUND_FEATURE), "it may come back as it was"
-    fake.answers["http://old"] = new
-    workers.refresh()
-    assert workers.all_know(BACKGROUND_FEATURE)
 
 
 def test_replicas_of_a_shard_stand_together_and_the_current_one_comes_first(
