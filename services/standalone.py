@@ -204,7 +204,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 contextlib.closing(extractor),
                 process_heartbeat(catalog, "extractor", extractor.state),
             ):
+                threads = start_service_threads({"fits": extractor.fits.run}, stop)
                 extractor.run(stop, wakeups)
+                for thread in threads:
+                    thread.join()
 
         stop = threading.Event()
         stack.enter_context(stop_when_a_thread_crashes(running.stop))

@@ -52,18 +52,23 @@ def read_stored_rows(
     rows = {}
     for object_key in sorted(rows_by_chunk):
         for row_number, photo_id in rows_by_chunk[object_key]:
-            try:
-                row = read_row(store, object_key, row_number)
-            except (NotFound, IndexError, ValueError) as error:
-                log.error("row %d of the chunk %s can't be read: %s", row_number, object_key, error)
-                continue
-            if rows_are_valid(row[np.newaxis]).all():
+            row = read_chunk_row(store, object_key, row_number)
+            if row is not None:
                 rows[photo_id] = row
-            else:
-                log.error(
-                    "row %d of the chunk %s is not a valid descriptor", row_number, object_key
-                )
     return rows
+
+
+def read_chunk_row(store: ObjectStore, object_key: str, row_number: int) -> Row | None:
+    """Return a (dimension,) row; None, and an error in the log, if it is missing or damaged."""
+    try:
+        row = read_row(store, object_key, row_number)
+    except (NotFound, IndexError, ValueError) as error:
+        log.error("row %d of the chunk %s can't be read: %s", row_number, object_key, error)
+        return None
+    if rows_are_valid(row[np.newaxis]).all():
+        return row
+    log.error("row %d of the chunk %s is not a valid descriptor", row_number, object_key)
+    return None
 
 
 def _read_reusable_rows(

@@ -18,7 +18,7 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from services.service_process import Announce, service_process
+from services.service_process import Announce, service_process, start_service_threads
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
@@ -58,6 +58,7 @@ def _run_celery_worker(
     worker = ExtractorWorker(catalog, store, settings, name, registry=registry)
     heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
+    threads: list[threading.Thread] = []
 
     def drain() -> dict[str, Any]:
         result = worker.drain_once(stop, DRAIN_SECONDS)
@@ -95,6 +96,7 @@ def _run_celery_worker(
             serve_metrics(settings, registry),
         ):
             worker.warm_up()
+            threads += start_service_threads({"fits": worker.fits.run}, stop)
             for queue in WakeupQueue:
                 wakeups.send(queue)  # for jobs queued before this worker started
             app.worker_main(
@@ -114,5 +116,7 @@ def _run_celery_worker(
         signals.worker_ready.disconnect(on_worker_ready)
         signals.heartbeat_sent.disconnect(on_heartbeat)
         stop.set()
+        for thread in threads:
+            thread.join()
         worker.close()
         wakeups.close()

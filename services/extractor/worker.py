@@ -11,8 +11,8 @@ A query that arrives while a bulk batch is described is described concurrently w
 is not possible, it goes before the next bulk batch, so that it waits for one batch at most. Its row
 is published at once, by the thread that described it.
 
-Jobs that are retried alone, to isolate the job that crashed the worker, and steps of model changes
-run exclusively: whatever was described before is published first.
+Jobs that are retried alone, to isolate the job that crashed the worker, and model changes run
+exclusively: whatever was described before is published first. Fits run beside (`fits`).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from prometheus_client import CollectorRegistry
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.comparison import ComparisonRunner, PreparedComparison
 from services.extractor.decoder_pool import DecoderPool
+from services.extractor.fits import ComputeFit, FitWorker, compute_in_child
 from services.extractor.generation_resolver import (
     defer_until_vocabulary,
     reindex_outdated_generations,
@@ -43,7 +44,7 @@ from services.extractor.model_registry import ModelRegistry
 from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind, WaitingFor
+from shared.catalog.jobs import EXTRACTOR_JOBS, FIT_JOBS, MODEL_CHANGE_JOBS, JobKind, WaitingFor
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority, mark_started
@@ -64,7 +65,7 @@ class _ExtractorBatch(ClaimedJobs):
 
     preparation: Future[DescribeBatch | PreparedComparison | None] | None = None
     """A result of None means that the map has no vocabulary yet. The future itself is None for a
-    step of a model change and for the import of a checkpoint."""
+    model change and for the import of a checkpoint."""
 
 
 class ExtractorWorker:
@@ -82,6 +83,7 @@ class ExtractorWorker:
         *,
         only_worker: bool = False,
         registry: CollectorRegistry | None = None,
+        compute_fit: ComputeFit = compute_in_child,
     ) -> None:
         """Create a worker with a name for its leases.
 
@@ -97,13 +99,19 @@ class ExtractorWorker:
         added = AddedModelLoader(catalog, store, settings)
         self._models = ModelRegistry(store, settings, added.load, self._metrics.observe_model_load)
         self._decoders = DecoderPool(settings)
-        self._model_changes = ModelChangeRunner(
-            catalog, store, self._models, self._decoders, settings
-        )
+        self._model_changes = ModelChangeRunner(catalog, store, self._models, settings)
         self._comparisons = ComparisonRunner(catalog, store, self._models, self._decoders, settings)
-        self._runner = JobRunner(
-            catalog, settings, name, EXTRACTOR_JOBS, self._metrics.count_step_outcome
+        self.fits = FitWorker(
+            catalog,
+            store,
+            self._models,
+            settings,
+            name,
+            self._metrics.count_step_outcome,
+            compute_fit,
         )
+        drained = [kind for kind in EXTRACTOR_JOBS if kind not in FIT_JOBS]
+        self._runner = JobRunner(catalog, settings, name, drained, self._metrics.count_step_outcome)
         # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -131,7 +139,10 @@ class ExtractorWorker:
             reindex_outdated_generations(self._catalog, self._models)
 
     def run(self, stop: threading.Event, wakeups: InProcessWakeups) -> None:
-        """Drain whenever there is work, until `stop` is set; used by the embedded worker."""
+        """Drain whenever there is work, until `stop` is set; used by the embedded worker.
+
+        Fits run in a thread of their own (`fits`).
+        """
         self.warm_up()
 
         def drain() -> bool:
@@ -297,7 +308,7 @@ class ExtractorWorker:
             if work.preparation is None:
                 started = time.perf_counter()
                 self._mark_begun(work)
-                self._model_changes.run_step(work.jobs[0])
+                self._model_changes.run(work.jobs[0])
                 took = time.perf_counter() - started
                 result.seconds["model change"] += took
                 self._metrics.observe_stage("model change", took)

@@ -42,7 +42,6 @@ from shared.storage.keys import (
     PREVIEWS,
     QUERIES,
     TRASH,
-    WORK,
     is_original_key,
 )
 from shared.storage.protocol import ObjectInfo
@@ -206,7 +205,7 @@ def _unreadable(path: Path, name: str) -> Misconfigured:
 
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
-EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH, WORK)
+EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH)
 
 
 def list_backup_objects(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:

@@ -77,7 +77,8 @@ class JobKind(StrEnum):
     BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
 
-MODEL_CHANGE_JOBS = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
+FIT_JOBS = (JobKind.FIT, JobKind.PCA)
+MODEL_CHANGE_JOBS = (*FIT_JOBS, JobKind.IMPORT, JobKind.SWITCH)
 
 # A client waits for their result, which is stored for QUERY_TTL_SECONDS.
 QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)

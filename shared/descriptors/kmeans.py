@@ -7,7 +7,7 @@ with three changes: k-means++ seeding, reseeding of empty clusters, and points r
                                 counts them: after each batch c is the mean of its points
     Lloyd                       all points against the same centres, which then move to the means
 
-`shared.descriptors.vocabulary_fit` schedules the passes and checkpoints them.
+`shared.descriptors.vocabulary_fit` schedules the passes.
 """
 
 from __future__ import annotations
@@ -29,22 +29,6 @@ class KMeansPlusPlus:
         """Indices of the points chosen as seeds."""
         self.distances = _squared_distances(points, points[first])
         """(n,) squared distance of each point to its nearest seed."""
-
-    @classmethod
-    def resume(
-        cls,
-        points: torch.Tensor,
-        *,
-        chosen: list[int],
-        distances: torch.Tensor,
-        generator_state: torch.Tensor,
-    ) -> KMeansPlusPlus:
-        """Restore a seeding of the same points from its `chosen`, `distances` and RNG state."""
-        seeding = cls.__new__(cls)
-        seeding.points, seeding.chosen, seeding.distances = points, chosen, distances
-        seeding.generator = torch.Generator()
-        seeding.generator.set_state(generator_state)
-        return seeding
 
     def next(self) -> None:
         """Choose one more seed, with probability proportional to the squared distance."""

@@ -1,4 +1,4 @@
-"""PCA fit: computes a PCA whitening from descriptor rows, in resumable steps by blocks of columns.
+"""PCA fit: computes a PCA whitening from descriptor rows, by blocks of columns.
 
 Fit on database rows only: queries of an evaluation would leak into the projection.
 
@@ -6,19 +6,18 @@ At 98,304 dimensions the covariance (39 GB) does not fit memory. With fewer rows
 same directions come from the n x n Gram matrix (Turk and Pentland 1991): XX' = U diag(s^2) U' gives
 l = s^2 / (n - 1) and p = X'u / s. X is read in blocks of columns, each centred by its own mean,
 once for XX' and once for the directions, so that memory holds n x n numbers, one block and its
-result. Each block is a step, and a fit can be saved and resumed between any two steps.
+result. Each block is a step.
 scikit-learn's IncrementalPCA reads batches of rows and holds a matrix of components in memory.
 """
 
 from __future__ import annotations
 
-import io
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,8 +179,7 @@ class PcaBlock:
 class PcaFit:
     """Fits a PCA whitening: call `step` until `done`.
 
-    Deterministic: the same rows give the same whitening, whether or not the fit was saved and
-    resumed between two steps.
+    Deterministic: the same rows give the same whitening.
     """
 
     def __init__(self, rows: ColumnSource, components: int) -> None:
@@ -273,30 +271,6 @@ class PcaFit:
         self._basis = vectors * scale
         self._products = np.empty((0, 0))
         self.stage, self._block = _PcaFitStage.DIRECTIONS, 0
-
-    # --- checkpointing -------------------------------------------------------------------------
-
-    def save(self) -> bytes:
-        """Encode the state; `resume` also needs the same rows, and the result the same blocks."""
-        arrays: dict[str, Any] = {
-            "stage": np.array(str(self.stage)),
-            "block": np.array(self._block),
-            "products": self._products,
-            "basis": self._basis,
-            "variances": self._variances,
-            "total": np.array(self._total),
-        }
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
-
-    def resume(self, data: bytes) -> None:
-        """Restore a state saved by a fit of the same rows."""
-        with np.load(io.BytesIO(data), allow_pickle=False) as saved:
-            self.stage = _PcaFitStage(str(saved["stage"]))
-            self._block = int(saved["block"])
-            self._products, self._basis = saved["products"], saved["basis"]
-            self._variances, self._total = saved["variances"], float(saved["total"])
 
 
 def check_pca_fittable(rows: int, dimension: int, components: int) -> None:

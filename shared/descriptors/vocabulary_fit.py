@@ -13,10 +13,9 @@ Euclidean distance; VLAD assigns them by cosine.
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -113,8 +112,7 @@ class _VocabularyFitStage(StrEnum):
 class VocabularyFit:
     """Fits K centres to points: call `step` until `done`.
 
-    Deterministic: the same points and seed give the same centres, whether or not the fit was saved
-    and resumed between two steps.
+    Deterministic: the same points and seed give the same centres.
     """
 
     def __init__(
@@ -248,50 +246,3 @@ class VocabularyFit:
             self._order = self._batches.shuffled([self._seed, self.passes])
         else:
             self._order = list(range(len(self._batches)))
-
-    # --- checkpointing -------------------------------------------------------------------------
-
-    def save(self) -> bytes:
-        """Encode the state; `resume` also needs the same points, clusters, seed and effort."""
-        arrays: dict[str, Any] = {
-            "numbers": np.array([self.passes, self._batch], np.int64),
-            "similarity": np.array(np.nan if self.similarity is None else self.similarity),
-            "stage": np.array(str(self.stage)),
-            "centres": self._centres.numpy(),
-            "counts": self._pass.counts.numpy(),
-            "sums": self._pass.sums.numpy(),
-            "seen": np.array(self._pass.similarity),
-            "worst": self._pass.worst.numpy(),
-            "worst_distances": self._pass.worst_distances.numpy(),
-        }
-        if self._seeding is not None:
-            arrays["chosen"] = np.array(self._seeding.chosen)
-            arrays["distances"] = self._seeding.distances.numpy()
-            arrays["generator"] = self._seeding.generator.get_state().numpy()
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
-
-    def resume(self, data: bytes) -> None:
-        """Restore a state saved by a fit with the same points, clusters, seed and effort."""
-        with np.load(io.BytesIO(data), allow_pickle=False) as saved:
-            self.passes, self._batch = map(int, saved["numbers"])
-            similarity = float(saved["similarity"])
-            self.similarity = None if np.isnan(similarity) else similarity
-            self.stage = _VocabularyFitStage(str(saved["stage"]))
-            self._centres = torch.from_numpy(saved["centres"])
-            self._pass = KMeansPass(
-                counts=torch.from_numpy(saved["counts"]),
-                sums=torch.from_numpy(saved["sums"]),
-                similarity=float(saved["seen"]),
-                worst=torch.from_numpy(saved["worst"]),
-                worst_distances=torch.from_numpy(saved["worst_distances"]),
-            )
-            if "chosen" in saved:
-                self._seeding = KMeansPlusPlus.resume(
-                    self._seeding_points(),
-                    chosen=saved["chosen"].tolist(),
-                    distances=torch.from_numpy(saved["distances"]),
-                    generator_state=torch.from_numpy(saved["generator"]),
-                )
-        self._set_order()

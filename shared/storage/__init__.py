@@ -18,7 +18,6 @@
 | `queries/<job>.jpg` | a preview of a query photo in a format that not all browsers show |
 | `queries/<job>.json` | the result of a comparison |
 | `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
-| `work/<job>/...` | checkpoints of a job that runs in several steps |
 | `trash/<day>/<key>` | an orphan moved to the trash on that day, deleted after TRASH_DAYS |
 | `imports/...` (IMPORT_PREFIX) | the operator's files, which Placewise only reads |
 

@@ -23,7 +23,6 @@ THUMBNAILS = "thumbnails/"
 TRASH = "trash/"
 VOCABULARIES = "vocabularies/"
 WHITENINGS = "whitenings/"
-WORK = "work/"
 
 OWN_PREFIXES = (
     CHECKPOINTS,
@@ -38,7 +37,6 @@ OWN_PREFIXES = (
     TRASH,
     VOCABULARIES,
     WHITENINGS,
-    WORK,
 )
 
 
@@ -204,8 +202,3 @@ def new_model_key(sha256: str) -> str:
     A key is never reused, so that garbage collection can't delete a model that was added again.
     """
     return f"{MODELS}{sha256}/{new_id()}.safetensors"
-
-
-def job_work_key(job_id: UUID, name: str) -> str:
-    """Return the key of a checkpoint of a job that runs in several steps."""
-    return f"{WORK}{job_id}/{name}"

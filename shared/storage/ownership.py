@@ -15,7 +15,7 @@ from uuid import UUID
 
 from shared.errors import Misconfigured
 from shared.storage.folder import PARTIAL_FOLDER, FolderStore
-from shared.storage.keys import ORIGINALS, OWNER_MARK, QUERIES, WORK, is_original_key
+from shared.storage.keys import ORIGINALS, OWNER_MARK, QUERIES, is_original_key
 from shared.storage.protocol import OwnedStore
 
 log = logging.getLogger(__name__)
@@ -154,7 +154,7 @@ def _has_objects(store: OwnedStore, import_prefix: str) -> bool:
         if info.key.startswith((OWNER_MARK, import_prefix)):
             continue
         is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if isinstance(store, FolderStore) and (is_foreign or info.key.startswith((QUERIES, WORK))):
+        if isinstance(store, FolderStore) and (is_foreign or info.key.startswith(QUERIES)):
             continue
         return True
     return False

@@ -91,4 +91,7 @@ class Service:
         return str(started["job_id"])
 
     def drain(self) -> None:
-        self.worker.drain(threading.Event())
+        stop = threading.Event()
+        self.worker.drain(stop)
+        while self.worker.fits.run_next(stop):
+            self.worker.drain(stop)

@@ -107,7 +107,12 @@ class Workplace:
         return self._worker
 
     def drain(self) -> DrainStats:
-        return self.worker.drain(threading.Event())
+        """Do all jobs of the extractor, fits too, which do not count in the result."""
+        stop = threading.Event()
+        result = self.worker.drain(stop)
+        while self.worker.fits.run_next(stop):
+            result.merge(self.worker.drain(stop))
+        return result
 
     def advance(self) -> None:
         advance_model_changes(self.catalog, self.wakeups, self._queued_chunks)

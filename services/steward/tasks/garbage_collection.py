@@ -22,7 +22,7 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending
@@ -32,7 +32,6 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
 from shared.storage.keys import (
     CHECKPOINTS,
-    WORK,
     derived_image_keys,
     incoming_key,
     local_features_key,
@@ -260,25 +259,6 @@ def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
     )
 
 
-def collect_model_change_files(catalog: Catalog, store: ObjectStore) -> None:
-    """Delete checkpoints of model changes that have ended or already have their generation."""
-    keys = [info.key for info in store.list(WORK)]
-    if not keys:
-        return
-    with catalog.read() as session:
-        unfinished = session.scalars(
-            select(Job.id).where(
-                Job.kind.in_(MODEL_CHANGE_JOBS),
-                Job.state.in_(UNFINISHED_STATES),
-                Job.generation_id.is_(None),
-            )
-        )
-        unfinished_ids = {str(job_id) for job_id in unfinished}
-    for key in keys:
-        if key.split("/")[1] not in unfinished_ids:
-            store.delete(key)
-
-
 def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
     """Delete uploaded checkpoints whose jobs have ended.
 
@@ -315,6 +295,5 @@ def collect_garbage(
     collect_whitenings(catalog, store, retired_grace_seconds)
     collect_deleted_photos(catalog, store, retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
-    collect_model_change_files(catalog, store)
     collect_presigned_uploads(catalog, store)
     collect_checkpoints(catalog, store)

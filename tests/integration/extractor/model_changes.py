@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import io
-import itertools
-import threading
-from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 from uuid import UUID
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from services.extractor import checkpointed_steps
-from services.extractor.model_changes import ModelChangeRunner
-from services.extractor.worker import ExtractorWorker
 from shared.catalog.photos import Photo
-from shared.jobs import Job, JobKind
+from shared.jobs import JobKind
 from shared.storage.keys import new_vocabulary_key
 from tests.integration.workplace import Workplace
 
@@ -54,29 +46,3 @@ def photo_ids(workplace: Workplace) -> list[UUID]:
                 .order_by(Photo.id)
             )
         )
-
-
-def do_one_step_a_slice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each look at the clock is a slice later than the one before."""
-    looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * checkpointed_steps.STEP_SECONDS)
-    monkeypatch.setattr(checkpointed_steps, "time", clock)
-
-
-def do_slices(
-    monkeypatch: pytest.MonkeyPatch,
-    worker: ExtractorWorker,
-    until: Callable[[Job], bool] = lambda job: True,
-) -> None:
-    """Drain until after the slice of a job (as it was claimed) for which `until` is true."""
-    stop = threading.Event()
-    real = ModelChangeRunner.run_step
-
-    def slice_and_stop(self: ModelChangeRunner, job: Job) -> None:
-        real(self, job)
-        if until(job):
-            stop.set()
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ModelChangeRunner, "run_step", slice_and_stop)
-        worker.drain(stop)

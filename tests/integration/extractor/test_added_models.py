@@ -13,7 +13,7 @@ import pytest
 import torch
 from sqlalchemy import select, update
 
-from services.extractor import checkpointed_steps as new_generation_module
+from services.extractor import new_generations
 from services.steward.tasks.garbage_collection import collect_checkpoints
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
@@ -407,7 +407,7 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
     walks: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = active(walks).id
-    real = new_generation_module.start_generation_with_stored_vocabulary
+    real = new_generations.start_generation_with_stored_vocabulary
 
     def remove_first(*arguments: Any) -> None:
         with walks.catalog.write() as session:

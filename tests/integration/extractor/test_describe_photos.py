@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import func, select
 
+from services.extractor import fits
 from services.extractor import worker as worker_module
 from services.extractor.generation_resolver import resolve_generation
-from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import auto_fit
 from services.steward.tasks.auto_fit import fit_due_vocabularies
@@ -28,7 +28,7 @@ from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.imaging.preprocessing import Pixels
-from shared.jobs import Job, JobKind, JobState
+from shared.jobs import JobKind, JobState
 from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
@@ -255,26 +255,24 @@ def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
     assert set(averages.rows()) == {photo_id}
 
 
-def test_a_query_goes_between_the_slices_of_a_fit(
+def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
     vlads: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(8))
     vlads.fit()
     job_id = vlads.start(JobKind.FIT, clusters=8, sample=100, seed=1)
-    queries: list[UUID] = []
-    stages: list[tuple[str | None, JobState]] = []
-    real = ModelChangeRunner.run_step
+    seen: list[JobState] = []
+    real = fits.compute_fit
 
-    def watch(self: ModelChangeRunner, job: Job) -> None:
-        if queries:
-            stages.append((job.stage, JobState(vlads.job(queries[-1]).state)))
-        queries.append(vlads.ask(photo_bytes(50 + len(queries))))
-        real(self, job)
+    def describe_meanwhile(*arguments: Any) -> Any:
+        query, photo = vlads.ask(photo_bytes(50)), vlads.upload(51)[0]
+        vlads.worker.drain(threading.Event())
+        seen.extend(JobState(job.state) for job in (vlads.job(query), vlads.job_of(photo)))
+        return real(*arguments)
 
-    monkeypatch.setattr(ModelChangeRunner, "run_step", watch)
+    monkeypatch.setattr(fits, "compute_fit", describe_meanwhile)
     vlads.drain()
-    assert [stage for stage, _ in stages] == ["sample", "sample", "cluster"]
-    assert {state for _, state in stages} == {JobState.SUCCEEDED}
+    assert seen == [JobState.SUCCEEDED] * 2
     assert vlads.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 from uuid import UUID
 
@@ -13,17 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from services.extractor import checkpointed_steps, fit_pca, prepare
+from services.extractor import fits, prepare
 from services.extractor.generation_resolver import reindex_outdated_generations
-from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
-from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import model_changes
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_whitenings
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation
-from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import StoredWhitening
@@ -34,7 +29,7 @@ from shared.descriptors.vocabulary import decode_centres
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
 from shared.storage.chunks import Rows, decode_rows, read_row
-from shared.storage.keys import WHITENINGS, WORK, query_vector_key
+from shared.storage.keys import WHITENINGS, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.checkpoints import none_added
@@ -147,11 +142,7 @@ def test_stored_rows_are_whitened_without_a_photo(
         "rows": PHOTOS,
         "explained": pytest.approx(expected.explained),
     }
-    assert (
-        job.progress_done
-        == job.progress_total
-        == 2 * PHOTOS + checkpointed_steps.FIT_PROGRESS_UNITS
-    )
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + fits.FIT_PROGRESS_UNITS
     (stored,) = whitenings(workplace)
     file = decode_whitening(workplace.store.get(stored.object_key))
     assert file.whitening.sha256 == stored.sha256 == expected.sha256
@@ -187,46 +178,6 @@ def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
     assert same(reduced.rows()[photo_id], expected)
 
 
-def test_a_fit_is_the_same_whoever_does_its_slices(
-    described: Workplace,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * checkpointed_steps.STEP_SECONDS)
-    monkeypatch.setattr(checkpointed_steps, "time", clock)
-    monkeypatch.setattr(fit_pca, "READ_BATCH_BYTES", 4 * 16 * 5)  # five rows at once
-    monkeypatch.setattr(
-        fit_pca, "block_width", lambda count, dimension: 6
-    )  # so: three blocks of columns
-    real = ModelChangeRunner.run_step
-    job_id = described.start(JobKind.PCA, pca=KEPT)
-    stages, progress = [], []
-    while described.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
-        stop = threading.Event()
-
-        def slice_and_stop(self: ModelChangeRunner, job: Job, stop: threading.Event = stop) -> None:
-            real(self, job)
-            stop.set()
-
-        with monkeypatch.context() as patched:
-            patched.setattr(ModelChangeRunner, "run_step", slice_and_stop)
-            make_worker().drain(stop)  # one that knows nothing
-        job = described.job(job_id)
-        stages.append(job.stage)
-        progress.append(job.progress_done)
-        assert len(stages) < 20
-    assert stages == ["gather"] * 3 + ["reduce"] * 7 + ["describe"]
-    assert progress == sorted(set(progress))
-    assert all(0 < done < job.progress_total for done in progress[1:])
-    before = described.rows()
-    described.finish(job_id)
-    # In blocks, the same but for the order in which floats were summed.
-    expected = by_hand(before)
-    for photo_id, row in described.rows().items():
-        assert same(np.abs(row), np.abs(projected(expected, before[photo_id])))
-
-
 @pytest.mark.parametrize("missing", [False, True])
 def test_a_photo_whose_row_is_damaged_is_described_anew(
     described: Workplace, monkeypatch: pytest.MonkeyPatch, missing: bool
@@ -243,7 +194,7 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
         half: Rows = (found / 2).astype(np.float32)
         return half
 
-    monkeypatch.setattr(fit_pca, "read_stored_rows", lambda *_: before)  # the fit is not meant
+    monkeypatch.setattr(fits, "read_chunk_row", read_row)  # the fit is not meant
     monkeypatch.setattr(prepare, "read_row", read)
     reduce(described)
     for photo_id, row in described.rows().items():
@@ -390,8 +341,6 @@ def test_a_deleted_map_leaves_no_whitening(reduced: Workplace) -> None:
         mark_map_deleted(session, session.get_one(Map, reduced.map_id))
     purge_deleted_maps(reduced.catalog, reduced.store)
     assert whitenings(reduced) == []
-    assert reduced.keys(WHITENINGS) | {k for k in reduced.keys(WORK) if "plan" not in k} <= (
-        reduced.keys(WORK)
-    )
+    assert reduced.keys(WHITENINGS) == set()
     with reduced.catalog.read() as session:
         assert session.query(Generation).count() == 0

@@ -6,23 +6,20 @@ import functools
 import threading
 from collections.abc import Callable
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 import pytest
 
-from services.extractor.model_changes import ModelChangeRunner
-from services.steward.tasks.garbage_collection import collect_model_change_files
+from services.extractor.fits import STAGES, FitProgress
 from shared.catalog.generations import GenerationState
 from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.errors import Conflict
-from shared.jobs import Job, JobKind, JobState
+from shared.jobs import JobKind, JobState
 from tests.integration.extractor.model_changes import (
     PHOTOS,
     WIDTH,
-    do_one_step_a_slice,
     import_file,
     npy,
     photo_ids,
@@ -35,44 +32,48 @@ from tests.support.photos import photo_bytes
 pytestmark = pytest.mark.databases("postgresql")
 
 
-@pytest.mark.parametrize("in_the_slice", [False, True])
+@pytest.mark.parametrize("stage", ["sample", "cluster"])
 def test_a_fit_can_be_cancelled_in_each_stage(
-    fitted: Workplace,
-    monkeypatch: pytest.MonkeyPatch,
-    in_the_slice: bool,
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
-    do_one_step_a_slice(monkeypatch)
     old = fitted.active().id
-    real = ModelChangeRunner.run_step
-    for stage in (None, "sample", "cluster"):
-        job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
-        stop = threading.Event()
+    job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+    real = FitProgress.report
 
-        def cancel_there(
-            self: ModelChangeRunner,
-            job: Job,
-            *,
-            stage: str | None = stage,
-            job_id: UUID = job_id,
-            stop: threading.Event = stop,
-        ) -> None:
-            if job.stage == stage:
-                fitted.cancel(job_id)
-                stop.set()
-            if job.stage != stage or in_the_slice:
-                real(self, job)
+    def cancel_there(self: FitProgress, *news: Any) -> None:
+        if STAGES[news[0]] == stage:
+            fitted.cancel(job_id)
+            self._written = 0.0  # the next look at the job is now
+        real(self, *news)
 
-        with monkeypatch.context() as patched:
-            patched.setattr(ModelChangeRunner, "run_step", cancel_there)
-            fitted.worker.drain(stop)
-        assert fitted.job(job_id).state == JobState.CANCELLED
-        assert fitted.building() is None
-        assert fitted.drain().claimed == 0
-        assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
-        collect_model_change_files(fitted.catalog, fitted.store)
-        assert fitted.keys("work/") == set()
+    with monkeypatch.context() as patched:
+        patched.setattr(FitProgress, "report", cancel_there)
+        fitted.drain()
+    assert fitted.job(job_id).state == JobState.CANCELLED
+    assert fitted.building() is None
+    assert not fitted.worker.fits.run_next(threading.Event())
+    assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
     assert fitted.fit(seed=1).state == JobState.SUCCEEDED
     assert fitted.active().id != old
+
+
+def test_a_worker_that_stops_gives_its_fit_back(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+    stop = threading.Event()
+    real = FitProgress.report
+
+    def stop_there(self: FitProgress, *news: Any) -> None:
+        stop.set()
+        real(self, *news)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FitProgress, "report", stop_there)
+        fitted.worker.fits.run_next(stop)
+    job = fitted.job(job_id)
+    assert (job.lease_token, job.attempts) == (None, 0)
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
 
 
 def test_a_fit_can_be_cancelled_while_photos_are_described(

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Callable
 from typing import Any
 from uuid import UUID
 
 import pytest
 
-from services.extractor import checkpointed_steps
-from services.extractor.model_changes import VocabularyFitJob
-from services.extractor.worker import ExtractorWorker
+from services.extractor import fits
+from services.extractor.child_process import ChildKilled
+from services.extractor.fits import FIT_PROGRESS_UNITS, FitProgress, FitWorker
+from services.extractor.model_registry import ModelRegistry
 from services.steward.tasks import model_changes, reindex_jobs
 from services.steward.tasks.garbage_collection import collect_garbage
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs
 from shared.catalog.chunks import list_live_chunks, select_failed_photos
 from shared.catalog.generations import GenerationState
-from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
@@ -31,14 +32,13 @@ from shared.jobs.transitions import cancel_job, requeue_job, retry_job
 from tests.integration.extractor.model_changes import (
     PHOTOS,
     WIDTH,
-    do_one_step_a_slice,
-    do_slices,
     import_file,
     npy,
     photo_ids,
     some_centres,
 )
 from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_model_changes.py fits vocabularies on SQLite.
@@ -74,11 +74,7 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         "photos": PHOTOS,
         "failed": 0,
     }
-    assert (
-        job.progress_done
-        == job.progress_total
-        == 2 * PHOTOS + checkpointed_steps.FIT_PROGRESS_UNITS
-    )
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + FIT_PROGRESS_UNITS
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
@@ -152,68 +148,84 @@ def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: 
     assert averages.active().id == generation
 
 
-def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
-    vlads: Workplace,
-    workplace_of: Callable[[str], Workplace],
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_fit_is_the_same_for_its_seed(
+    vlads: Workplace, workplace_of: Callable[[str], Workplace]
 ) -> None:
-    params = {"clusters": 4, "sample": 5, "seed": 7}
-    vlads.upload(*range(PHOTOS))
-    whole = vlads.fit(**params)  # its clusters are found in one slice
-
-    do_one_step_a_slice(monkeypatch)
-    torn = workplace_of("test-tiny-vlad")
-    torn.upload(*range(PHOTOS))
-    job_id = torn.start(JobKind.FIT, **params)
-    progress = []
-    while torn.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
-        do_slices(monkeypatch, make_worker())  # each slice by a worker that knows nothing
-        progress.append((torn.job(job_id).progress_done, torn.job(job_id).progress_total))
-        assert len(progress) < 120
-    assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
-    done, totals = zip(*progress, strict=True)
-    assert set(totals) == {5 + checkpointed_steps.FIT_PROGRESS_UNITS + PHOTOS}, (
-        "what there is to do does not change"
-    )
-    assert list(done) == sorted(set(done)), "each slice is seen"
-    assert (done[2], done[-1]) == (5, 5 + checkpointed_steps.FIT_PROGRESS_UNITS)
-    again = torn.finish(job_id)
-    assert again.progress_done == totals[0]
-
-    other = workplace_of("test-tiny-vlad")
-    other.upload(*range(PHOTOS))
-    another = other.fit(**{**params, "seed": 8})
-
     fingerprints = []
-    for workplace, job in ((vlads, whole), (torn, again), (other, another)):
+    for workplace, seed in (
+        (vlads, 7),
+        (workplace_of("test-tiny-vlad"), 7),
+        (workplace_of("test-tiny-vlad"), 8),
+    ):
+        workplace.upload(*range(PHOTOS))
+        job = workplace.fit(clusters=4, sample=5, seed=seed)
         assert job.result is not None
         fingerprints.append(workplace.vocabulary(job.result["vocabulary_id"]).sha256)
     assert fingerprints[0] == fingerprints[1] != fingerprints[2]
-    provenances = [
-        p.vocabulary(p.active().vocabulary_id).provenance["passes"] for p in (vlads, torn)
-    ]
-    assert provenances[0] == provenances[1] > 1
 
 
-def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
+    fitted: Workplace,
+    workplace_of: Callable[[str], Workplace],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The child opens the catalog and the store of the settings itself."""
+    with_child = workplace_of("test-tiny-vlad")
+    with_child.upload(*range(PHOTOS))
+    progress: list[tuple[str | None, int]] = []
+    real = FitProgress.report
+
+    def report(self: FitProgress, *news: Any) -> None:
+        self._written = 0.0  # so that each is stored
+        real(self, *news)
+        job = with_child.job(job_id)
+        progress.append((job.stage, job.progress_done))
+
+    settings = with_child.settings.model_copy(
+        update={
+            "database_url": with_child.catalog.url.render_as_string(hide_password=False),
+            "upload_dir": with_child.store.root,
+            "device": "cpu",
+        }
+    )
+    monkeypatch.setattr(FitProgress, "report", report)
+    job_id = with_child.start(JobKind.FIT, **FIT)
+    models = ModelRegistry(with_child.store, settings, none_added)
+    worker = FitWorker(
+        with_child.catalog, with_child.store, models, settings, "with a child", lambda *_: None
+    )
+    assert worker.run_next(threading.Event())
+    total = with_child.job(job_id).progress_total
+    with_child.finish(job_id)
+    assert (
+        with_child.vocabulary(with_child.active().vocabulary_id).sha256
+        == fitted.vocabulary(fitted.active().vocabulary_id).sha256
+    )
+    stages, done = zip(*progress, strict=True)
+    assert [stage for stage, _ in itertools.groupby(stages)] == ["sample", "cluster"]
+    assert list(done) == sorted(done)
+    assert (done[-1], total) == (PHOTOS + FIT_PROGRESS_UNITS, 2 * PHOTOS + FIT_PROGRESS_UNITS)
+
+
+def test_a_fit_whose_process_is_killed_is_tried_again_and_then_fails(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     old = fitted.active().id
-    crashes = itertools.count(1)
+    deaths = itertools.count(1)
 
-    def crash(*_: Any) -> None:
-        next(crashes)
-        raise RuntimeError("out of memory")
+    def die(*_: Any) -> None:
+        next(deaths)
+        raise ChildKilled("its process was killed (SIGKILL)")
 
     job_id = fitted.start(JobKind.FIT, **FIT)
-    monkeypatch.setattr(VocabularyFitJob, "_cluster", crash)
+    monkeypatch.setattr(fits, "compute_fit", die)
     fitted.drain()
     job = fitted.job(job_id)
-    assert (job.state, job.stage) == (JobState.FAILED, "cluster")
-    assert next(crashes) == MAX_ATTEMPTS + 1
+    assert job.state == JobState.FAILED
+    assert next(deaths) == MAX_ATTEMPTS + 1
     assert job.error is not None
     assert job.error["code"] == "worker_crashed"
+    assert "its process was killed (SIGKILL)" in caplog.text
     monkeypatch.undo()
     assert fitted.active().id == old
 

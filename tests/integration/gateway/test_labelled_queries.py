@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
+from typing import Any
 from uuid import UUID
 
 import pytest
 
-from services.extractor.model_changes import VocabularyFitJob
+from services.extractor import fits
+from services.extractor.fits import VocabularyFitRequest
 from services.steward.tasks.compaction import merge_small_chunks
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
-from shared.descriptors.extractor import Extractor
-from shared.jobs import Job, JobKind, JobState
-from shared.storage.keys import job_work_key
+from shared.jobs import JobKind, JobState
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import FIT, Workplace
 from tests.support.photos import near_copy, photo_bytes
@@ -59,15 +58,17 @@ def test_a_vocabulary_is_learnt_from_database_photos_alone(
     photo_ids = vlads.upload(*range(8))
     become(vlads, PhotoRole.QUERY, *photo_ids[::2])
     seen: list[str] = []
-    real = VocabularyFitJob._sample
+    real = fits.compute_fit
 
-    def sample(self: VocabularyFitJob, job: Job, extractor: Extractor) -> None:
-        seen[:] = json.loads(vlads.store.get(job_work_key(job.id, "plan.json")))
-        real(self, job, extractor)
+    def compute(request: VocabularyFitRequest, *arguments: Any) -> Any:
+        seen.extend(request.photos)
+        return real(request, *arguments)
 
-    monkeypatch.setattr(VocabularyFitJob, "_sample", sample)
+    monkeypatch.setattr(fits, "compute_fit", compute)
     vlads.fit()
-    assert {UUID(photo_id) for photo_id in seen} == set(photo_ids[1::2])
+    with vlads.catalog.read() as session:
+        keys = {session.get_one(Photo, photo_id).object_key for photo_id in photo_ids[1::2]}
+    assert set(seen) == keys
     assert vlads.vocabulary(vlads.active().vocabulary_id).provenance["photos"] == 4
     assert set(vlads.rows()) == set(photo_ids)
 

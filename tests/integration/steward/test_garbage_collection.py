@@ -13,7 +13,6 @@ from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
     collect_ended_generations,
-    collect_model_change_files,
     collect_queries,
     collect_superseded_chunks,
 )
@@ -22,10 +21,9 @@ from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, get_photo
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState
+from shared.jobs import Job, JobKind
 from shared.storage import FolderStore
 from shared.storage.keys import (
-    job_work_key,
     local_features_key,
     preview_key,
     query_key,
@@ -192,23 +190,3 @@ def test_queries_go_when_their_time_is_over(chunk_map: ChunkMap) -> None:
 def add_one_job(chunk_map: ChunkMap, kind: JobKind, **columns: Any) -> UUID:
     with chunk_map.catalog.write() as session:
         return add_job(session, chunk_map.map_id, kind, **columns).id
-
-
-def test_what_a_model_change_kept_goes_when_it_needs_it_no_more(chunk_map: ChunkMap) -> None:
-    needed = [
-        add_one_job(chunk_map, JobKind.FIT),
-        add_one_job(chunk_map, JobKind.FIT, state=JobState.RUNNING, stage="cluster"),
-    ]
-    over = [
-        add_one_job(chunk_map, JobKind.FIT, state=JobState.CANCELLED),
-        add_one_job(chunk_map, JobKind.FIT, state=JobState.FAILED),
-        add_one_job(
-            chunk_map, JobKind.FIT, state=JobState.RUNNING, generation_id=chunk_map.generation_id
-        ),
-        new_id(),  # no one knows it
-    ]
-    for job_id in needed + over:
-        chunk_map.store.put(job_work_key(job_id, "plan.json"), b"[]")
-    chunk_map.store.put("work/stray.txt", b"?")
-    collect_model_change_files(chunk_map.catalog, chunk_map.store)
-    assert chunk_map.objects("work/") == {job_work_key(job_id, "plan.json") for job_id in needed}

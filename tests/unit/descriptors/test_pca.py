@@ -16,7 +16,6 @@ from sklearn.decomposition import PCA
 from shared.descriptors.pca_fit import (
     SAMPLE_BYTES,
     ArrayColumns,
-    PcaFit,
     StoredColumns,
     block_width,
     fit_pca,
@@ -146,26 +145,11 @@ def test_a_row_that_is_the_mean_or_nothing_becomes_zero_and_one_that_is_nan_stay
 
 
 @pytest.mark.parametrize(("count", "dimension"), [(60, 200), (200, 60)])
-def test_a_fit_is_the_same_when_it_was_interrupted_between_any_two_steps(
-    count: int, dimension: int
-) -> None:
+def test_progress_grows_by_a_step_to_its_end(count: int, dimension: int) -> None:
+    seen: list[tuple[int, int]] = []
     rows = ArrayColumns(unit_rows(count, dimension), block_bytes=40_000)
-    whole = fit_pca_columns(rows, 12)
-    parts, saved, progress = [], None, []
-    while True:
-        torn = PcaFit(rows, 12)
-        if saved is not None:
-            torn.resume(saved)
-        progress.append(torn.progress)
-        if torn.done:
-            break
-        part = torn.step()
-        if part is not None:
-            parts.append(part)
-        assert torn.parts == len(parts)
-        saved = torn.save()
-    assert torn.whitening(parts).sha256 == whole.sha256
-    assert progress == [(done, len(progress) - 1) for done in range(len(progress))]
+    fit_pca_columns(rows, 12, lambda done, total: seen.append((done, total)))
+    assert seen == [(done, len(seen)) for done in range(1, len(seen) + 1)]
 
 
 # --- the sample ------------------------------------------------------------------------------

@@ -43,23 +43,6 @@ def test_more_seeds_than_distinct_points_repeat_them() -> None:
     assert seeds_of(points, 6, seed=0).shape == (6, 4)
 
 
-def test_seeding_goes_on_where_it_was_interrupted() -> None:
-    points = unit_points(4, 60, 5)
-    at_once = seeds_of(points, 12, seed=3)
-    first = KMeansPlusPlus(points, seed=3)
-    for _ in range(5):
-        first.next()
-    second = KMeansPlusPlus.resume(
-        points,
-        chosen=list(first.chosen),
-        distances=first.distances.clone(),
-        generator_state=first.generator.get_state(),
-    )
-    while len(second.chosen) < 12:
-        second.next()
-    assert torch.equal(second.centres(), at_once)
-
-
 def test_a_pass_ends_with_plain_means_that_are_not_normalised_again() -> None:
     points = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     centres = torch.tensor([[0.7, 0.7], [-1.0, 0.0]])

@@ -1,15 +1,11 @@
-"""Checkpointed steps of model changes: time-limited work, progress, and creation of generations.
+"""The end of a model change's own work: its vocabulary or whitening, and the new generation.
 
-A model change runs in steps of about a second, so that queries run in between. After each step the
-state is stored and the job is released (`checkpoint_and_release`), so that any worker can run the
-next one. All transactions run under the job's lease.
+All is stored in one transaction, under the job's lease.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy.orm import Session
@@ -31,9 +27,8 @@ from shared.descriptors.vocabulary_file import Provenance
 from shared.jobs import Job
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.model_changes import create_generation
-from shared.jobs.transitions import release_job
 from shared.storage import ObjectStore
-from shared.storage.keys import job_work_key, new_vocabulary_key, new_whitening_key
+from shared.storage.keys import new_vocabulary_key, new_whitening_key
 
 
 def map_extractor(catalog: Catalog, models: ModelRegistry, job: Job) -> Extractor:
@@ -152,82 +147,3 @@ def _set_describe_progress(session: Session, job: Job, progress_done: int, **par
     job.attempts = 0
     job.progress_done = progress_done
     job.progress_total = progress_done + count_live_photos(session, job.map_id)
-
-
-def checkpoint_and_release(catalog: Catalog, job: Job, **columns: Any) -> None:
-    """Store the step's outcome in the job's `columns` and return the job to the queue."""
-    with catalog.write() as session:
-        for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
-            for name, value in columns.items():
-                setattr(owned, name, value)
-            owned.attempts = 0
-            release_job(owned)
-
-
-STEP_SECONDS = 1.0  # about the time of a batch: the longest that a query has to wait
-FIT_PROGRESS_UNITS = 100  # units of job progress for the fit: its steps in per cent
-
-
-class IncrementalFit(Protocol):
-    """A fit that runs step by step and can be saved between two steps."""
-
-    @property
-    def done(self) -> bool:
-        """Whether no step is left."""
-
-    @property
-    def progress(self) -> tuple[int, int]:
-        """Steps done, and total steps."""
-
-    def save(self) -> bytes:
-        """Serialise the state between two steps."""
-
-    def resume(self, data: bytes) -> None:
-        """Restore a saved state."""
-
-
-def time_slice() -> Iterator[None]:
-    """Yield once, and then until about STEP_SECONDS have passed."""
-    deadline = time.monotonic() + STEP_SECONDS
-    while True:
-        yield
-        if time.monotonic() >= deadline:
-            return
-
-
-def run_fit_steps(
-    catalog: Catalog,
-    store: ObjectStore,
-    job: Job,
-    fit: IncrementalFit,
-    step: Callable[[], object],
-    *,
-    resumed_param: str,
-    progress_done: int,
-) -> bool:
-    """Run steps of a fit for about STEP_SECONDS; checkpoint the job if the fit is not finished.
-
-    The fit is resumed from its checkpoint if the job's parameter `resumed_param` says that there is
-    one. `progress_done` is the progress of the job before the fit.
-
-    Returns:
-        Whether the fit is finished.
-    """
-    checkpoint_key = job_work_key(job.id, "fit.npz")
-    if job.params.get(resumed_param):
-        fit.resume(store.get(checkpoint_key))
-    for _ in time_slice():
-        if fit.done:
-            break
-        step()
-    if fit.done:
-        return True
-    store.put(checkpoint_key, fit.save())
-    done, total = fit.progress
-    checkpoint_and_release(
-        catalog,
-        job,
-        params={**job.params, resumed_param: True},
-        progress_done=progress_done + FIT_PROGRESS_UNITS * done // total,
-    )
-    return False
