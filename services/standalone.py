@@ -35,7 +35,7 @@ from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
-from services.steward.tasks.maintenance import release_expired_leases
+from services.steward.tasks.maintenance import reclaim_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
 from shared.catalog.database.schema import migrate, sqlite_file
@@ -151,7 +151,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             with catalog.write() as session:
                 delete_dead_search_workers(session, all_workers=True)
                 delete_processes(session, "extractor")
-            release_expired_leases(catalog, all_leases=True)
+            reclaim_leases(catalog, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]

@@ -119,7 +119,7 @@ def make_loss(name: str) -> nn.Module:
 
     Raises:
         Unprocessable: `unknown_loss`.
-        InvalidRequest: `own_module_unfit`.
+        InvalidRequest: `own_module_unusable`.
     """
     if is_own_module(name):
         return make_own_module("loss_name", name)
@@ -210,7 +210,7 @@ def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
 
     Raises:
         Unprocessable: `unknown_miner`.
-        InvalidRequest: `own_module_unfit`.
+        InvalidRequest: `own_module_unusable`.
     """
     if name is None or name.strip().lower() == NO_MINER:
         return None

@@ -134,7 +134,7 @@ def register_own_modules(arguments: TrainingArguments) -> None:
     """Import the backbone and the aggregator that the arguments name by module path.
 
     Raises:
-        InvalidRequest: `own_module_unfit`, if one cannot be imported or is not what it should be.
+        InvalidRequest: `own_module_unusable`, if one can't be imported or is not what it should be.
     """
     if is_own_module(arguments.backbone_arch):
         build: Callable[[bool], nn.Module] = _import_object(
@@ -144,7 +144,7 @@ def register_own_modules(arguments: TrainingArguments) -> None:
     if is_own_module(arguments.agg_arch):
         aggregator = _import_object("agg_arch", arguments.agg_arch)
         if not (isinstance(aggregator, type) and issubclass(aggregator, Aggregator)):
-            raise _unfit_error(
+            raise _unusable_error(
                 "agg_arch",
                 arguments.agg_arch,
                 "it is not a subclass of Aggregator "
@@ -157,17 +157,17 @@ def make_own_module(argument: str, path: str) -> nn.Module:
     """Create a loss or miner of the user by calling what `path` names, without arguments.
 
     Raises:
-        InvalidRequest: `own_module_unfit`; also for a module with parameters, because the optimizer
-            trains those of the network only.
+        InvalidRequest: `own_module_unusable`; also for a module with parameters, because the
+            optimizer trains those of the network only.
     """
     try:
         made = _import_object(argument, path)()
     except TypeError as error:
-        raise _unfit_error(argument, path, str(error)) from error
+        raise _unusable_error(argument, path, str(error)) from error
     if not isinstance(made, nn.Module):
-        raise _unfit_error(argument, path, "it does not make a torch.nn.Module")
+        raise _unusable_error(argument, path, "it does not make a torch.nn.Module")
     if any(True for _ in made.parameters()):
-        raise _unfit_error(argument, path, "it has parameters of its own, which are not trained")
+        raise _unusable_error(argument, path, "it has parameters of its own, which are not trained")
     return made
 
 
@@ -175,7 +175,7 @@ def _import_object(argument: str, path: str) -> Any:
     """Import `package.module:Name`; modules in the working directory are found, too.
 
     Raises:
-        InvalidRequest: `own_module_unfit`.
+        InvalidRequest: `own_module_unusable`.
     """
     module_name, _, name = path.partition(":")
     here = str(Path.cwd())
@@ -184,11 +184,11 @@ def _import_object(argument: str, path: str) -> Any:
     try:
         found = getattr(importlib.import_module(module_name), name)
     except Exception as error:  # whatever the module's own code raises
-        raise _unfit_error(argument, path, f"{type(error).__name__}: {error}") from error
+        raise _unusable_error(argument, path, f"{type(error).__name__}: {error}") from error
     if not callable(found):
-        raise _unfit_error(argument, path, "it is not a class or function")
+        raise _unusable_error(argument, path, "it is not a class or function")
     return found
 
 
-def _unfit_error(argument: str, path: str, reason: str) -> InvalidRequest:
-    return InvalidRequest("own_module_unfit", f"--{argument} {path} can't be used: {reason}.")
+def _unusable_error(argument: str, path: str, reason: str) -> InvalidRequest:
+    return InvalidRequest("own_module_unusable", f"--{argument} {path} can't be used: {reason}.")

@@ -172,7 +172,7 @@ class ModelImporter:
         """Validate the checkpoint at `object_key`, store its model file, and add its catalog row.
 
         Raises:
-            Unprocessable: As `load_checkpoint` raises it; `model_unfit`, `checkpoint_lost`.
+            Unprocessable: As `load_checkpoint` raises it; `model_unusable`, `checkpoint_lost`.
             Conflict: `model_name_taken`.
         """
         filename = job.params["filename"]

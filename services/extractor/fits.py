@@ -251,7 +251,7 @@ class FitWorker:
         extractor = map_extractor(self._catalog, self._models, job)
         if not extractor.config.needs_vocabulary:
             raise Unprocessable(
-                "vocabulary_unfit",
+                "vocabulary_unusable",
                 f"The extractor {extractor.config.name} uses no vocabulary: "
                 "there is nothing to fit.",
             )

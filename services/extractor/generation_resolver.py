@@ -42,7 +42,7 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
-from shared.jobs.transitions import fail_job, release_job
+from shared.jobs.transitions import fail_job, requeue_job
 from shared.storage import ObjectStore
 from shared.storage.keys import new_vocabulary_key
 
@@ -172,7 +172,7 @@ def defer_until_vocabulary(catalog: Catalog, jobs: list[Job]) -> None:
             if job.kind == JobKind.DESCRIBE and not has_generation:
                 fail_job(job, error.as_problem())
             else:
-                release_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
+                requeue_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
 
 
 def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:

@@ -37,7 +37,7 @@ class _VocabularySwitchJob:
         """Import the vocabulary file at `object_key`.
 
         Raises:
-            Unprocessable: `vocabulary_unfit` if the map's extractor can't use it.
+            Unprocessable: `vocabulary_unusable` if the map's extractor can't use it.
         """
         extractor = map_extractor(self.catalog, self.models, job)
         imported = decode_vocabulary(self.store.get(job.params["object_key"]))
@@ -60,7 +60,7 @@ class _VocabularySwitchJob:
         goes on doing so.
 
         Raises:
-            Unprocessable: `vocabulary_unfit` if the extractor can't use the vocabulary, or if it
+            Unprocessable: `vocabulary_unusable` if the extractor can't use the vocabulary, or if it
                 needs one and None was given.
         """
         if job.params.get("extractor") is None:
@@ -84,7 +84,7 @@ class _VocabularySwitchJob:
                 return
             if extractor.config.needs_vocabulary:
                 raise Unprocessable(
-                    "vocabulary_unfit",
+                    "vocabulary_unusable",
                     f"The extractor {extractor.config.name} needs a vocabulary. Choose one with "
                     "`vocabulary_id`.",
                 )
@@ -105,8 +105,8 @@ class _VocabularySwitchJob:
     ) -> None:
         """Create the generation, with the whitening that the job names, if any.
 
-        A reindexed generation keeps its whitening. Unprocessable (`pca_unfit`) if the whitening was
-        fitted on other descriptors.
+        A reindexed generation keeps its whitening. Unprocessable (`pca_unusable`) if the whitening
+        was fitted on other descriptors.
         """
         whitening_id = job.params.get("whitening_id")
         if whitening_id is None:

@@ -25,7 +25,7 @@ from shared.ids import new_id
 from shared.jobs import JobKind
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import distinct_request_ids
-from shared.jobs.transitions import cancel_job, fail_job, release_job, succeed_job
+from shared.jobs.transitions import cancel_job, fail_job, requeue_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, encode_rows, write_chunk
 from shared.storage.keys import query_vector_key
@@ -96,7 +96,7 @@ def _publish_photos(
         if generation.state not in _accepted_generation_states(batch.kind):
             # A model change was activated or abandoned while the batch was computed.
             for job in owned.values():
-                cancel_job(job) if batch.kind == JobKind.REINDEX else release_job(job)
+                cancel_job(job) if batch.kind == JobKind.REINDEX else requeue_job(job)
             return outcome
         live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
         # A batch that lost its lease after its commit has described photos already.

@@ -186,7 +186,7 @@ class ExtractorWorker:
             while upcoming is not None:
                 if out_of_time():
                     with upcoming.lease:
-                        self._runner.release(upcoming)
+                        self._runner.requeue(upcoming)
                     result.interrupted = True
                     break
                 current = upcoming

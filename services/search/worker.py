@@ -361,6 +361,6 @@ def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:
     try:
         weighted = apply_word_weights(row, weights)
     except ValueError as error:
-        raise InvalidRequest("word_weights_unfit", f"{error}.") from None
+        raise InvalidRequest("word_weights_mismatch", f"{error}.") from None
     # float32 like all rows, so that every search strategy uses the same query.
     return None if weighted is None else weighted.astype(np.float32)

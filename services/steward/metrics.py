@@ -1,7 +1,4 @@
-"""Prometheus metrics of a steward: runs of periodic tasks, repairs, deletions and jobs.
-
-A periodic task is called `duty` in metric names and labels.
-"""
+"""Prometheus metrics of a steward: runs of periodic tasks, repairs, deletions and jobs."""
 
 from __future__ import annotations
 
@@ -30,20 +27,20 @@ class StewardMetrics:
         gauge = partial(Gauge, namespace=METRIC_PREFIX, registry=registry)
         histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=registry)
         self._task_runs = counter(
-            "duties",
-            "Runs of each periodic task by outcome: done, failed, or catalog_away.",
-            ["duty", "outcome"],
+            "tasks",
+            "Runs of each periodic task by outcome: done, failed, or catalog_unavailable.",
+            ["task", "outcome"],
         )
         self._task_seconds = histogram(
-            "duty_seconds",
+            "task_seconds",
             "Duration of a run of a periodic task, in seconds.",
-            ["duty"],
+            ["task"],
             buckets=TASK_BUCKETS_SECONDS,
         )
         self.leases_expired = counter(
             "leases_expired", "Jobs whose lease expired because their worker died."
         )
-        self.hints_resent = counter("hints_resent", "Wakeups sent again for waiting jobs.")
+        self.wakeups_resent = counter("wakeups_resent", "Wakeups sent again for waiting jobs.")
         self.slots_merged = counter("slots_merged", "Slots whose chunks were merged into one.")
         self.journal_lines = counter("journal_lines", "Catalog rows written to the journal.")
         self.catalog_lag_segments = gauge(
@@ -52,7 +49,7 @@ class StewardMetrics:
             "older catalog was restored.",
         )
         self.objects_deleted = counter(
-            "objects_deleted", "Deleted objects that nothing referred to any more.", ["duty"]
+            "objects_deleted", "Deleted objects that nothing referred to any more.", ["task"]
         )
         self.objects_trashed = counter("objects_trashed", "Orphaned objects moved to the trash.")
         self.collection_held = gauge(
@@ -70,11 +67,11 @@ class StewardMetrics:
 
     def observe_task(self, name: str, outcome: str, seconds: float) -> None:
         """Record a run of a periodic task."""
-        duty = name.replace(" ", "_")
-        self._task_runs.labels(duty, outcome).inc()
-        self._task_seconds.labels(duty).observe(seconds)
+        task = name.replace(" ", "_")
+        self._task_runs.labels(task, outcome).inc()
+        self._task_seconds.labels(task).observe(seconds)
         if outcome == "done":
-            self._last_success[duty] = time.monotonic()
+            self._last_success[task] = time.monotonic()
 
     def count_jobs(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
         """Record a slice of the steward's own jobs."""
@@ -87,11 +84,11 @@ class _TaskLagCollector(Collector):
 
     def collect(self) -> Iterable[Metric]:
         lag = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_duty_lag_seconds",
+            f"{METRIC_PREFIX}_task_lag_seconds",
             "Seconds since the last successful run of the periodic task.",
-            labels=["duty"],
+            labels=["task"],
         )
         now = time.monotonic()
-        for duty, succeeded_at in dict(self._last_success).items():
-            lag.add_metric([duty], now - succeeded_at)
+        for task, succeeded_at in dict(self._last_success).items():
+            lag.add_metric([task], now - succeeded_at)
         yield lag

@@ -30,7 +30,7 @@ from services.steward.tasks.maintenance import (
     delete_old_jobs,
     delete_old_searches,
     delete_old_tracks,
-    release_expired_leases,
+    reclaim_leases,
     resend_wakeups,
     update_statistics_of_large_maps,
 )
@@ -130,14 +130,14 @@ class Scheduler:
         self.tasks = [
             *([PeriodicTask("keep disk reserve", 5.0, reserve.maintain)] if reserve else []),
             PeriodicTask(
-                "free leases",
+                "reclaim leases",
                 1.0,
-                lambda: metrics.leases_expired.inc(release_expired_leases(catalog)),
+                lambda: metrics.leases_expired.inc(reclaim_leases(catalog)),
             ),
             PeriodicTask(
-                "resend hints",
+                "resend wakeups",
                 2.0,
-                lambda: metrics.hints_resent.inc(resend_wakeups(catalog, wakeups)),
+                lambda: metrics.wakeups_resent.inc(resend_wakeups(catalog, wakeups)),
             ),
             PeriodicTask(
                 "advance model changes",
@@ -154,7 +154,7 @@ class Scheduler:
                 1.0,
                 lambda: cancel_items_of_ended_batches(catalog),
             ),
-            PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
+            PeriodicTask("repair generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
             PeriodicTask(
                 "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
@@ -267,7 +267,7 @@ class Scheduler:
             if task.uses_catalog:
                 self._outage.record_success()
         except SQLAlchemyError as error:
-            outcome = "catalog_away"
+            outcome = "catalog_unavailable"
             self._outage.record_error(error)
         except Exception:  # a failed task must not stop the others
             outcome = "failed"

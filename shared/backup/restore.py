@@ -29,7 +29,7 @@ from shared.catalog.maps import DEFAULT_MAP, Map
 from shared.catalog.processes import RegisteredSearchWorker
 from shared.errors import Conflict, Misconfigured, NotFound
 from shared.jobs.model_changes import cancel_model_change
-from shared.jobs.transitions import cancel_job, release_job
+from shared.jobs.transitions import cancel_job, requeue_job
 from shared.storage import ObjectStore
 from shared.storage.copying import copy_object, hash_object
 
@@ -160,7 +160,7 @@ def _copy_objects(folder: BackupFolder, store: ObjectStore, progress: BackupProg
 def _cancel_unfinished_work(session: Session) -> int:
     """Release all leases, and cancel jobs that can't be resumed; return their number."""
     for job in session.scalars(select(Job).where(Job.lease_token.is_not(None))).all():
-        release_job(job)
+        requeue_job(job)
     jobs = session.scalars(
         select(Job).where(
             Job.state.in_(UNFINISHED_STATES),

@@ -123,7 +123,7 @@ class Extractor:
             limit: The batch size limit that was measured for `backbone`.
 
         Raises:
-            Misconfigured: `weights_missing`, `weights_unfit`, `torchhub_unfit`.
+            Misconfigured: `weights_missing`, `weights_unusable`, `torchhub_unusable`.
             PlacewiseError: For a checkpoint, as `TrainedBackbone.from_checkpoint` raises.
         """
         self.config = config
@@ -148,7 +148,7 @@ class Extractor:
     def shipped_vocabulary(self) -> tuple[ClusterCentres, dict[str, Any]] | None:
         """Return the vocabulary shipped with the extractor and its provenance, or None.
 
-        Raises Misconfigured (`vocabulary_unfit`) if it was fitted with other weights.
+        Raises Misconfigured (`vocabulary_unusable`) if it was fitted with other weights.
         """
         if self.config.shipped_vocabulary is None:
             return None
@@ -157,7 +157,7 @@ class Extractor:
         provenance = json.loads(path.with_suffix(".json").read_text())
         if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
             raise Misconfigured(
-                "vocabulary_unfit",
+                "vocabulary_unusable",
                 f"The shipped vocabulary {path.name} was fitted with other weights "
                 f"({provenance['backbone_fingerprint'][:12]}) than those installed "
                 f"({self.backbone.fingerprint[:12]}). Install the pinned packages: `make setup`.",

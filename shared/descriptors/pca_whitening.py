@@ -133,10 +133,10 @@ class PcaWhiteningFile:
         `spec` is that of descriptors before projection. If the spec of the fitted rows is unknown,
         only the dimension is compared.
 
-        Raises Unprocessable (`pca_unfit`) naming the differences.
+        Raises Unprocessable (`pca_unusable`) naming the differences.
         """
         if self.whitening.dimension != spec["dimension"]:
-            raise _pca_unfit_error(
+            raise _pca_unusable_error(
                 f"it projects descriptors of {self.whitening.dimension} dimensions, but these "
                 f"have {spec['dimension']}"
             )
@@ -148,18 +148,20 @@ class PcaWhiteningFile:
             if key not in IGNORED_SPEC_FIELDS and spec.get(key) != self.spec.get(key)
         ]
         if differing:
-            raise _pca_unfit_error(f"it was fitted on other descriptors ({'; '.join(differing)})")
+            raise _pca_unusable_error(
+                f"it was fitted on other descriptors ({'; '.join(differing)})"
+            )
 
 
 def decode_whitening(data: bytes) -> PcaWhiteningFile:
     """Decode and validate a PCA file.
 
-    Raises Unprocessable (`pca_unfit`) with the reason.
+    Raises Unprocessable (`pca_unusable`) with the reason.
     """
     try:
         stored = load(data)
     except SafetensorError as error:
-        raise _pca_unfit_error(
+        raise _pca_unusable_error(
             f"it is not a safetensors file, or it is truncated ({error})"
         ) from error
     return PcaWhiteningFile(_whitening(stored), _spec(data))
@@ -174,32 +176,32 @@ def _spec(data: bytes) -> dict[str, Any] | None:
     try:
         spec = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _pca_unfit_error(f"its spec can't be read ({error})") from error
+        raise _pca_unusable_error(f"its spec can't be read ({error})") from error
     if not isinstance(spec, dict):
-        raise _pca_unfit_error("its spec is not a JSON object")
+        raise _pca_unusable_error("its spec is not a JSON object")
     return spec
 
 
 def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
     missing = [name for name in TENSOR_NAMES if name not in stored]
     if missing:
-        raise _pca_unfit_error(f"it has no {', '.join(missing)}")
+        raise _pca_unusable_error(f"it has no {', '.join(missing)}")
     mean, directions, variances = (_floats(stored, name) for name in TENSOR_NAMES[:3])
     shapes = (mean.shape, variances.shape)
     if directions.ndim != 2 or shapes != (directions.shape[1:], directions.shape[:1]):
-        raise _pca_unfit_error(
+        raise _pca_unusable_error(
             f"its mean {mean.shape}, directions {directions.shape} and variances "
             f"{variances.shape} do not match: (D,), (d, D) and (d,) are expected"
         )
     components, dimension = directions.shape
     if not 0 < components <= dimension:
-        raise _pca_unfit_error(f"it projects {dimension} dimensions to {components}")
+        raise _pca_unusable_error(f"it projects {dimension} dimensions to {components}")
     if not (variances > 0).all():
-        raise _pca_unfit_error("a variance is not positive")
+        raise _pca_unusable_error("a variance is not positive")
     # Unit directions divided by their standard deviation, within the precision of float32.
     lengths = np.linalg.norm(directions, axis=1) * np.sqrt(variances)
     if not np.allclose(lengths, 1.0, rtol=0.01):
-        raise _pca_unfit_error("its directions do not match its variances")
+        raise _pca_unusable_error("its directions do not match its variances")
     try:
         return PcaWhitening(
             mean,
@@ -209,20 +211,22 @@ def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
             rows=int(stored["rows"].item()),
         )
     except ValueError as error:
-        raise _pca_unfit_error(f"explained and rows must be one number each ({error})") from error
+        raise _pca_unusable_error(
+            f"explained and rows must be one number each ({error})"
+        ) from error
 
 
 def _floats(stored: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
     array = stored[name]
     if array.dtype != np.float32:
-        raise _pca_unfit_error(f"its {name} is {array.dtype}, not float32")
+        raise _pca_unusable_error(f"its {name} is {array.dtype}, not float32")
     floats = array.astype(np.float32, copy=False)
     if not np.isfinite(floats).all():
-        raise _pca_unfit_error(f"its {name} holds NaN or infinite numbers")
+        raise _pca_unusable_error(f"its {name} holds NaN or infinite numbers")
     return floats
 
 
-def _pca_unfit_error(reason: str) -> Unprocessable:
+def _pca_unusable_error(reason: str) -> Unprocessable:
     return Unprocessable(
-        "pca_unfit", f"The PCA file can't be used: {reason}. Fit a new one on the map's rows."
+        "pca_unusable", f"The PCA file can't be used: {reason}. Fit a new one on the map's rows."
     )

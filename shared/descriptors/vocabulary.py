@@ -66,38 +66,38 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
             check.
 
     Raises:
-        Unprocessable: `vocabulary_unfit`, with the reason.
+        Unprocessable: `vocabulary_unusable`, with the reason.
     """
 
-    def unfit(reason: str) -> Unprocessable:
-        return Unprocessable("vocabulary_unfit", f"This is not a usable vocabulary: {reason}.")
+    def unusable(reason: str) -> Unprocessable:
+        return Unprocessable("vocabulary_unusable", f"This is not a usable vocabulary: {reason}.")
 
     if array.ndim != 2 or 0 in array.shape:
-        raise unfit(f"its shape is {array.shape}, not (clusters, dimension)")
+        raise unusable(f"its shape is {array.shape}, not (clusters, dimension)")
     if array.dtype.kind != "f":
-        raise unfit(f"its numbers are {array.dtype}, not floating point")
+        raise unusable(f"its numbers are {array.dtype}, not floating point")
     with np.errstate(over="ignore"):  # overflow becomes infinite and is rejected below
         array = np.ascontiguousarray(array, dtype=np.float32)
     if width is not None and array.shape[1] != width:
-        raise unfit(
+        raise unusable(
             f"its centres have {array.shape[1]} dimensions, the extractor's local features {width}"
         )
     if not np.isfinite(array).all():
-        raise unfit("it holds NaN or infinite numbers")
+        raise unusable("it holds NaN or infinite numbers")
     norms = np.linalg.norm(array.astype(np.float64), axis=1)
     zero = np.flatnonzero(norms < 1e-6)
     if len(zero):
-        raise unfit(f"centre {int(zero[0])} is zero")
+        raise unusable(f"centre {int(zero[0])} is zero")
     longest = int(norms.argmax())
     if norms[longest] > MAX_CENTRE_NORM:
-        raise unfit(
+        raise unusable(
             f"the norm of centre {longest} is {norms[longest]:.3g}, more than "
             f"{MAX_CENTRE_NORM:.0e}, with which residuals may overflow; centres of unit vectors "
             "have a norm of at most 1"
         )
     distinct = len(np.unique(array, axis=0))
     if distinct != len(array):
-        raise unfit(f"only {distinct} of its {len(array)} centres are distinct")
+        raise unusable(f"only {distinct} of its {len(array)} centres are distinct")
     return ClusterCentres(array, hashlib.sha256(array.tobytes()).hexdigest())
 
 
@@ -109,13 +109,13 @@ def encode_centres(centres: ClusterCentres) -> bytes:
 def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
     """Decode and validate the centres in the bytes of a `.npy` file.
 
-    Raises Unprocessable (`vocabulary_unfit`).
+    Raises Unprocessable (`vocabulary_unusable`).
     """
     try:
         array = decode_array(data)
     except ARRAY_READ_ERRORS as error:
         raise Unprocessable(
-            "vocabulary_unfit",
+            "vocabulary_unusable",
             "This is not a NumPy .npy file of cluster centres, or it is truncated.",
         ) from error
     return parse_centres(array, width=width)
@@ -133,13 +133,13 @@ def decode_array(data: bytes) -> NDArray[Any]:
 
     Nothing is unpickled, and no more memory is allocated than there are bytes.
 
-    Raises one of ARRAY_READ_ERRORS for other bytes, and Unprocessable (`vocabulary_unfit`) for
+    Raises one of ARRAY_READ_ERRORS for other bytes, and Unprocessable (`vocabulary_unusable`) for
     pickled objects.
     """
     file = io.BytesIO(data)
     shape, fortran_order, dtype = read_npy_header(file)
     if dtype.hasobject:
-        raise Unprocessable("vocabulary_unfit", "This file holds pickled objects, not numbers.")
+        raise Unprocessable("vocabulary_unusable", "This file holds pickled objects, not numbers.")
     if math.prod(shape) * dtype.itemsize != len(data) - file.tell():
         raise ValueError("the header does not match the size of the data")
     values = np.frombuffer(data, dtype, offset=file.tell())

@@ -87,18 +87,18 @@ def check_vocabulary_fits(
 
     A vocabulary of unknown origin only needs the same width.
 
-    Raises Unprocessable (`vocabulary_unfit`) naming both specs.
+    Raises Unprocessable (`vocabulary_unusable`) naming both specs.
     """
     if not extractor.config.needs_vocabulary:
         raise Unprocessable(
-            "vocabulary_unfit", f"The extractor {extractor.config.name} uses no vocabulary."
+            "vocabulary_unusable", f"The extractor {extractor.config.name} uses no vocabulary."
         )
     computed = feature_provenance(extractor)
     if has_provenance(provenance):
         fitted_on = {key: provenance.get(key) for key in computed}
         if fitted_on != computed:
             raise Unprocessable(
-                "vocabulary_unfit",
+                "vocabulary_unusable",
                 f"The vocabulary was fitted on {_describe_features(fitted_on)}; the extractor "
                 f"{extractor.config.name} computes {_describe_features(computed)}. Fit a "
                 "vocabulary with this extractor.",
@@ -115,11 +115,11 @@ def check_vocabulary_width(
 
     `width` None skips the check: the width is known only after the network is loaded.
 
-    Raises Unprocessable (`vocabulary_unfit`).
+    Raises Unprocessable (`vocabulary_unusable`).
     """
     if width is not None and centres.dimension != width:
         raise Unprocessable(
-            "vocabulary_unfit",
+            "vocabulary_unusable",
             f"The vocabulary has {centres.dimension} dimensions, the local features of "
             f"{config.name} {width}.",
         )
@@ -163,7 +163,7 @@ class VocabularyFile:
 def decode_vocabulary(data: bytes) -> VocabularyFile:
     """Decode and validate the bytes of a `.npz` or `.npy` file.
 
-    Raises Unprocessable (`vocabulary_unfit`).
+    Raises Unprocessable (`vocabulary_unusable`).
     """
     if not data.startswith(b"PK"):
         return VocabularyFile(decode_centres(data), UNKNOWN_PROVENANCE)
@@ -172,23 +172,25 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
             infos = archive.infolist()
             # Checked before reading: many members may overlap in the same bytes.
             if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
-                raise _vocabulary_unfit_error(
+                raise _vocabulary_unusable_error(
                     f"it holds {_join_some([info.filename for info in infos]) or 'nothing'}"
                 )
             members = {info.filename: _read(archive, info) for info in infos}
     except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
-        raise _vocabulary_unfit_error(f"it can't be read ({error})") from error
+        raise _vocabulary_unusable_error(f"it can't be read ({error})") from error
     centres = decode_centres(members[f"{CENTRES}.npy"])
     provenance = _decode_provenance(members[f"{PROVENANCE}.npy"])
     if provenance.get("sha256") != centres.sha256:
-        raise _vocabulary_unfit_error("its provenance belongs to other centres (the hash differs)")
+        raise _vocabulary_unusable_error(
+            "its provenance belongs to other centres (the hash differs)"
+        )
     return VocabularyFile(centres, provenance)
 
 
 def read_vocabulary(path: Path) -> VocabularyFile:
     """Read and validate a `.npz`, `.npy` or `.pt` file.
 
-    Raises Unprocessable (`vocabulary_unfit`).
+    Raises Unprocessable (`vocabulary_unusable`).
     """
     if path.suffix != ".pt":
         return decode_vocabulary(path.read_bytes())
@@ -203,15 +205,17 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 def _decode_provenance(data: bytes) -> Provenance:
     if len(data) > MAX_PROVENANCE_BYTES:
-        raise _vocabulary_unfit_error("its provenance is too long")
+        raise _vocabulary_unusable_error("its provenance is too long")
     try:
         array = decode_array(data)
         text = array.item() if array.dtype.kind == "U" and array.size == 1 else ""
         provenance: Any = json.loads(text)
     except (*ARRAY_READ_ERRORS, RecursionError) as error:
-        raise _vocabulary_unfit_error(f"its provenance can't be read ({error})") from error
+        raise _vocabulary_unusable_error(f"its provenance can't be read ({error})") from error
     if not isinstance(provenance, dict) or not has_provenance(provenance):
-        raise _vocabulary_unfit_error("its provenance does not name the features it was fitted on")
+        raise _vocabulary_unusable_error(
+            "its provenance does not name the features it was fitted on"
+        )
     return provenance
 
 
@@ -220,9 +224,9 @@ def _join_some(names: list[str]) -> str:
     return ", ".join(sorted(names)[:3]) + more
 
 
-def _vocabulary_unfit_error(reason: str) -> Unprocessable:
+def _vocabulary_unusable_error(reason: str) -> Unprocessable:
     return Unprocessable(
-        "vocabulary_unfit",
+        "vocabulary_unusable",
         f"This .npz is not a vocabulary file as written by `placewise vocabulary fit DIR --out`: "
         f"{reason}.",
     )
@@ -243,11 +247,11 @@ def _read_tensor(path: Path) -> ClusterCentres:
             check_declared_size([tensor], path)
     except TENSOR_READ_ERRORS as error:
         raise Unprocessable(
-            "vocabulary_unfit", f"{path.name} is not a PyTorch tensor file: {error}"
+            "vocabulary_unusable", f"{path.name} is not a PyTorch tensor file: {error}"
         ) from error
     if not isinstance(tensor, torch.Tensor):
         raise Unprocessable(
-            "vocabulary_unfit",
+            "vocabulary_unusable",
             f"{path.name} holds a {type(tensor).__name__}, expected one tensor.",
         )
     # Copied: it is mapped from the file, which may change.

@@ -28,7 +28,7 @@ from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields
 from shared.ingest.validation import ValidatedPhoto
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.transitions import requeue_job
+from shared.jobs.transitions import requeue_job_as_new
 
 COORDINATE_TOLERANCE_DEGREES = 1e-7  # about a centimetre
 
@@ -185,7 +185,7 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
         photo.relative_path = fields.relative_path
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
-        requeue_job(job)
+        requeue_job_as_new(job)
         return StoreResult(photo, job, queued=True)
     return StoreResult(photo, job, queued=False)
 

@@ -36,7 +36,7 @@ from shared.integrity.referenced_objects import (
     list_referenced_objects,
     plural,
 )
-from shared.jobs.transitions import requeue_job
+from shared.jobs.transitions import requeue_job_as_new
 from shared.jobs.wakeups import Wakeups
 from shared.storage import ObjectStore
 from shared.storage.chunks import decode_rows, manifest_key, rows_are_valid
@@ -358,7 +358,7 @@ def _queue_photo(session: Session, photo: Photo) -> None:
     if job is not None and job.state in UNFINISHED_STATES:
         return
     if job is not None:
-        requeue_job(job)
+        requeue_job_as_new(job)
         return
     photo.job_id = new_id()
     session.add(

@@ -1,7 +1,7 @@
 """The job queue: claims, leases, the job runner, state transitions and wakeups.
 
-The `jobs` table is the queue and the only source of truth. A wakeup (`shared.jobs.wakeups`; the
-metrics call it a hint) only makes a worker look at the table sooner.
+The `jobs` table is the queue and the only source of truth. A wakeup (`shared.jobs.wakeups`) only
+makes a worker look at the table sooner.
 """
 
 from shared.catalog.jobs import Job, JobKind, JobState, Priority

@@ -42,7 +42,7 @@ from shared.jobs.transitions import (
     cancel_job,
     cancel_jobs,
     make_waiting_jobs_claimable,
-    release_job,
+    requeue_job,
 )
 
 
@@ -113,7 +113,7 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
         increment_map_version(session, job.map_id)
     job.generation_id = generation.id
     job.stage = "describe"
-    release_job(job, waiting_for=WaitingFor.DESCRIPTORS)
+    requeue_job(job, waiting_for=WaitingFor.DESCRIPTORS)
     return generation
 
 

@@ -45,7 +45,7 @@ from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs
 from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.transitions import cancel_batch_items, fail_job, release_job
+from shared.jobs.transitions import cancel_batch_items, fail_job, requeue_job
 from shared.telemetry.tracing import request_id_context, span
 
 log = logging.getLogger(__name__)
@@ -196,9 +196,9 @@ class JobRunner:
         claimed.lease.enter_context(maintain_lease(self.catalog, claimed.token, lease_seconds))
         return claimed
 
-    def release(self, claimed: ClaimedJobs) -> None:
+    def requeue(self, claimed: ClaimedJobs) -> None:
         """Return the jobs to the queue because the worker stops, without counting an attempt."""
-        self._update(claimed, lambda _session, job: release_job(job))
+        self._update(claimed, lambda _session, job: requeue_job(job))
         self.on_outcome(claimed.kind, StepOutcome.INTERRUPTED, len(claimed.jobs))
 
     @contextlib.contextmanager
@@ -215,14 +215,14 @@ class JobRunner:
             except JobInterrupted:
                 outcome = StepOutcome.INTERRUPTED
                 log.info("%s: interrupted", jobs)
-                self._update(claimed, lambda _session, job: release_job(job))
+                self._update(claimed, lambda _session, job: requeue_job(job))
             except (Unavailable, OSError, SQLAlchemyError) as error:
                 outcome, delay = StepOutcome.PAUSED, UNAVAILABLE_RETRY_SECONDS
                 log.warning("%s: retried in %g s: %s", jobs, delay, error)
                 problem = error.as_problem() if isinstance(error, PlacewiseError) else None
                 self._update(
                     claimed,
-                    lambda _session, job: release_job(job, after_seconds=delay, problem=problem),
+                    lambda _session, job: requeue_job(job, after_seconds=delay, problem=problem),
                 )
             except PlacewiseError as error:
                 outcome, refusal = StepOutcome.FAILED, error.as_problem()
@@ -289,13 +289,13 @@ def _retry_after_crash(session: Session, job: Job, together: int, event: str) ->
         _fail_for_good(session, job, error.as_problem())
         return
     job.alone = job.alone or together > 1
-    release_job(job)
+    requeue_job(job)
 
 
 def _fail_or_defer(session: Session, job: Job, problem: dict[str, Any]) -> None:
     """Fail the job; a stored photo is retried instead, because an operator can remove the cause."""
     if job.kind in (JobKind.INDEX, JobKind.REINDEX):
-        release_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
+        requeue_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
     else:
         _fail_for_good(session, job, problem)
 

@@ -1,4 +1,4 @@
-"""State transitions of jobs and batches: succeed, fail, release, cancel, retry.
+"""State transitions of jobs and batches: succeed, fail, requeue, cancel.
 
 Callers hold the lock of the job's row; a worker has also checked its lease token.
 """
@@ -42,7 +42,7 @@ def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
     """Mark the job as succeeded with its result.
 
     A job that has a result already has succeeded before, and webhooks got its event
-    (`repeat_job`).
+    (`requeue_job_as_new`).
     """
     has_succeeded_before = job.result is not None
     job.state = JobState.SUCCEEDED
@@ -93,14 +93,14 @@ def _event_data(session: Session, job: Job) -> dict[str, Any]:
     }
 
 
-def release_job(
+def requeue_job(
     job: Job,
     *,
     after_seconds: float = 0.0,
     waiting_for: WaitingFor | None = None,
     problem: dict[str, Any] | None = None,
 ) -> None:
-    """End the job's lease without counting an attempt, so that it is claimed again later.
+    """Return a claimed job to the queue without counting an attempt.
 
     A checkpointed job stays `running` between its slices; any other job is `queued` again.
 
@@ -212,11 +212,14 @@ def retry_job(session: Session, job: Job) -> None:
         if photo.deleted_at is not None:
             raise Conflict("photo_deleted", "The job's photo was deleted.", job_id=str(job.id))
         photo.job_id = job.id
-    requeue_job(job)
+    requeue_job_as_new(job)
 
 
-def requeue_job(job: Job) -> None:
-    """Reset the job to `queued`, as if it were new."""
+def requeue_job_as_new(job: Job, *, keep_result: bool = False) -> None:
+    """Reset the job to `queued`, as if it were new.
+
+    A succeeded job that keeps its result succeeds again without a second event for webhooks.
+    """
     if job.kind == JobKind.REINDEX:
         # Its generation may be gone: the photo is indexed into the active one.
         job.kind, job.priority, job.generation_id = JobKind.INDEX, Priority.UPLOAD, None
@@ -224,7 +227,8 @@ def requeue_job(job: Job) -> None:
     job.attempts = 0
     job.alone = False
     job.error = None
-    job.result = None
+    if not keep_result:
+        job.result = None
     _clear_waiting(job)
     job.run_after = None
     job.progress_done = 0
@@ -232,13 +236,6 @@ def requeue_job(job: Job) -> None:
     job.started_at = None
     job.finished_at = None
     _drop_lease(job)
-
-
-def repeat_job(job: Job) -> None:
-    """Queue a succeeded job again; it keeps its result, so that webhooks get no second event."""
-    result = job.result
-    requeue_job(job)
-    job.result = result
 
 
 def cancel_batch(session: Session, job: Job) -> None:
@@ -321,7 +318,7 @@ def retry_batch(session: Session, job: Job) -> None:
             "again; photos that are already in the map are not described twice",
         )
     session.flush()
-    requeue_job(job)
+    requeue_job_as_new(job)
     job.stage = "store"
     sync_item_states(session, job)
 
@@ -329,7 +326,7 @@ def retry_batch(session: Session, job: Job) -> None:
 def _retry_item_photo(session: Session, photo: Photo, item: BatchItem) -> None:
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
-        requeue_job(job)
+        requeue_job_as_new(job)
     item.state, item.photo_job_id = JobState.RUNNING, photo.job_id
 
 

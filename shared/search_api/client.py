@@ -109,7 +109,7 @@ def merge_statuses(
             for key in lagging
         },
         devices=tuple(device for status in statuses for device in status.devices),
-        away=tuple(shard.name for shard in sorted(unreachable)),
+        unavailable=tuple(shard.name for shard in sorted(unreachable)),
     )
 
 

@@ -174,7 +174,7 @@ class SearchStatus(_Message):
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
     devices: tuple[DeviceStatus, ...] = ()
     """GPUs in use; empty where the CPU searches everything."""
-    away: tuple[str, ...] = ()
+    unavailable: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 
     @property

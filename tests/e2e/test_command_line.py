@@ -369,7 +369,7 @@ def test_vocabularies_are_fitted_imported_and_listed(
 
     np.save(tmp_path / "narrow.npy", centres[:, 1:])
     refused = placewise("vocabulary", "import", tmp_path / "narrow.npy", "--json")
-    assert f"{WIDTH - 1} dimensions" in refused.refusal("vocabulary_unfit")
+    assert f"{WIDTH - 1} dimensions" in refused.refusal("vocabulary_unusable")
 
 
 # --- without a server ------------------------------------------------------------------------

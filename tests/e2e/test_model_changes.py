@@ -243,12 +243,12 @@ def test_one_model_change_at_a_time(server: ServerProcess, before: Before) -> No
         pytest.param(b"cluster centres, in words", id="text"),
     ],
 )
-def test_an_unfit_vocabulary_fails_with_the_reason_and_changes_nothing(
+def test_an_unusable_vocabulary_fails_with_the_reason_and_changes_nothing(
     server: ServerProcess, before: Before, data: bytes
 ) -> None:
     answering, known = active(server), got(server.client.get(VOCABULARIES))
     error = refused(server, post_import(server, data))
-    assert (error["code"], error["status"]) == ("vocabulary_unfit", 422)
+    assert (error["code"], error["status"]) == ("vocabulary_unusable", 422)
     assert active(server) == answering
     assert got(server.client.get(VOCABULARIES)) == known
     assert got(server.similar(before.photos[0]))["generation_id"] == answering["generation_id"]
@@ -271,7 +271,7 @@ def test_bad_requests_for_a_model_change_are_refused(server: ServerProcess) -> N
         problem(server.client.get(path, params={"map": "nowhere"}), 404, "map_not_found")
         problem(post(path, json={}, params={"map": "nowhere"}), 404, "map_not_found")
     error = refused(server, post(GENERATIONS, json={"vocabulary_id": None}))
-    assert error["code"] == "vocabulary_unfit"
+    assert error["code"] == "vocabulary_unusable"
 
 
 @pytest.mark.usefixtures("fitted")

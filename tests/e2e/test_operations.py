@@ -178,7 +178,7 @@ def test_an_unknown_map_is_not_found(server: ServerProcess, path: str) -> None:
 def test_an_extractor_without_a_vocabulary_has_nothing_to_fit(server: ServerProcess) -> None:
     answer = server.client.post(f"{API}/vocabularies", json={})
     job = server.finished(answer.json()["job_id"])
-    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unfit")
+    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unusable")
     assert "test-tiny-avg" in job["error"]["detail"]
 
 

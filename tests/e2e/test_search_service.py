@@ -115,7 +115,7 @@ def test_two_search_processes_answer_what_the_embedded_one_answers(
 
 
 @pytest.mark.parametrize("shard", ["2/2", "all"])
-def test_an_unfit_shard_is_refused_at_the_start(tmp_path: Path, shard: str) -> None:
+def test_an_unusable_shard_is_refused_at_the_start(tmp_path: Path, shard: str) -> None:
     env = environment(tmp_path / "home", search_shard=shard)
     ended = run_command("search", env=env, cwd=tmp_path)
     assert ended.returncode != 0

@@ -80,7 +80,7 @@ def test_an_entry_has_no_vocabulary_to_fit(server: ServerProcess, allowed: str) 
     fit = server.client.post("/api/v1/vocabularies", params={"map": "nofit"})
     assert fit.status_code == 202, fit.text
     job = server.client.get(f"{fit.json()['status_url']}&wait=30").json()
-    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unfit")
+    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unusable")
 
 
 @pytest.mark.parametrize("entry", ["prints", "colours", "colours:dimension=41,input.size=64x64"])
@@ -109,5 +109,5 @@ def test_an_entry_that_is_no_extractor_keeps_photos_waiting_with_the_reason(
 ) -> None:
     make(server, "unfit", f"torchhub:{folder}:maps")
     response = server.ask(photo_bytes(1), map="unfit")
-    assert response.json()["code"] == "torchhub_unfit", response.text
+    assert response.json()["code"] == "torchhub_unusable", response.text
     assert "input.size" in response.json()["detail"]

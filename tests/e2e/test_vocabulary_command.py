@@ -145,7 +145,7 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
     other = VocabularyFile(found.centres, {**found.provenance, "layer": "another"})
     (folder.path / "other.npz").write_bytes(other.encode())
     problem = folder.json("import", "other.npz", code=1)
-    assert problem["code"] == "vocabulary_unfit"
+    assert problem["code"] == "vocabulary_unusable"
     assert "layer another" in problem["detail"]
     assert "layer projection" in problem["detail"]
 
@@ -159,7 +159,7 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
         (("fit", "--out", "a.npz"), "options_contradict", "--out"),
         (
             ("fit", "photos", "--out", "a.npz", "--extractor", "test-tiny-avg"),
-            "vocabulary_unfit",
+            "vocabulary_unusable",
             "does not use a vocabulary",
         ),
     ],

@@ -92,7 +92,7 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
         assert_each_finds_itself(server, uploader.acknowledged)
 
 
-def test_a_fit_that_is_killed_goes_on_after_the_restart(tmp_path: Path) -> None:
+def test_a_fit_that_is_killed_starts_again_after_the_restart(tmp_path: Path) -> None:
     with ServerProcess(tmp_path / "home", extractor="test-tiny-vlad", batch_photos=2) as server:
         for number in range(40):
             assert server.upload(photo_bytes(number)).status_code == 202

@@ -126,8 +126,8 @@ def _figures(running: ServerProcess) -> dict[str, dict[tuple[tuple[str, str], ..
 
 
 def _wait_for_collection(running: ServerProcess) -> None:
-    done = (("duty", "collect_orphans"), ("outcome", "done"))
-    _wait_for(lambda: _figures(running).get("placewise_steward_duties_total", {}).get(done, 0) >= 1)
+    done = (("task", "collect_orphans"), ("outcome", "done"))
+    _wait_for(lambda: _figures(running).get("placewise_steward_tasks_total", {}).get(done, 0) >= 1)
 
 
 def test_removed_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:

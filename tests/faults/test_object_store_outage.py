@@ -131,7 +131,7 @@ def test_silence_is_waited_for_once(
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
-def test_nobody_there_is_found_out_at_once(
+def test_an_address_where_no_server_listens_is_an_error_at_once(
     listener: socket.socket, call: Callable[[S3Store], object]
 ) -> None:
     store = store_at(listener)
@@ -140,7 +140,7 @@ def test_nobody_there_is_found_out_at_once(
         call(store)
 
 
-def test_connection_that_is_cut_is_tried_once_more(listener: socket.socket) -> None:
+def test_a_connection_that_is_cut_is_tried_once_more(listener: socket.socket) -> None:
     def serve() -> None:
         for answer in (b"", b"HTTP/1.1 200 OK\r\nETag: x\r\nContent-Length: 1\r\n\r\nx"):
             connection, _ = listener.accept()

@@ -285,7 +285,7 @@ def describe_files(
 
     Raises:
         Unprocessable: `photos_refused`, which lists every photo that can't be described with the
-            reason; `vocabulary_unfit`; `pca_unfit`.
+            reason; `vocabulary_unusable`; `pca_unusable`.
         Misconfigured: `vocabulary_missing`, `out_unwritable`, and errors of loading the extractor.
     """
     started = time.perf_counter()
@@ -319,13 +319,13 @@ def load_own_vocabulary(config: ExtractorConfig, vocabulary: Path | None) -> Voc
     An extractor that uses no vocabulary, or ships one, requires none.
 
     Raises:
-        Unprocessable: `vocabulary_unfit` if it does not match the extractor.
+        Unprocessable: `vocabulary_unusable` if it does not match the extractor.
         Misconfigured: `vocabulary_missing` if the extractor needs one and none is given.
     """
     if vocabulary is not None:
         if not config.needs_vocabulary:
             raise Unprocessable(
-                "vocabulary_unfit", f"The extractor {config.name} does not use a vocabulary."
+                "vocabulary_unusable", f"The extractor {config.name} does not use a vocabulary."
             )
         own = read_vocabulary(vocabulary)
         check_vocabulary_width(own.centres, config, config.width)  # before the weights are loaded
@@ -343,7 +343,7 @@ def resolve_centres(extractor: Extractor, own: VocabularyFile | None) -> Cluster
     """The cluster centres of the file, or else the shipped ones; None if none are needed.
 
     Raises:
-        Unprocessable: `vocabulary_unfit` if the file's vocabulary does not match the extractor.
+        Unprocessable: `vocabulary_unusable` if the file's vocabulary does not match the extractor.
     """
     if own is not None:
         check_vocabulary_fits(own.provenance, own.centres, extractor)

@@ -65,7 +65,7 @@ def fit_vocabulary_on_folder(
 
     Raises:
         InvalidRequest: `no_photos`, `bad_out`.
-        Unprocessable: `no_photos`, `vocabulary_unfit`.
+        Unprocessable: `no_photos`, `vocabulary_unusable`.
         Misconfigured: `out_unwritable`, and errors of loading the extractor.
     """
     check_output_path(out, ".npz", "a vocabulary")
@@ -76,7 +76,7 @@ def fit_vocabulary_on_folder(
     )
     if not config.needs_vocabulary:
         raise Unprocessable(
-            "vocabulary_unfit",
+            "vocabulary_unusable",
             f"The extractor {config.name} does not use a vocabulary: there is nothing to fit.",
         )
     all_photos = list_photos(folder)

@@ -215,7 +215,7 @@ def fetch(
             _fetch_dinov2(config.backbone, settings, on_progress)
     weights = inspect_weights(config, settings)
     if not weights.here:
-        raise Misconfigured("weights_unfit", weights.note or "")
+        raise Misconfigured("weights_unusable", weights.note or "")
     if as_json:
         print_json({**asdict(weights), "dimension": dimension})
         return

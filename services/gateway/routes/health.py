@@ -254,8 +254,8 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     problems = []
-    if status.away:
-        problems.append(f"no search worker is available for: {', '.join(status.away)}")
+    if status.unavailable:
+        problems.append(f"no search worker is available for: {', '.join(status.unavailable)}")
     if status.missing:
         named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
         more = len(status.missing) - MAX_NAMED_CHUNKS

@@ -57,7 +57,7 @@ from shared.ingest.photo_metadata import (
     parse_time,
 )
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.transitions import cancel_jobs, repeat_job
+from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
 from shared.storage.keys import preview_key, thumbnail_key
 
 router = APIRouter(tags=["photos"])
@@ -277,7 +277,7 @@ def _queue_preview(
         session.flush()
         get_photo(session, photo.map_id, photo.id).job_id = job.id
     else:
-        repeat_job(job)
+        requeue_job_as_new(job, keep_result=True)
         session.flush()
     return job
 

@@ -38,7 +38,7 @@ from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
-from shared.jobs.transitions import requeue_job
+from shared.jobs.transitions import requeue_job_as_new
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.background import background_frames
 from shared.search_api.comparison import query_expired_error
@@ -211,7 +211,7 @@ def _describe_again(gateway: GatewayContext, job_id: UUID) -> None:
     with gateway.catalog.write() as session:
         job = session.get(Job, job_id, with_for_update=True)
         if job is not None and job.state == JobState.SUCCEEDED:
-            requeue_job(job)
+            requeue_job_as_new(job)
     gateway.wakeups.send(WakeupQueue.QUERY)
 
 

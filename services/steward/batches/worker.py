@@ -60,7 +60,7 @@ from shared.jobs.runner import IDLE_POLL_SECONDS, MAX_ATTEMPTS, JobInterrupted, 
 from shared.jobs.transitions import (
     cancel_batch_items,
     make_waiting_jobs_claimable,
-    release_job,
+    requeue_job,
     succeed_job,
 )
 from shared.storage import ObjectStore
@@ -333,12 +333,12 @@ class BatchWorker:
             counts = sync_item_states(session, leased)
             if counts[JobState.QUEUED]:
                 pause = 0.0 if waiting_for else self._pause_seconds(session, leased)
-                release_job(leased, after_seconds=pause, waiting_for=waiting_for)
+                requeue_job(leased, after_seconds=pause, waiting_for=waiting_for)
                 return
             if counts[JobState.RUNNING]:
                 leased.stage = "describe"
                 waits = is_waiting_for_vocabulary(session, leased)
-                release_job(
+                requeue_job(
                     leased,
                     after_seconds=PROGRESS_POLL_SECONDS,
                     waiting_for=WaitingFor.VOCABULARY if waits else None,

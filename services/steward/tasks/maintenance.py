@@ -34,7 +34,7 @@ from shared.jobs.wakeups import WakeupQueue
 log = logging.getLogger(__name__)
 
 
-def release_expired_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
+def reclaim_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
     """Requeue or fail the jobs of dead workers; see `reclaim_expired_leases`."""
     with catalog.write() as session:
         reclaimed = reclaim_expired_leases(session, all_leases=all_leases)

@@ -32,7 +32,7 @@ from shared.descriptors.backbones.dinov2_weights import (
     find_or_download_weights,
     hub_repository,
     open_weights,
-    weights_unfit_error,
+    weights_unusable_error,
 )
 from shared.extractor_config.configs import FACETS
 
@@ -88,7 +88,7 @@ class Dinov2:
             shape: Overrides the shape of `size`, for tests.
 
         Raises:
-            Misconfigured: `weights_missing`, `weights_unfit`.
+            Misconfigured: `weights_missing`, `weights_unusable`.
         """
         self._shape = shape or SHAPES[size]
         self.name = f"dinov2-{size}"
@@ -145,7 +145,7 @@ class Dinov2:
 def check_dinov2_weights(
     size: str, layer: int, facet: str, file: DinoWeightsFile, *, shape: VitShape | None = None
 ) -> None:
-    """Raise Misconfigured (`weights_unfit`) if the file can't be loaded; reads its index only."""
+    """Raise Misconfigured (`weights_unusable`) if the file can't be loaded; reads its index."""
     shape = shape or SHAPES[size]
     check_tensor_shapes(file, _shapes(build_empty_vit(shape, layer, facet)), size, shape.registers)
 
@@ -213,7 +213,7 @@ def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
 def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile) -> str:
     """Return the `fingerprint` of a network with these weights without loading it onto a device.
 
-    Raises Misconfigured (`weights_unfit`).
+    Raises Misconfigured (`weights_unusable`).
     """
     vit = build_empty_vit(SHAPES[size], layer, facet)
     digest = hashlib.sha256()
@@ -227,7 +227,7 @@ def load_vit_weights(
 ) -> str:
     """Load the tensors into an empty network.
 
-    Returns their sha256: name-sorted, as float32 bytes. Raises Misconfigured (`weights_unfit`).
+    Returns their sha256: name-sorted, as float32 bytes. Raises Misconfigured (`weights_unusable`).
     """
     digest = hashlib.sha256()
     state = {}
@@ -247,7 +247,7 @@ def _tensors(
     for name in sorted(expected_shapes):
         stored = file.read(name)
         if not stored.is_floating_point() or not torch.isfinite(stored).all():
-            raise weights_unfit_error(
+            raise weights_unusable_error(
                 file.path, f"{name} holds numbers that are not finite floats", size
             )
         # Copied: the file may be changed or removed while the service runs.

@@ -129,7 +129,7 @@ def _download(size: str, on_progress: OnProgress) -> Path:
 def open_weights(path: Path, size: str) -> DinoWeightsFile:
     """Open a `.safetensors` or PyTorch file in either naming; only its index is read.
 
-    Raises Misconfigured (`weights_unfit`) if it is neither, or truncated.
+    Raises Misconfigured (`weights_unusable`) if it is neither, or truncated.
     """
     try:
         with path.open("rb") as file:
@@ -139,13 +139,13 @@ def open_weights(path: Path, size: str) -> DinoWeightsFile:
         return _under_timms_names(stored)
     except TENSOR_READ_ERRORS as error:
         reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
-        raise weights_unfit_error(path, reason, size) from error
+        raise weights_unusable_error(path, reason, size) from error
 
 
-def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
+def weights_unusable_error(path: Path, reason: str, size: str) -> Misconfigured:
     """Return the error for a weights file that can't be used."""
     return Misconfigured(
-        "weights_unfit",
+        "weights_unusable",
         f"The weights {path} can't be used for dinov2-{size}: {reason}. {_weights_help(size)}",
     )
 
@@ -153,9 +153,9 @@ def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
 def check_tensor_shapes(
     file: DinoWeightsFile, expected: dict[str, Shape], size: str, registers: int
 ) -> None:
-    """Raise Misconfigured (`weights_unfit`) unless every expected tensor has its shape."""
+    """Raise Misconfigured (`weights_unusable`) unless every expected tensor has its shape."""
     if file.registers != registers:
-        raise weights_unfit_error(
+        raise weights_unusable_error(
             file.path,
             f"they are of a network with {file.registers} register tokens, expected {registers}",
             size,
@@ -172,7 +172,7 @@ def check_tensor_shapes(
     if differing:
         faults.append(_join_some(differing))
     if faults:
-        raise weights_unfit_error(file.path, "; ".join(faults) + _guess_size(file, size), size)
+        raise weights_unusable_error(file.path, "; ".join(faults) + _guess_size(file, size), size)
 
 
 def _guess_size(file: DinoWeightsFile, size: str) -> str:

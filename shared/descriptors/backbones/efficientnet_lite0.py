@@ -63,7 +63,7 @@ class EfficientNetLite0:
 def published_network() -> Any:
     """Build timm's complete network with the package's weights.
 
-    Raises Misconfigured: `weights_missing`, `weights_unfit`.
+    Raises Misconfigured: `weights_missing`, `weights_unusable`.
     """
     import timm  # imported here because it takes seconds
 
@@ -103,7 +103,7 @@ def _rename_tensors(
     ]
     if len(state) != len(expected) or shapes_differ:
         raise Misconfigured(
-            "weights_unfit",
+            "weights_unusable",
             f"{PACKAGE} holds {len(state)} tensors, expected {len(expected)}; "
             f"first difference in shape: {shapes_differ[:1]}. Install version 0.1.0.",
         )

@@ -84,7 +84,7 @@ def _load_module(
 
     Weights that the entry downloads through torch.hub are downloaded by `download_file` instead.
 
-    Raises Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+    Raises Misconfigured: `weights_missing`, `torchhub_unusable`, `download_corrupt`.
     """
     try:
         with _import_guard(folder, on_progress):
@@ -103,9 +103,9 @@ def _load_module(
             raise _code_missing_error(
                 hub, f"a file that it needs can't be downloaded: {message}"
             ) from error
-        raise _torchhub_unfit_error(hub, f"loading it failed with {message}") from error
+        raise _torchhub_unusable_error(hub, f"loading it failed with {message}") from error
     if not isinstance(module, torch.nn.Module):
-        raise _torchhub_unfit_error(
+        raise _torchhub_unusable_error(
             hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module"
         )
     return module
@@ -163,10 +163,10 @@ def _code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     )
 
 
-def _torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
+def _torchhub_unusable_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     """Return the error for an entry that can't be used."""
     return Misconfigured(
-        "torchhub_unfit",
+        "torchhub_unusable",
         f"The extractor {hub.name} can't be used: {reason}. Three ways to fix it: (1) in the name, "
         "set other arguments of the entry, or the input that its network expects "
         "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) use another commit, and "
@@ -276,7 +276,7 @@ class TorchHubBackbone:
     ) -> None:
         """Load the entry, which executes its code, and check it on two images of noise.
 
-        Raises Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+        Raises Misconfigured: `weights_missing`, `torchhub_unusable`, `download_corrupt`.
         """
         self._hub = hub
         folder = _find_or_download_code(hub, on_progress)
@@ -311,7 +311,7 @@ class TorchHubBackbone:
 
     @torch.inference_mode()
     def _probe(self) -> int:
-        """Return the descriptor's dimension; raise `torchhub_unfit` for invalid descriptors."""
+        """Return the descriptor's dimension; raise `torchhub_unusable` for invalid descriptors."""
         hub = self._hub
         noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, hub.height, hub.width, 3)
@@ -319,32 +319,32 @@ class TorchHubBackbone:
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
         except Exception as error:  # third-party networks may raise anything
-            raise _torchhub_unfit_error(
+            raise _torchhub_unusable_error(
                 hub,
                 f"with 2 photos of {hub.height} x {hub.width} pixels it fails with "
                 f"{type(error).__name__}: {first_error_line(error)}",
             ) from error
         if not isinstance(both, torch.Tensor) or not both.is_floating_point():
-            raise _torchhub_unfit_error(
+            raise _torchhub_unusable_error(
                 hub, f"it returns a {_describe_value(both)}, not a tensor of floats"
             )
         if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
-            raise _torchhub_unfit_error(
+            raise _torchhub_unusable_error(
                 hub,
                 f"for 2 photos it returns the shape {tuple(both.shape)}, for one "
                 f"{tuple(alone.shape)}; expected one descriptor per photo: (2, D) and (1, D)",
             )
         if both.shape[1] > MAX_WIDTH:
-            raise _torchhub_unfit_error(
+            raise _torchhub_unusable_error(
                 hub, f"{both.shape[1]} dimensions exceed the maximum of {MAX_WIDTH}"
             )
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise _torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
+            raise _torchhub_unusable_error(hub, "its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()):
-            raise _torchhub_unfit_error(hub, "its descriptors are zero")
+            raise _torchhub_unusable_error(hub, "its descriptors are zero")
         cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
         if cosine < MIN_REPEAT_COSINE:
-            raise _torchhub_unfit_error(
+            raise _torchhub_unusable_error(
                 hub,
                 "the descriptor of a photo depends on the other photos of its batch (cosine "
                 f"{cosine:.3f}), and the composition of batches varies",

@@ -104,30 +104,32 @@ class TrainedBackbone:
     def check(self) -> None:
         """Check the weights, and the descriptors of two images of noise.
 
-        Raises Unprocessable (`model_unfit`).
+        Raises Unprocessable (`model_unusable`).
         """
         for name, tensor in self._model.state_dict().items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-                raise _model_unfit_error(f"its weights {name} contain NaN or infinite numbers")
+                raise _model_unusable_error(f"its weights {name} contain NaN or infinite numbers")
         if self.width > MAX_WIDTH:
-            raise _model_unfit_error(f"{self.width} dimensions exceed the maximum of {MAX_WIDTH}")
+            raise _model_unusable_error(
+                f"{self.width} dimensions exceed the maximum of {MAX_WIDTH}"
+            )
         noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, *self.image_size, 3)
         photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
         both, alone = self._forward(photos), self._forward(photos[:1])
         if both.shape != (2, self.width) or alone.shape != (1, self.width):
-            raise _model_unfit_error(f"for 2 photos it returns the shape {tuple(both.shape)}")
+            raise _model_unusable_error(f"for 2 photos it returns the shape {tuple(both.shape)}")
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise _model_unfit_error("its descriptors hold NaN or infinite numbers")
+            raise _model_unusable_error("its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()) or torch.equal(both[0], both[1]):
-            raise _model_unfit_error("its descriptors of two different photos are zero or equal")
+            raise _model_unusable_error("its descriptors of two different photos are zero or equal")
         cosine = float(normalise_features(both[0]) @ normalise_features(alone[0]))
         if cosine < MIN_REPEAT_COSINE:
-            raise _model_unfit_error(
+            raise _model_unusable_error(
                 "the descriptor of a photo depends on the other photos of its batch (cosine "
                 f"{cosine:.3f}), and the composition of batches varies"
             )
 
 
-def _model_unfit_error(reason: str) -> Unprocessable:
-    return Unprocessable("model_unfit", f"The model can't describe photos: {reason}.")
+def _model_unusable_error(reason: str) -> Unprocessable:
+    return Unprocessable("model_unusable", f"The model can't describe photos: {reason}.")

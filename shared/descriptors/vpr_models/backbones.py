@@ -186,7 +186,7 @@ def _load_torchvision_network(name: str, pretrained: bool, weights: Path | None)
             IMAGENET1K_V1, from torch.hub's cache or downloaded.
 
     Raises:
-        Misconfigured: `weights_missing`, `weights_unfit`, `download_corrupt`.
+        Misconfigured: `weights_missing`, `weights_unusable`, `download_corrupt`.
     """
     from torchvision import models  # imported here because it takes seconds
 
@@ -229,7 +229,7 @@ def _check_weights_file(path: Path, name: str) -> Path:
 def _read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
     """Load the tensors of a `.safetensors` or PyTorch file by name; no code is executed.
 
-    Raises Misconfigured (`weights_unfit`) for other files.
+    Raises Misconfigured (`weights_unusable`) for other files.
     """
     try:
         with path.open("rb") as file:
@@ -239,14 +239,14 @@ def _read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
         state = load_tensors(path)
     except TENSOR_READ_ERRORS as error:
         reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
-        raise _pretrained_unfit_error(path, name, reason) from error
+        raise _pretrained_unusable_error(path, name, reason) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise _pretrained_unfit_error(path, name, "it contains other objects than named tensors")
+        raise _pretrained_unusable_error(path, name, "it contains other objects than named tensors")
     return state
 
 
 def _load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
-    """Load tensors into a network; raise Misconfigured (`weights_unfit`) if they don't fit."""
+    """Load tensors into a network; raise Misconfigured (`weights_unusable`) if they don't fit."""
     expected: dict[str, torch.Tensor] = network.state_dict()
     # Files of old releases lack num_batches_tracked, which is not used.
     state = {n: t for n, t in expected.items() if n.endswith("num_batches_tracked")} | state
@@ -259,12 +259,14 @@ def _load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: 
     ]
     if problems:
         more = f" and {len(problems) - 1} more problems" if len(problems) > 1 else ""
-        raise _pretrained_unfit_error(path, name, f"it has {problems[0]}{more}")
+        raise _pretrained_unusable_error(path, name, f"it has {problems[0]}{more}")
     network.load_state_dict(state)
 
 
-def _pretrained_unfit_error(path: Path, name: str, reason: str) -> Misconfigured:
-    return Misconfigured("weights_unfit", f"The weights {path} can't be used for {name}: {reason}.")
+def _pretrained_unusable_error(path: Path, name: str, reason: str) -> Misconfigured:
+    return Misconfigured(
+        "weights_unusable", f"The weights {path} can't be used for {name}: {reason}."
+    )
 
 
 def _pretrained_missing_error(name: str, url: str, reason: str) -> Misconfigured:
@@ -380,7 +382,7 @@ class _OwnBackbone(StagedBackbone):
         maps = self._run(photos)
         if not isinstance(maps, torch.Tensor) or maps.ndim != 4:
             raise Misconfigured(
-                "backbone_unfit",
+                "backbone_unusable",
                 f"The backbone {type(self.stem).__name__} must return maps (B, C, h, w) of "
                 f"(B, 3, H, W) photos, not {tuple(getattr(maps, 'shape', [type(maps)]))}.",
             )
@@ -406,7 +408,7 @@ def build_backbone(config: VprModelConfig, weights: Path | None) -> StagedBackbo
         weights: A file of pretrained weights; None for those of the hub's cache.
 
     Raises:
-        Misconfigured: `weights_missing`, `weights_unfit`, `download_corrupt`.
+        Misconfigured: `weights_missing`, `weights_unusable`, `download_corrupt`.
     """
     name = config.backbone_arch
     backbone = _BUILDERS[name](name, config.pretrained, weights)

@@ -73,14 +73,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         NotFound: `checkpoint_not_found`.
         Unprocessable: `checkpoint_unreadable` (not a PyTorch file, truncated, or with other objects
-            than tensors and plain values); `checkpoint_unfit` (tensors of another network); and as
-            VprModelConfig and `build_vpr_model`.
+            than tensors and plain values); `checkpoint_unusable` (tensors of another network); and
+            as VprModelConfig and `build_vpr_model`.
     """
     stored = _read(path)
     parameters = stored.get("hyper_parameters", {})
     tensors = stored.get("state_dict", stored.get("model_state_dict", stored))
     if not isinstance(parameters, Mapping) or not isinstance(tensors, Mapping):
-        raise _checkpoint_unfit_error(path, "it has no mapping of tensors")
+        raise _checkpoint_unusable_error(path, "it has no mapping of tensors")
     if isinstance(parameters.get("model"), Mapping):
         config = VprModelConfig.parse({**parameters["model"], "pretrained": False})
         own_tensors = {
@@ -92,7 +92,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         try:
             config, own_tensors = read_published_checkpoint(parameters, tensors)
         except ValueError as error:
-            raise _checkpoint_unfit_error(path, str(error)) from error
+            raise _checkpoint_unusable_error(path, str(error)) from error
     with torch.device("meta"):
         model = build_vpr_model(config)
     _load_tensors_into(model, own_tensors, path)
@@ -147,7 +147,7 @@ def _read(path: Path) -> dict[str, Any]:
             f"truncated, or has other objects than tensors and plain values{_known_reason(error)}.",
         ) from error
     if not isinstance(stored, dict):
-        raise _checkpoint_unfit_error(path, f"it holds a {type(stored).__name__}")
+        raise _checkpoint_unusable_error(path, f"it holds a {type(stored).__name__}")
     return stored
 
 
@@ -173,20 +173,20 @@ def _load_tensors_into(model: VprModel, tensors: dict[str, Any], path: Path) -> 
             problems.append(f"{name} is {tuple(tensor.shape)}, expected {shape}")
     if problems:
         more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
-        raise _checkpoint_unfit_error(path, "; ".join(problems[:3]) + more)
+        raise _checkpoint_unusable_error(path, "; ".join(problems[:3]) + more)
     try:
         check_declared_size((tensors[name] for name in expected), path)
     except ValueError as error:
-        raise _checkpoint_unfit_error(path, str(error)) from error
+        raise _checkpoint_unusable_error(path, str(error)) from error
     # Copied, because they are mapped from the file, which may change.
     model.load_state_dict(
         {name: tensors[name].to(expected[name].dtype, copy=True) for name in expected}, assign=True
     )
 
 
-def _checkpoint_unfit_error(path: Path, reason: str) -> Unprocessable:
+def _checkpoint_unusable_error(path: Path, reason: str) -> Unprocessable:
     return Unprocessable(
-        "checkpoint_unfit",
+        "checkpoint_unusable",
         f"{path.name} is not a checkpoint of a known VPR model: {reason}. Use one of `placewise "
         "train`, or of a network in docs/place-models.md. Other networks work without a checkpoint "
         "if their authors publish a hubconf.py, as the extractor torchhub:OWNER/NAME@COMMIT:ENTRY:"

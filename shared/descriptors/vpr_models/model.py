@@ -39,7 +39,7 @@ class VprModel(nn.Module):
         return self.aggregator.dimension
 
     def forward(self, photos: torch.Tensor) -> torch.Tensor:
-        """Compute descriptors; raises Unprocessable (`image_size_unfit`) for unsupported sizes."""
+        """Compute descriptors; raises Unprocessable (`image_size_unsupported`)."""
         height, width = photos.shape[-2:]
         _check_patches(self.backbone, height, width, self.config)
         maps, token = self.backbone(photos)
@@ -63,8 +63,8 @@ def build_vpr_model(config: VprModelConfig, *, weights: Path | None = None) -> V
             Unused without `config.pretrained`.
 
     Raises:
-        Misconfigured: `weights_missing`, `weights_unfit`.
-        Unprocessable: `bad_agg_config`, `image_size_unfit`.
+        Misconfigured: `weights_missing`, `weights_unusable`.
+        Unprocessable: `bad_agg_config`, `image_size_unsupported`.
     """
     backbone = build_backbone(config, weights)
     _check_patches(backbone, *config.image_size, config)
@@ -140,7 +140,7 @@ def _check_patches(
     if height % side or width % side:
         nearest = [max(1, round(length / side)) * side for length in (height, width)]
         raise Unprocessable(
-            "image_size_unfit",
+            "image_size_unsupported",
             f"{config.backbone_arch} needs photos whose height and width are multiples of {side} "
             f"pixels, not {height} x {width}. The nearest size is {nearest[0]} x {nearest[1]}.",
         )
@@ -159,7 +159,7 @@ def _check_map(
             "train a model at this size."
         )
         raise Unprocessable(
-            "image_size_unfit",
+            "image_size_unsupported",
             f"{config.agg_arch} can't take photos of {photo[0]} x {photo[1]} pixels: {reason}. "
             f"{advice}",
         )

@@ -10,7 +10,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import func, select, update
 
-from services.steward.tasks import maintenance as retention
+from services.steward.tasks import maintenance
 from services.steward.tasks.maintenance import delete_expired_idempotency_keys
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
@@ -152,7 +152,7 @@ def test_one_of_many_at_once_gets_the_key(catalog: Catalog) -> None:
 def test_expired_keys_are_forgotten_and_others_stay(
     catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retention, "RETENTION_ROWS_PER_TRANSACTION", 2)
+    monkeypatch.setattr(maintenance, "RETENTION_ROWS_PER_TRANSACTION", 2)
     for number in range(3):
         keep(catalog, token(catalog, replace(CALL, key=f"old-{number}")))
     expire(catalog)

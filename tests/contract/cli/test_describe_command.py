@@ -206,8 +206,10 @@ def test_interrupted_run_leaves_nothing_behind(
         (["--backbone", "dinov2_vits14", "--layer", "12"], "bad_extractor_option", "0 to 11"),
         (["--weights", "{centres}"], "weights_unused", "test-tiny-avg"),
         (["--backbone", "dinov2_vits14"], "vocabulary_missing", "--vocabulary FILE"),
-        (["--extractor", "test-tiny-avg", "--vocabulary", "{centres}"], "vocabulary_unfit", "no"),
-        (["--extractor", "anyloc-vits14", "--vocabulary", "{centres}"], "vocabulary_unfit", "384"),
+        (["--extractor", "test-tiny-avg", "--vocabulary", "{centres}"],
+         "vocabulary_unusable", "no"),
+        (["--extractor", "anyloc-vits14", "--vocabulary", "{centres}"],
+         "vocabulary_unusable", "384"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused_before_anything_is_loaded(

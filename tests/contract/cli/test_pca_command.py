@@ -76,7 +76,7 @@ def test_a_folders_whitening_shortens_the_rows_of_the_same_extractor(
     # Of other features with as many numbers, it would spoil every row.
     other = run("describe", photos[0], "--out", tmp_path / "no.npy", "--pca", file,
                 "--extractor", "test-tiny-vlad:aggregator=gem", code=1)  # fmt: skip
-    assert other["code"] == "pca_unfit"
+    assert other["code"] == "pca_unusable"
     assert "aggregator is 'gem', was 'avg'" in other["detail"]
     assert not (tmp_path / "no.npy").exists()
 
@@ -148,7 +148,7 @@ def test_what_is_no_file_of_rows_or_of_a_whitening_is_refused(folder: Path, tmp_
     )
     photo = folder / "0.jpg"
     refused = run("describe", photo, "--out", tmp_path / "no.npy", "--pca", text, code=1)
-    assert refused["code"] == "pca_unfit"
+    assert refused["code"] == "pca_unusable"
     no_out = run("pca", "fit", text, code=1)
     assert no_out["code"] == "bad_out"
     for arguments in (["--out", "a.safetensors"], ["--vocabulary", text]):

@@ -26,7 +26,7 @@ from shared.jobs.model_changes import (
     wake_vocabulary_waiters,
 )
 from shared.jobs.transitions import (
-    release_job,
+    requeue_job,
 )
 from tests.contract.jobs.jobs import ids, queue, token_of
 from tests.support.catalog_rows import (
@@ -177,7 +177,7 @@ def test_every_claim_has_a_fresh_token(catalog: Catalog, map_id: UUID) -> None:
         tokens.add(token_of(jobs))
         with catalog.write() as session:
             for job in lock_leased_jobs(session, token_of(jobs), jobs):
-                release_job(job)
+                requeue_job(job)
     assert len(tokens) == 4
 
 

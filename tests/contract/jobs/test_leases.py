@@ -34,7 +34,7 @@ from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import (
     cancel_job,
-    release_job,
+    requeue_job,
 )
 from tests.contract.jobs.jobs import end, free, ids, queue, token_of
 from tests.support.catalog_rows import (
@@ -305,8 +305,8 @@ def test_leases_know_no_clock_but_the_databases(
     expire_lease(catalog, *waiting)
     assert free(catalog) == 2  # and one 30 years behind keeps nothing
     with catalog.write() as session:
-        release_job(session.get_one(Job, waiting[0]), after_seconds=60)
-        release_job(session.get_one(Job, waiting[1]), after_seconds=-60)
+        requeue_job(session.get_one(Job, waiting[0]), after_seconds=60)
+        requeue_job(session.get_one(Job, waiting[1]), after_seconds=-60)
     assert ids(take(catalog)) == [waiting[1]]
 
 

@@ -18,7 +18,7 @@ from tests.support.catalog_rows import add_job, add_map, read_job, take
 
 KINDS = (JobKind.INDEX, JobKind.DESCRIBE, JobKind.EVALUATE)
 UNAVAILABLE = Unavailable("object_store_unavailable", "The object store is unreachable.")
-REFUSED = Unprocessable("vocabulary_unfit", "The vocabulary does not fit.")
+REFUSED = Unprocessable("vocabulary_unusable", "The vocabulary does not fit.")
 
 
 class Recorder:
@@ -48,9 +48,9 @@ def queue(catalog: Catalog, kind: JobKind, count: int = 1) -> list[UUID]:
     [
         (JobKind.INDEX, UNAVAILABLE, "queued", 0, "object_store_unavailable", StepOutcome.PAUSED),
         (JobKind.EVALUATE, OSError("disk"), "queued", 0, None, StepOutcome.PAUSED),
-        (JobKind.INDEX, REFUSED, "queued", 0, "vocabulary_unfit", StepOutcome.FAILED),
-        (JobKind.DESCRIBE, REFUSED, "failed", 0, "vocabulary_unfit", StepOutcome.FAILED),
-        (JobKind.EVALUATE, REFUSED, "failed", 0, "vocabulary_unfit", StepOutcome.FAILED),
+        (JobKind.INDEX, REFUSED, "queued", 0, "vocabulary_unusable", StepOutcome.FAILED),
+        (JobKind.DESCRIBE, REFUSED, "failed", 0, "vocabulary_unusable", StepOutcome.FAILED),
+        (JobKind.EVALUATE, REFUSED, "failed", 0, "vocabulary_unusable", StepOutcome.FAILED),
         (JobKind.EVALUATE, JobInterrupted(), "queued", 0, None, StepOutcome.INTERRUPTED),
         (JobKind.INDEX, RuntimeError("bug"), "queued", 1, None, StepOutcome.CRASHED),
     ],
@@ -153,6 +153,6 @@ def test_released_jobs_are_claimable_at_once(catalog: Catalog, recorder: Recorde
     assert claimed is not None
     assert not recorder.runner.has_jobs()
     with claimed.lease:
-        recorder.runner.release(claimed)
+        recorder.runner.requeue(claimed)
     assert recorder.outcomes == [(JobKind.INDEX, StepOutcome.INTERRUPTED, 2)]
     assert recorder.runner.has_jobs()

@@ -20,8 +20,8 @@ from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import (
     cancel_job,
     fail_job,
-    release_job,
     requeue_job,
+    requeue_job_as_new,
     retry_job,
     succeed_job,
 )
@@ -80,8 +80,8 @@ def test_a_released_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_
     jobs = take(catalog)
     with catalog.write() as session:
         one, two = lock_leased_jobs(session, token_of(jobs), jobs)
-        release_job(one)
-        release_job(two, after_seconds=3600)
+        requeue_job(one)
+        requeue_job(two, after_seconds=3600)
     assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
     assert ids(take(catalog)) == waiting[:1]
     assert [read_job(catalog, job_id).attempts for job_id in waiting] == [0, 0]
@@ -92,7 +92,7 @@ def test_a_released_model_change_stays_running(catalog: Catalog, map_id: UUID) -
         (job_id,) = queue(catalog, map_id, kind=kind)
         jobs = take(catalog)
         with catalog.write() as session:
-            release_job(lock_leased_jobs(session, token_of(jobs), jobs)[0])
+            requeue_job(lock_leased_jobs(session, token_of(jobs), jobs)[0])
         job = read_job(catalog, job_id)
         assert (job.state, job.lease_token) == (JobState.RUNNING, None)
         jobs = take(catalog)
@@ -159,7 +159,7 @@ def test_a_requeued_job_has_lost_its_past(catalog: Catalog, map_id: UUID) -> Non
     (job_id,) = queue(catalog, map_id, attempts=2, alone=True)
     jobs = take(catalog)
     with catalog.write() as session:
-        requeue_job(session.get_one(Job, job_id))
+        requeue_job_as_new(session.get_one(Job, job_id))
     assert end(catalog, jobs) == []
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)

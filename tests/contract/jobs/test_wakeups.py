@@ -9,13 +9,13 @@ from shared.jobs import (
 )
 
 
-def test_a_hint_sent_before_the_wait_is_not_lost() -> None:
+def test_a_wakeup_sent_before_the_wait_is_not_lost() -> None:
     wakeups = InProcessWakeups()
     wakeups.send()
     assert wakeups.wait(30)
 
 
-def test_at_most_one_hint_is_outstanding() -> None:
+def test_at_most_one_wakeup_is_outstanding() -> None:
     wakeups = InProcessWakeups()
     for _ in range(5):
         wakeups.send()
@@ -23,7 +23,7 @@ def test_at_most_one_hint_is_outstanding() -> None:
     assert not wakeups.wait(0)
 
 
-def test_a_waiting_worker_wakes_with_the_hint() -> None:
+def test_a_waiting_worker_is_woken() -> None:
     wakeups = InProcessWakeups()
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(wakeups.wait, 60)
@@ -31,5 +31,5 @@ def test_a_waiting_worker_wakes_with_the_hint() -> None:
         assert waiting.result(timeout=30)
 
 
-def test_a_wait_without_a_hint_ends() -> None:
+def test_a_wait_without_a_wakeup_ends() -> None:
     assert not InProcessWakeups().wait(0.01)

@@ -145,7 +145,7 @@ class SearchPortContract:
         request = places.request(places.query(unit_rows(2, 1)[0]))
         with pytest.raises(InvalidRequest) as caught:
             port().search(request.model_copy(update={"word_weights": (1.0,) * 5}))
-        assert caught.value.code == "word_weights_unfit"
+        assert caught.value.code == "word_weights_mismatch"
 
     def test_filtered_hits_are_the_best_of_what_passes(
         self, places: SmallMap, port: OpenPort

@@ -15,9 +15,9 @@ import torch
 from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
 
-from services.extractor import publish as publish_module
+from services.extractor import publish
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.maintenance import release_expired_leases
+from services.steward.tasks.maintenance import reclaim_leases
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo, mark_photo_deleted
@@ -26,7 +26,7 @@ from shared.descriptors.extractor import Extractor
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobState, claim_jobs
 from shared.jobs.runner import MAX_ATTEMPTS
-from shared.jobs.transitions import requeue_job
+from shared.jobs.transitions import requeue_job_as_new
 from shared.storage import FolderStore
 from tests.integration.extractor.conftest import Hook
 from tests.integration.extractor.test_describe_photos import _drain
@@ -107,15 +107,15 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
 
     photo_ids = averages.upload(1, 2)
     with monkeypatch.context() as patched:
-        patched.setattr(publish_module, "lock_map", die)
+        patched.setattr(publish, "lock_map", die)
         with pytest.raises(Killed):
             averages.drain()
     orphans = averages.keys("chunks/")
     assert len(orphans) == 2  # rows and manifest
     assert averages.rows() == {}
-    assert release_expired_leases(averages.catalog) == 0  # the lease has to expire first
+    assert reclaim_leases(averages.catalog) == 0  # the lease has to expire first
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
-    assert release_expired_leases(averages.catalog) == 2
+    assert reclaim_leases(averages.catalog) == 2
     _drain(make_worker())
     assert set(averages.rows()) == set(photo_ids)
     live = averages.keys("")
@@ -165,7 +165,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     monkeypatch.undo()
     assert len(averages.rows()) == 4
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
-    release_expired_leases(averages.catalog)
+    reclaim_leases(averages.catalog)
     averages.drain()
     assert set(averages.rows()) == set(photo_ids)
 
@@ -182,7 +182,7 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     def take_over() -> None:
         jobs = [averages.job_of(photo_id).id for photo_id in photo_ids]
         expire_lease(averages.catalog, *jobs)
-        assert release_expired_leases(averages.catalog) == 3
+        assert reclaim_leases(averages.catalog) == 3
         _drain(quick)
         seen.append(averages.keys("chunks/"))
 
@@ -205,7 +205,7 @@ def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
 
     def start_anew() -> None:
         with averages.catalog.write() as session:
-            requeue_job(session.get_one(Job, lost))
+            requeue_job_as_new(session.get_one(Job, lost))
 
     before_describing(once(start_anew))
     averages.drain()
@@ -245,7 +245,7 @@ def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) ->
     job_id = averages.job_of(photo_ids[0]).id
     averages.delete(photo_ids[0])
     with averages.catalog.write() as session:  # the worker had claimed it just before
-        requeue_job(session.get_one(Job, job_id))
+        requeue_job_as_new(session.get_one(Job, job_id))
     averages.drain()
     assert set(averages.rows()) == {photo_ids[1]}
     assert averages.job(job_id).state == JobState.CANCELLED

@@ -22,7 +22,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import StoredWhitening
-from shared.descriptors import extractor as extractors
+from shared.descriptors import extractor as extractor_module
 from shared.descriptors.pca_fit import fit_pca as fit_whitening
 from shared.descriptors.pca_whitening import PcaProjection, PcaWhitening, decode_whitening
 from shared.descriptors.vocabulary import decode_centres
@@ -149,7 +149,9 @@ def test_stored_rows_are_whitened_without_a_photo(
     assert file.spec == old.spec
 
 
-def test_labelled_queries_are_projected_and_never_learnt_from(described: Workplace) -> None:
+def test_labelled_queries_are_projected_and_not_fitted_on(
+    described: Workplace,
+) -> None:
     searched = sorted(described.rows())[:4]
     with described.catalog.write() as session:
         for photo_id in searched:
@@ -227,7 +229,7 @@ def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
 ) -> None:
     """An upgrade: the rows are projected ones, by a former decoder. The whitening stays."""
     before, old = reduced.rows(), reduced.active()
-    monkeypatch.setattr(extractors, "DECODER", "another release")
+    monkeypatch.setattr(extractor_module, "DECODER", "another release")
     models = ModelRegistry(
         reduced.store, reduced.settings.model_copy(update={"device": "cpu"}), none_added
     )
@@ -295,10 +297,10 @@ def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
     assert job.stage == "reduce"
 
 
-def test_rows_of_another_release_are_not_learnt_from(
+def test_a_whitening_is_not_fitted_on_rows_of_another_release(
     described: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(extractors, "DECODER", "another release")
+    monkeypatch.setattr(extractor_module, "DECODER", "another release")
     assert refusal(described.finish(described.start(JobKind.PCA, pca=3))) == "spec_differs"
 
 

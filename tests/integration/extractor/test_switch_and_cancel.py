@@ -164,7 +164,7 @@ def auto_fit(workplace: Workplace) -> bool:
         return session.get_one(Map, workplace.map_id).auto_fit
 
 
-def test_an_unfit_vocabulary_is_refused_with_the_reason_and_changes_nothing(
+def test_an_unusable_vocabulary_is_refused_with_the_reason_and_changes_nothing(
     fitted: Workplace,
 ) -> None:
     old = fitted.active().id
@@ -185,7 +185,7 @@ def test_an_unfit_vocabulary_is_refused_with_the_reason_and_changes_nothing(
         job = fitted.finish(import_file(fitted, data))
         assert job.state == JobState.FAILED, reason
         assert job.error is not None
-        assert job.error["code"] == "vocabulary_unfit"
+        assert job.error["code"] == "vocabulary_unusable"
         assert reason in job.error["detail"]
     assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
     assert fitted.building() is None
@@ -216,7 +216,7 @@ def test_a_switch_that_can_not_be_fails_with_the_reason(
     assert foreign is not None
     for vocabulary_id, code in (
         (foreign["vocabulary_id"], "vocabulary_not_found"),  # of another map
-        (None, "vocabulary_unfit"),  # the extractor needs one
+        (None, "vocabulary_unusable"),  # the extractor needs one
     ):
         job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=vocabulary_id))
         assert job.state == JobState.FAILED

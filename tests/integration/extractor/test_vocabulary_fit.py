@@ -28,7 +28,7 @@ from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
 from shared.integrity.verify import discard_chunk
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.runner import MAX_ATTEMPTS
-from shared.jobs.transitions import cancel_job, requeue_job, retry_job
+from shared.jobs.transitions import cancel_job, requeue_job_as_new, retry_job
 from tests.integration.extractor.model_changes import (
     PHOTOS,
     WIDTH,
@@ -96,7 +96,7 @@ def _version(workplace: Workplace) -> int:
         return session.get_one(Map, workplace.map_id).version
 
 
-def test_few_photos_bear_few_clusters(vlads: Workplace) -> None:
+def test_few_photos_give_few_clusters(vlads: Workplace) -> None:
     vlads.upload(1, 2, 3)
     job = vlads.fit(clusters=64)
     assert job.result is not None
@@ -144,7 +144,7 @@ def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: 
     for job in (averages.fit(), averages.finish(import_file(averages, npy(some_centres(3))))):
         assert job.state == JobState.FAILED
         assert job.error is not None
-        assert job.error["code"] == "vocabulary_unfit"
+        assert job.error["code"] == "vocabulary_unusable"
     assert averages.active().id == generation
 
 
@@ -368,7 +368,7 @@ def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_agai
     with fitted.catalog.write() as session:
         job = session.get_one(Job, job_id)
         # Uploading the same bytes again queues the job as it is; POST /jobs/{id}/retry asks.
-        retry_job(session, job) if later_changes else requeue_job(job)
+        retry_job(session, job) if later_changes else requeue_job_as_new(job)
     fitted.drain()
     assert fitted.job(job_id).state == JobState.SUCCEEDED
     assert bad in fitted.rows()

@@ -47,7 +47,7 @@ def active_vocabulary(workplace: Workplace) -> Vocabulary:
     return workplace.vocabulary(workplace.active().vocabulary_id)
 
 
-def test_a_fitted_vocabulary_says_how_it_was_learnt(vlads: Workplace) -> None:
+def test_a_fitted_vocabulary_says_what_it_was_fitted_on(vlads: Workplace) -> None:
     vlads.upload(*range(6))
     vlads.upload_bytes(b"nobody can decode this")
     assert vlads.fit(clusters=4, seed=5).state == JobState.SUCCEEDED
@@ -103,7 +103,7 @@ def test_a_vocabulary_of_other_weights_is_refused_with_both_specs(vlads: Workpla
     job = vlads.finish(import_file(vlads, other, "vits14.npz"))
     assert job.state == JobState.FAILED
     assert job.error is not None
-    assert job.error["code"] == "vocabulary_unfit"
+    assert job.error["code"] == "vocabulary_unusable"
     assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in job.error["detail"]
     assert "test-tiny-vlad computes test-tiny (weights" in job.error["detail"]
     assert job.error["learnt_with"]["backbone"] == "dinov2-vits14"
@@ -122,7 +122,7 @@ def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace)
     job = vlads.finish(vlads.start(JobKind.SWITCH, vocabulary_id=str(first)))
     assert job.state == JobState.FAILED
     assert job.error is not None
-    assert job.error["code"] == "vocabulary_unfit"
+    assert job.error["code"] == "vocabulary_unusable"
     assert "efefefefefef" in job.error["detail"]
 
 
@@ -148,7 +148,7 @@ def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switche
     )
     assert refused.state == JobState.FAILED
     assert refused.error is not None
-    assert refused.error["code"] == "vocabulary_unfit"
+    assert refused.error["code"] == "vocabulary_unusable"
     assert "square32 version 1; the extractor" in refused.error["detail"].replace("name ", "")
     assert refused.error["learnt_with"]["preprocessing"] == version_1
     assert refused.error["extractor_makes"]["preprocessing"] == version_2

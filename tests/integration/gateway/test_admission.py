@@ -12,7 +12,7 @@ import pytest
 from fastapi import Request
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway import admission as room_module
+from services.gateway import admission
 from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
 from services.gateway.authentication import Caller
 from shared.catalog.database.base import db_now_plus
@@ -57,13 +57,13 @@ def make_service(
 
 @pytest.fixture
 def always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(admission, "ADMISSION_POLL_SECONDS", 0.0)
     monkeypatch.setattr("shared.jobs.queue_depth.POLL_COST_DIVISOR", 0.0)
 
 
 @pytest.fixture
 def never_look_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 3600.0)
+    monkeypatch.setattr(admission, "ADMISSION_POLL_SECONDS", 3600.0)
 
 
 def upload(service: Service, number: int, map_name: str = "default") -> httpx2.Response:
@@ -218,8 +218,8 @@ def test_a_look_is_taken_once_for_many_calls(
         looks.append(most)
         return measure_queue_depth(session, most)
 
-    monkeypatch.setattr(room_module, "measure_queue_depth", counted)
-    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 3600.0)
+    monkeypatch.setattr(admission, "measure_queue_depth", counted)
+    monkeypatch.setattr(admission, "ADMISSION_POLL_SECONDS", 3600.0)
     service = make_service()
     for number in range(5):
         assert upload(service, number).status_code == 202
@@ -239,7 +239,7 @@ def test_a_look_is_taken_once_for_many_calls(
 def test_the_time_to_come_again_follows_from_the_queue_and_its_speed(
     waiting: int, per_second: float, seconds: int
 ) -> None:
-    error = room_module._queue_full_error("jobs", waiting, 1000, per_second)
+    error = admission._queue_full_error("jobs", waiting, 1000, per_second)
     assert error.extra["retry_after_seconds"] == seconds
 
 

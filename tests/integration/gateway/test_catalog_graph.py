@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, insert
 
-from services.gateway.tracks import apply_frames
-from services.gateway.tracks import catalog_graph as graph_module
+from services.gateway.tracks import apply_frames, catalog_graph
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.steward.tasks.maintenance import update_statistics_of_large_maps
 from shared.catalog.database.base import db_now
@@ -126,7 +125,7 @@ def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_start_o
     most_near, most_photos, most_of_label = 60, 20, 30
     for module in (filter_module, apply_frames):
         monkeypatch.setattr(module, "MAX_PHOTOS", most_photos)
-    for module in (filter_module, graph_module):
+    for module in (filter_module, catalog_graph):
         monkeypatch.setattr(module, "MAX_SAME_LABEL", most_of_label)
     monkeypatch.setattr(filter_module, "MAX_NEAR", most_near)
     with catalog.write() as session:

@@ -244,7 +244,7 @@ def test_a_client_is_not_blamed_for_a_server_that_does_not_read() -> None:
         assert b"200000" in answer_of(polite)
 
 
-def test_a_client_that_goes_away_counts_as_499_without_a_trace(
+def test_a_client_that_disconnects_counts_as_499_without_a_traceback(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with serving() as server:

@@ -1,4 +1,4 @@
-"""`Idempotency-Key` over HTTP: a repeated call is done once and answered the same."""
+"""`Idempotency-Key` over HTTP: a repeated call is done idempotency and answered the same."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway import idempotency as once
+from services.gateway import idempotency
 from services.gateway.routes import model_changes
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
@@ -276,9 +276,9 @@ def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_o
     service.indexed(1, latitude=45, longitude=7)
     jobs = count(catalog, Job)
     second: list[httpx2.Response] = []
-    begin = once.IdempotentRequest.claim_key
+    begin = idempotency.IdempotentRequest.claim_key
 
-    def slowly(self: once.IdempotentRequest, *arguments: Any) -> None:
+    def slowly(self: idempotency.IdempotentRequest, *arguments: Any) -> None:
         begin(self, *arguments)
         if not second:
             with catalog.write() as session:
@@ -287,7 +287,7 @@ def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_o
             second[0] = call_evaluation(service, headers=keyed())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(once.IdempotentRequest, "claim_key", slowly)
+        patch.setattr(idempotency.IdempotentRequest, "claim_key", slowly)
         first = call_evaluation(service, headers=keyed())
     problem(first, 409, "idempotency_key_in_use")
     assert second[0].status_code == 202
@@ -299,10 +299,10 @@ def test_a_gateway_that_crashed_blocks_its_key_no_longer_than_its_lease(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a killed process leaves: a claimed key, and nothing after it."""
-    monkeypatch.setattr(once.IdempotentRequest, "_release", lambda self, token: None)
+    monkeypatch.setattr(idempotency.IdempotentRequest, "_release", lambda self, token: None)
     with monkeypatch.context() as dying:
         dying.setattr(
-            once.IdempotentRequest,
+            idempotency.IdempotentRequest,
             "store_response",
             lambda *_: (_ for _ in ()).throw(SystemError("killed")),
         )

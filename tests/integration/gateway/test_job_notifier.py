@@ -10,7 +10,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from services.gateway import dependencies as job_watch
+from services.gateway import dependencies
 from services.gateway.dependencies import Change, JobNotifier, WatchedState
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
@@ -37,7 +37,7 @@ def jobs(catalog: Catalog) -> list[UUID]:
 
 async def started(*waits: asyncio.Task[None]) -> None:
     """Returns when they have looked at least once."""
-    await asyncio.sleep(5 * job_watch.NOTIFIER_POLL_SECONDS)
+    await asyncio.sleep(5 * dependencies.NOTIFIER_POLL_SECONDS)
     assert not any(wait.done() for wait in waits)
 
 
@@ -58,7 +58,7 @@ def test_one_slow_look_does_not_hold_up_the_next_ones(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A tenth of the time would be a pause of 20 seconds."""
-    look, looks = job_watch._load_watched_states, 0
+    look, looks = dependencies._load_watched_states, 0
 
     def slow_at_first(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
         nonlocal looks
@@ -67,7 +67,7 @@ def test_one_slow_look_does_not_hold_up_the_next_ones(
         time.sleep(2.0 if looks == 1 else 0.0)
         return states
 
-    monkeypatch.setattr(job_watch, "_load_watched_states", slow_at_first)
+    monkeypatch.setattr(dependencies, "_load_watched_states", slow_at_first)
 
     async def scenario() -> None:
         wait = asyncio.create_task(JobNotifier(catalog).wait_until_finished(jobs[0], LONG))
@@ -89,7 +89,7 @@ def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) ->
 def test_stopping_server_lets_nobody_wait_for_long(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job_watch, "SHUTDOWN_WAIT_SECONDS", 0.0)
+    monkeypatch.setattr(dependencies, "SHUTDOWN_WAIT_SECONDS", 0.0)
 
     async def scenario() -> None:
         watch = JobNotifier(catalog)
@@ -102,13 +102,13 @@ def test_stopping_server_lets_nobody_wait_for_long(
 
 
 def count_looks(monkeypatch: pytest.MonkeyPatch, looks: list[set[UUID]]) -> None:
-    real = job_watch._load_watched_states
+    real = dependencies._load_watched_states
 
     def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
         looks.append(job_ids)
         return real(catalog, job_ids)
 
-    monkeypatch.setattr(job_watch, "_load_watched_states", counted)
+    monkeypatch.setattr(dependencies, "_load_watched_states", counted)
 
 
 def test_all_that_wait_share_one_look(
@@ -130,7 +130,7 @@ def test_all_that_wait_share_one_look(
             set_columns(catalog, job, state=JobState.SUCCEEDED)
         await asyncio.wait_for(asyncio.gather(*waits), LONG)
         after = len(looks)
-        await asyncio.sleep(5 * job_watch.NOTIFIER_POLL_SECONDS)
+        await asyncio.sleep(5 * dependencies.NOTIFIER_POLL_SECONDS)
         assert len(looks) == after, "nobody waits, nobody looks"
 
     asyncio.run(scenario())
@@ -142,14 +142,14 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
     looks: list[set[UUID]] = []
     read: list[set[UUID]] = []
     count_looks(monkeypatch, looks)
-    real = job_watch._load_jobs
+    real = dependencies._load_jobs
 
     def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
         read.append(job_ids)
         return real(catalog, job_ids)
 
-    monkeypatch.setattr(job_watch, "_load_jobs", counted)
-    monkeypatch.setattr(job_watch, "CHANGE_POLL_SECONDS", 0.1)
+    monkeypatch.setattr(dependencies, "_load_jobs", counted)
+    monkeypatch.setattr(dependencies, "CHANGE_POLL_SECONDS", 0.1)
 
     async def scenario() -> None:
         watch = JobNotifier(catalog)
@@ -190,12 +190,12 @@ def test_waiting_for_a_change_ends_with_an_outage_of_the_catalog_and_with_the_ti
 
     with pytest.raises(TimeoutError):
         asyncio.run(wait(0.001))
-    monkeypatch.setattr(job_watch, "_load_watched_states", fail)
+    monkeypatch.setattr(dependencies, "_load_watched_states", fail)
     with pytest.raises(OperationalError):
         asyncio.run(wait(LONG))
 
 
-def test_who_goes_away_takes_no_others_answer_along(catalog: Catalog, jobs: list[UUID]) -> None:
+def test_a_client_that_disconnects_ends_no_other_wait(catalog: Catalog, jobs: list[UUID]) -> None:
     async def scenario() -> None:
         watch = JobNotifier(catalog)
         goes, stays = (

@@ -52,7 +52,7 @@ def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: 
     assert job.progress_done == job.progress_total
 
 
-def test_a_vocabulary_is_learnt_from_database_photos_alone(
+def test_a_vocabulary_is_fitted_on_database_photos_only(
     vlads: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_ids = vlads.upload(*range(8))

@@ -15,7 +15,7 @@ from sqlalchemy import select
 from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_registry import ModelRegistry
 from services.steward.evaluation_worker import EvaluationWorker
-from services.steward.tasks import delete_maps as delete_maps_module
+from services.steward.tasks import delete_maps
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.model_changes import advance_model_changes
@@ -264,7 +264,7 @@ def _check_remembered(catalog: Catalog, store: FolderStore) -> None:
 def test_a_map_of_more_rows_than_one_transaction_takes_goes_as_well(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(delete_maps_module, "ROWS_PER_TRANSACTION", 10)  # and one chunk at once
+    monkeypatch.setattr(delete_maps, "ROWS_PER_TRANSACTION", 10)  # and one chunk at once
     service.json("POST", "/maps", 201, json={"name": "gone"})
     before = rows(catalog)
     for number in range(3):

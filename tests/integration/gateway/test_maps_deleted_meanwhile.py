@@ -13,9 +13,9 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.publish import publish
-from services.gateway.routes import uploads as upload_module
+from services.gateway.routes import uploads as uploads_module
 from services.gateway.similarity.execute import run_similarity_search
-from services.steward.tasks import delete_maps as delete_maps_module
+from services.steward.tasks import delete_maps
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import Chunk, Descriptor
@@ -188,7 +188,7 @@ def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
             store.put(add_photo(session, map_id).object_key, b"late")
 
     with monkeypatch.context() as patched:
-        patched.setattr(delete_maps_module, "_purge_vocabulary_objects", slip_in)
+        patched.setattr(delete_maps, "_purge_vocabulary_objects", slip_in)
         with pytest.raises(Exception, match=r"(?i)foreign key"):
             purge_deleted_maps(catalog, store)
     remove_all(catalog, store)
@@ -208,7 +208,7 @@ def test_a_job_that_slips_in_is_cancelled_before_anything_is_removed(
     def away(*_: Any) -> bool:
         raise Away
 
-    monkeypatch.setattr(delete_maps_module, "_purge_chunks", away)
+    monkeypatch.setattr(delete_maps, "_purge_chunks", away)
     with pytest.raises(Away):
         purge_deleted_maps(catalog, store)
     assert read_job(catalog, job.id).state == JobState.CANCELLED
@@ -225,7 +225,7 @@ def test_an_upload_whose_map_went_meanwhile_is_not_found_and_leaves_no_bytes(
         remove_all(catalog, store)
         return real(*arguments)
 
-    monkeypatch.setattr(upload_module, "store_photo", delete_first)
+    monkeypatch.setattr(uploads_module, "store_photo", delete_first)
     files = {"file": photo_bytes(1)}
     answer = service("POST", "/upload", params={"map": "gone"}, files=files)
     assert "placewise maps create gone" in problem(answer, 404, "map_not_found")["detail"]

@@ -16,14 +16,13 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import func, select
 
-from services.gateway import rate_limits as quotas_module
-from services.gateway.routes import uploads as upload_module
+from services.gateway import rate_limits
+from services.gateway.routes import uploads as uploads_module
 from services.steward.batches.worker import BatchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
-from shared.ingest import store_photo as photo_quota
-from shared.ingest import validation as incoming_module
+from shared.ingest import store_photo, validation
 from shared.ingest.validation import ValidatedPhoto
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
@@ -127,7 +126,7 @@ def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(quotas_module, "REDIS_RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(rate_limits, "REDIS_RETRY_SECONDS", 0.0)
     with start_redis(own=True) as redis, caplog.at_level(logging.WARNING):
         door = Door(catalog, store, settings.model_copy(update={"redis_url": SecretStr(redis.url)}))
         key = door.key("read", requests_per_minute=1)["key"]
@@ -144,7 +143,7 @@ def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
 def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
     door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photo_quota, "FULL_RECOUNT_SECONDS", 0.0)
+    monkeypatch.setattr(store_photo, "FULL_RECOUNT_SECONDS", 0.0)
     key = door.key("write", max_photos=2)["key"]
     for _ in range(3):  # the same bytes again, and none at all, are no further photos
         assert door.put(key, 1).status_code in (200, 202)
@@ -159,7 +158,7 @@ def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
 def test_tracks_and_their_frames_count_in_the_limits_of_their_key(
     door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photo_quota, "FULL_RECOUNT_SECONDS", 0.0)
+    monkeypatch.setattr(store_photo, "FULL_RECOUNT_SECONDS", 0.0)
 
     def send(key: str, track_id: str, number: int) -> httpx2.Response:
         data = {"captured_at": f"2026-05-01T12:00:0{number}Z"}
@@ -187,13 +186,13 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
 ) -> None:
     most, uploads = 3, 8
     all_received = Barrier(uploads)
-    real = incoming_module.validate_photo
+    real = validation.validate_photo
 
     def examine_together(*arguments: Any) -> ValidatedPhoto:
         all_received.wait(60)
         return real(*arguments)
 
-    monkeypatch.setattr(upload_module, "validate_photo", examine_together)
+    monkeypatch.setattr(uploads_module, "validate_photo", examine_together)
     door.app.openapi()  # a route is worked out at its first call, which no two threads may do
     key = door.key("write", max_photos=most)["key"]
     with ThreadPoolExecutor(uploads) as pool:

@@ -18,7 +18,7 @@ from services.gateway.tracks import apply_frames
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_queries
 from services.steward.tasks.maintenance import delete_old_tracks
-from shared.catalog import tracks as tracks_table
+from shared.catalog import tracks as tracks_module
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job
@@ -208,7 +208,7 @@ def test_a_late_frame_changes_the_states_after_it(
             other["state"]["probability"], abs=0.2
         )
     assert after["state"]["probability"] != before["state"]["probability"]
-    monkeypatch.setattr(tracks_table, "MAX_LATE_FRAMES", 2)
+    monkeypatch.setattr(tracks_module, "MAX_LATE_FRAMES", 2)
     refusal = refused(street, late, "frame_too_late", 4, captured_at=time_of(0.5))
     assert refusal["status"] == 409
     send(street, late, 4, captured_at=time_of(1.5))
@@ -474,7 +474,7 @@ def test_any_times_and_odometry_lead_to_a_state(
 
 @pytest.mark.databases("sqlite")
 def test_a_full_track_takes_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracks_table, "MAX_TRACK_FRAMES", 1)
+    monkeypatch.setattr(tracks_module, "MAX_TRACK_FRAMES", 1)
     track_id = begin(service)
     send(service, track_id, 0)
     assert refused(service, track_id, "track_full", 1)["status"] == 409

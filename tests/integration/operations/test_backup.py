@@ -13,9 +13,8 @@ import pytest
 from sqlalchemy import select
 
 from services.extractor.worker import ExtractorWorker
-from shared.backup import create as make
-from shared.backup import folder as copy_objects
-from shared.backup import folder as rows
+from shared.backup import create
+from shared.backup import folder as folder_module
 from shared.backup.create import create_backup
 from shared.backup.folder import BackupFolder, backup_tables, open_backup
 from shared.backup.restore import RestoreResult, restore_backup
@@ -172,7 +171,7 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
 
     def noted(store: FolderStore, folder: BackupFolder, info: Any) -> int:
         taken.append(info.key)
-        return copy_objects.back_up_object(store, folder, info)
+        return folder_module.back_up_object(store, folder, info)
 
     monkeypatch.setattr("shared.backup.create.back_up_object", noted)
     assert backed_up().objects
@@ -198,7 +197,7 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
     rounds: list[int] = []
 
     def meanwhile(*arguments: Any) -> Any:
-        counts = rows.dump_rows(*arguments)
+        counts = folder_module.dump_rows(*arguments)
         rounds.append(1)
         return counts
 
@@ -217,10 +216,10 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
             service.store.delete(newest.object_key)
         return copy_rest(*arguments)
 
-    copy_all, copy_rest = make._copy_all, make._copy_missing
+    copy_all, copy_rest = create._copy_all, create._copy_missing
     monkeypatch.setattr("shared.backup.create.dump_rows", meanwhile)
-    monkeypatch.setattr(make, "_copy_all", before)
-    monkeypatch.setattr(make, "_copy_missing", after)
+    monkeypatch.setattr(create, "_copy_all", before)
+    monkeypatch.setattr(create, "_copy_missing", after)
     about = backed_up()
     assert len(rounds) == 2
     assert (about.missing, about.damaged) == ([], [])
@@ -252,7 +251,7 @@ def test_an_interrupted_backup_leaves_the_one_before_and_goes_on(
     before = backed_up()
     service.indexed(2)
     with monkeypatch.context() as patched:
-        patched.setattr(make, "_copy_missing", lambda *_: 1 / 0)
+        patched.setattr(create, "_copy_missing", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             backed_up()
     with (tmp_path / "backup/objects.jsonl").open("a") as lines:

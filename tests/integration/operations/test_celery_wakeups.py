@@ -64,9 +64,7 @@ def until(condition) -> None:  # type: ignore[no-untyped-def]
         time.sleep(0.05)
 
 
-def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
-    wakeups: CeleryWakeups, own_redis: RedisServer
-) -> None:
+def test_a_wakeup_is_json_that_names_no_job(wakeups: CeleryWakeups, own_redis: RedisServer) -> None:
     wakeups.send(WakeupQueue.QUERY)
     until(lambda: waiting(own_redis)[WakeupQueue.QUERY])
     found = waiting(own_redis)
@@ -78,7 +76,7 @@ def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
     assert (arguments, named) == ([], {})
 
 
-def test_a_lane_holds_few_hints_however_many_are_sent(
+def test_a_queue_holds_few_wakeups_however_many_are_sent(
     wakeups: CeleryWakeups, own_redis: RedisServer
 ) -> None:
     for _ in range(3 * MAX_PENDING_WAKEUPS):
@@ -89,7 +87,7 @@ def test_a_lane_holds_few_hints_however_many_are_sent(
     assert len(waiting(own_redis)[WakeupQueue.BULK]) == MAX_PENDING_WAKEUPS
 
 
-def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
+def test_without_redis_a_wakeup_neither_waits_nor_raises_and_the_next_one_arrives(
     wakeups: CeleryWakeups, own_redis: RedisServer
 ) -> None:
     assert own_redis.process is not None
@@ -177,7 +175,7 @@ def done(catalog: Catalog) -> dict[str, int]:
         return {str(state): count for state, count in found}
 
 
-def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
+def test_an_extractor_runs_queued_jobs_whatever_happens_to_the_wakeups(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
@@ -205,7 +203,7 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
     put(5)
     with Redis.from_url(own_redis.url) as client:
         client.flushall()
-    resend_wakeups(catalog_on_postgres, wakeups)  # the steward's duty
+    resend_wakeups(catalog_on_postgres, wakeups)  # the steward's task
     until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 46})
 
     extractor.process.terminate()

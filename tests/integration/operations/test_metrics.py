@@ -94,7 +94,7 @@ def test_alerts_and_dashboards_name_only_what_the_services_export(
         "placewise_search_device_failed": {"device"},
         "placewise_extractor_device_used_bytes": {"device"},
         "placewise_extractor_device_total_bytes": {"device"},
-        "placewise_steward_duty_lag_seconds": {"duty"},
+        "placewise_steward_task_lag_seconds": {"task"},
     }.items():
         there.setdefault(name, frozenset(labels))
     assert len(expressions()) > 40
@@ -116,7 +116,7 @@ def test_every_name_begins_with_its_service_and_no_label_is_anyones_choice(
     for name, labels in exported(whole).items():
         assert re.match(r"placewise_(gateway|extractor|search|steward)_", name), name
         assert labels <= {
-            *("method", "route", "status", "kind", "state", "stage", "outcome", "duty"),
+            *("method", "route", "status", "kind", "state", "stage", "outcome", "task"),
             *("certificate", "device", "generation", "le", "reason"),
         }, name
 
@@ -180,7 +180,7 @@ def test_an_extractor_counts_its_batches_stages_and_losses(averages: Workplace) 
     assert value("placewise_extractor_model_load_seconds_count") == 1
 
 
-def test_a_steward_counts_its_rounds_and_what_it_mends(
+def test_a_steward_counts_its_tasks_and_repairs(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     registry = CollectorRegistry()
@@ -190,19 +190,19 @@ def test_a_steward_counts_its_rounds_and_what_it_mends(
         add_job(session, map_id)
         add_job(session, map_id)
     expire_lease(catalog, take(catalog, 1)[0].id)
-    duties = {duty.name: duty for duty in steward.tasks}
-    for name in ("free leases", "resend hints", "collect"):
-        steward._run_task(duties[name])
-    duties["compact"].run = lambda: 1 / 0
-    steward._run_task(duties["compact"])
+    tasks = {task.name: task for task in steward.tasks}
+    for name in ("reclaim leases", "resend wakeups", "collect"):
+        steward._run_task(tasks[name])
+    tasks["compact"].run = lambda: 1 / 0
+    steward._run_task(tasks["compact"])
     value = registry.get_sample_value
     assert value("placewise_steward_leases_expired_total") == 1
-    assert value("placewise_steward_hints_resent_total") == 1
-    counted = "placewise_steward_duties_total"
-    assert value(counted, {"duty": "free_leases", "outcome": "done"}) == 1
-    assert value(counted, {"duty": "compact", "outcome": "failed"}) == 1
-    assert value("placewise_steward_duty_lag_seconds", {"duty": "collect"}) is not None
-    assert value("placewise_steward_duty_lag_seconds", {"duty": "compact"}) is None
+    assert value("placewise_steward_wakeups_resent_total") == 1
+    counted = "placewise_steward_tasks_total"
+    assert value(counted, {"task": "reclaim_leases", "outcome": "done"}) == 1
+    assert value(counted, {"task": "compact", "outcome": "failed"}) == 1
+    assert value("placewise_steward_task_lag_seconds", {"task": "collect"}) is not None
+    assert value("placewise_steward_task_lag_seconds", {"task": "compact"}) is None
 
 
 def test_figures_are_answered_on_a_port_of_their_own(

@@ -32,7 +32,7 @@ from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.journal.outbox import catalog_lag, write_journal
 from shared.journal.segments import list_segments
-from shared.rebuild import recover as recover_module
+from shared.rebuild import recover
 from shared.rebuild.recover import RecoveryReport, begin_rebuild, recover_catalog
 from shared.storage import FolderStore
 from shared.storage.chunks import manifest_key, write_chunk
@@ -171,7 +171,7 @@ def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
 
     for step in ("recover_chunks", "recover_originals", "_queue_photos"):
         with monkeypatch.context() as patched:
-            patched.setattr(recover_module, step, die)
+            patched.setattr(recover, step, die)
             with pytest.raises(KeyboardInterrupt):
                 rebuilt(service)
         lag = catalog_lag(service.catalog, store)

@@ -17,7 +17,7 @@ from starlette.testclient import TestClient
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
-from services.search import service as search_service
+from services.search import service
 from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
@@ -118,7 +118,7 @@ def test_a_killed_shard_is_named_and_the_others_answer_until_it_is_back(
     assert response.certificate == "none"
     assert_answers(response, rest)
     assert len(rest) < len(everything)
-    assert tier.port.status().away == ("shard 1/3",)
+    assert tier.port.status().unavailable == ("shard 1/3",)
 
     tier.servers[1][0].start()
     deadline = time.monotonic() + BACK_SECONDS
@@ -126,7 +126,7 @@ def test_a_killed_shard_is_named_and_the_others_answer_until_it_is_back(
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert_answers(response, everything)
-    assert tier.port.status().away == ()
+    assert tier.port.status().unavailable == ()
 
 
 def test_a_killed_replica_is_not_noticed(places: SmallMap, tier_of: OpenTier) -> None:
@@ -138,7 +138,7 @@ def test_a_killed_replica_is_not_noticed(places: SmallMap, tier_of: OpenTier) ->
         response = ask(tier, places)
         assert response.missing == ()
         assert_answers(response, everything)
-    assert tier.port.status().away == ()
+    assert tier.port.status().unavailable == ()
 
 
 def test_without_any_worker_search_is_unavailable(places: SmallMap, tier_of: OpenTier) -> None:
@@ -377,7 +377,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
     assert 0 <= lag["seconds"] < 5
 
     with monkeypatch.context() as patched:
-        patched.setattr(search_service, "MAX_READY_LAG_SECONDS", 0.0)
+        patched.setattr(service, "MAX_READY_LAG_SECONDS", 0.0)
         status, body = ready()
         assert status == 503
         assert re.search("is 0 versions behind, last current .* s ago", body["reasons"][0])

@@ -15,8 +15,7 @@ from sqlalchemy import select, update
 
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward.tasks import generation_repair as generation_repair_module
-from services.steward.tasks import model_changes as search_workers
+from services.steward.tasks import generation_repair, model_changes
 from services.steward.tasks.generation_repair import repair_generations
 from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS, remove_dead_search_workers
 from shared.catalog.database.base import db_now, db_now_plus
@@ -260,7 +259,7 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
 
-    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
+    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
     repair_generations(fitted.catalog, fitted.store)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
@@ -283,7 +282,7 @@ def test_a_chunk_that_only_its_worker_can_not_read_is_kept(
     fitted.store.put(key, whole[:-1])
     worker.catch_up()
     fitted.store.put(key, whole)
-    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
+    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
     repair_generations(fitted.catalog, fitted.store)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
@@ -292,8 +291,8 @@ def test_a_chunk_that_only_its_worker_can_not_read_is_kept(
 def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
     fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(generation_repair_module, "MAX_REPAIRED_CHUNKS", 0)
-    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
+    monkeypatch.setattr(generation_repair, "MAX_REPAIRED_CHUNKS", 0)
+    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
     worker, old = register("worker"), fitted.active()
     job_id, new_id = complete(fitted)
     key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))

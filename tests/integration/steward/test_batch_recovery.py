@@ -9,14 +9,13 @@ from uuid import UUID
 import pytest
 from sqlalchemy import func, select
 
-from services.steward.batches import worker as bring_in_module
+from services.steward.batches import worker
 from services.steward.batches.worker import resume_batches
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.photos import Photo
 from shared.errors import StorageFull, Unavailable
-from shared.ingest import store_photo as store_photo_module
-from shared.ingest import validation as incoming_module
+from shared.ingest import store_photo, validation
 from shared.jobs import Job, JobKind, JobState
 from shared.storage import FolderStore, ObjectStore
 from tests.integration.steward.batches import Batches, Killed, codes, counts, files, restart
@@ -71,17 +70,17 @@ def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start_import(files(*range(5)))
-    real = store_photo_module.insert_photo
+    real = store_photo.insert_photo
 
     def put_then_die(*arguments: Any) -> Any:
         real(*arguments)
         raise Killed
 
     for life in range(2):
-        monkeypatch.setattr(bring_in_module, "insert_photo", put_then_die)
+        monkeypatch.setattr(worker, "insert_photo", put_then_die)
         with pytest.raises(Killed):
             batches.work()
-        monkeypatch.setattr(bring_in_module, "insert_photo", real)
+        monkeypatch.setattr(worker, "insert_photo", real)
         assert batches.photos() == [], life
         batches.worker = restart(batches, job_id)
     assert len(batches.keys("originals/")) == 2, "orphans of the two lives"
@@ -111,14 +110,14 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start_import(files(*range(4)))
-    real = incoming_module.validate_photo
+    real = validation.validate_photo
 
     def die_of_one(store: ObjectStore, received: Any, *rest: Any, **fields: Any) -> Any:
         if received.filename == "2.jpg":
             raise Killed
         return real(store, received, *rest, **fields)
 
-    monkeypatch.setattr(bring_in_module, "validate_photo", die_of_one)
+    monkeypatch.setattr(worker, "validate_photo", die_of_one)
     for _ in range(3):
         with pytest.raises(Killed):
             batches.work()
@@ -203,7 +202,7 @@ def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
 ) -> None:
     photos = files(*range(5))
     job_id = on_s3.start(*photos) if source == "files" else on_s3.start_import(photos)
-    real = incoming_module.validate_photo
+    real = validation.validate_photo
     left = [3]
 
     def die_at_the_third(*arguments: Any) -> Any:
@@ -212,7 +211,7 @@ def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
             raise Killed
         return real(*arguments)
 
-    monkeypatch.setattr(bring_in_module, "validate_photo", die_at_the_third)
+    monkeypatch.setattr(worker, "validate_photo", die_at_the_third)
     with pytest.raises(Killed):
         on_s3.work()
     on_s3.worker = restart(on_s3, job_id)

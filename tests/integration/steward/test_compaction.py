@@ -11,7 +11,7 @@ from uuid import UUID
 
 import pytest
 
-from services.steward.tasks import compaction as compact_module
+from services.steward.tasks import compaction
 from services.steward.tasks.compaction import merge_slot, merge_small_chunks
 from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
@@ -78,7 +78,7 @@ def test_a_row_of_a_full_slot_was_merged_at_most_twice(
         written.update(options["photo_ids"])
         return write_chunk(*arguments, **options)
 
-    monkeypatch.setattr(compact_module, "write_chunk", count)
+    monkeypatch.setattr(compaction, "write_chunk", count)
     photo_ids = []
     for _ in range(24):
         photo_ids += sum_of(chunk_map.chunks(2, slot_rows=16))
@@ -141,7 +141,7 @@ def test_merging_twice_at_once_merges_once(
 
     with chunk_map.catalog.read() as session:
         first_keys = {list_live_chunks(session, chunk_map.generation_id)[0].object_key}
-    monkeypatch.setattr(compact_module, "read_chunk", read_together)
+    monkeypatch.setattr(compaction, "read_chunk", read_together)
     with ThreadPoolExecutor(2) as pool:
         merges = [
             pool.submit(merge_slot, chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
@@ -166,7 +166,7 @@ def while_merging(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], obj
                 break
             return written
 
-        monkeypatch.setattr(compact_module, "write_chunk", write)
+        monkeypatch.setattr(compaction, "write_chunk", write)
 
     return meanwhile
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from services.steward import evaluation_worker as asked_module
+from services.steward import evaluation_worker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation
 from shared.catalog.jobs import get_job
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.databases("postgresql")
 @pytest.fixture
 def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
     """The evaluator looks at its job after every question."""
-    monkeypatch.setattr(asked_module, "PROGRESS_INTERVAL_SECONDS", -1.0)
+    monkeypatch.setattr(evaluation_worker, "PROGRESS_INTERVAL_SECONDS", -1.0)
 
 
 @pytest.mark.usefixtures("look_always")

@@ -144,10 +144,10 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     chunk_map.age(orphans, 2 * DAY_SECONDS)
     metrics = StewardMetrics(CollectorRegistry())
     steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings, metrics)
-    (duty,) = [duty for duty in steward.tasks if duty.name == "collect orphans"]
+    (task,) = [task for task in steward.tasks if task.name == "collect orphans"]
     assert MAX_ORPHAN_SHARE * len(live | orphans) < 4
 
-    duty.run()
+    task.run()
     assert chunk_map.objects() == live | orphans
     assert chunk_map.objects("trash/") == set()
     assert metrics.collection_held._value.get() == 1
@@ -163,7 +163,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     assert chunk_map.objects() == live
     assert len(chunk_map.objects("trash/")) == 4
     assert read_hold(chunk_map.store) is None
-    duty.run()
+    task.run()
     assert metrics.collection_held._value.get() == 0
     assert metrics.trash_bytes._value.get() == 24
 

@@ -9,7 +9,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select, update
 
-from services.steward.tasks import maintenance as retention_module
+from services.steward.tasks import maintenance
 from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
@@ -128,7 +128,7 @@ def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog
 def test_more_than_one_transaction_takes_goes_in_several(
     service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retention_module, "RETENTION_ROWS_PER_TRANSACTION", 2)
+    monkeypatch.setattr(maintenance, "RETENTION_ROWS_PER_TRANSACTION", 2)
     with catalog.write() as session:
         map_id = get_map(session, "default").id
         for _ in range(5):

@@ -138,7 +138,7 @@ def test_a_long_task_with_a_thread_of_its_own_delays_no_other(
 def test_each_duty_is_done_by_the_loop(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One round does everything once: each duty leaves its trace."""
+    """One round does everything once: each task leaves its trace."""
     wakeups = InProcessWakeups()
     soon = settings.model_copy(update={"orphan_age_seconds": 0.0})
     monkeypatch.setattr(vocabularies, "MIN_PHOTOS_TO_FIT", 1)
@@ -190,7 +190,7 @@ def test_each_duty_is_done_by_the_loop(
         assert fit.map_id == other
 
 
-def test_a_lost_hint_is_sent_again_while_there_is_work(chunk_map: ChunkMap) -> None:
+def test_a_lost_wakeup_is_sent_again_while_there_are_jobs(chunk_map: ChunkMap) -> None:
     wakeups = InProcessWakeups()
     resend_wakeups(chunk_map.catalog, wakeups)
     assert not wakeups.wait(0)

@@ -20,7 +20,7 @@ import pytest
 from sqlalchemy import update
 
 from services.extractor.worker import ExtractorWorker
-from services.steward import webhooks as send_module
+from services.steward import webhooks as webhooks_module
 from services.steward.batches.worker import BatchWorker
 from services.steward.webhooks import (
     MAX_IN_FLIGHT,
@@ -134,7 +134,7 @@ def hooks(
 def test_a_retry_is_sent_when_it_is_due_though_nothing_else_happens(
     hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(send_module, "RETRY_DELAYS_SECONDS", (2.0, 3600.0))
+    monkeypatch.setattr(webhooks_module, "RETRY_DELAYS_SECONDS", (2.0, 3600.0))
     hooks.receiver.status = 500
     hooks.announce(EventKind.JOB_SUCCEEDED)
     stop = threading.Event()
@@ -277,7 +277,9 @@ def test_a_name_that_has_become_private_since_is_not_called(
         hooks.door.catalog, Settings().model_copy(update={"webhook_private_addresses": False})
     )
     monkeypatch.setattr(
-        send_module, "parse_webhook_url", lambda url, allow_private: _target_of(hooks.receiver.url)
+        webhooks_module,
+        "parse_webhook_url",
+        lambda url, allow_private: _target_of(hooks.receiver.url),
     )
     assert hooks.send(strict) == 1
     assert hooks.receiver.messages == []
@@ -315,7 +317,7 @@ def test_the_connection_goes_to_the_address_that_was_checked(
 def test_a_receiver_that_hangs_is_not_waited_for(
     hooks: WebhookSetup, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch, hangs: str
 ) -> None:
-    monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 60.0 if hangs == "body" else 0.5)
+    monkeypatch.setattr(webhooks_module, "ATTEMPT_SECONDS", 60.0 if hangs == "body" else 0.5)
     with hanging_receiver(localhost_tls, hangs) as hooks.receiver.url:
         webhook = hooks.add("batch.finished")
         hooks.announce(EventKind.BATCH_FINISHED)
@@ -332,7 +334,7 @@ def test_receivers_that_hang_delay_neither_other_webhooks_nor_the_stop(
     hooks: WebhookSetup, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # An attempt has no end of its own here: whoever waited for one would never come back.
-    monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 3600.0)
+    monkeypatch.setattr(webhooks_module, "ATTEMPT_SECONDS", 3600.0)
     looked_up, answered = threading.Event(), threading.Event()
     real = socket.getaddrinfo
 

@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from services.search.worker import SearchWorker
-from services.steward import word_weights as teach_module
+from services.steward import word_weights as word_weights_module
 from services.steward.evaluation_worker import EvaluationWorker
-from services.steward.tasks import auto_evaluation as auto_evaluate
+from services.steward.tasks import auto_evaluation
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
@@ -213,7 +213,7 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
     first, again, other = (city.learn(seed=seed, sample=FEW) for seed in (0, 0, 1))
     assert first == again
     assert first.weights != other.weights
-    monkeypatch.setattr(teach_module, "ROW_BATCH_BYTES", 10 * WORDS * WIDTH * 4)
+    monkeypatch.setattr(word_weights_module, "ROW_BATCH_BYTES", 10 * WORDS * WIDTH * 4)
     small = city.learn(sample=FEW)
     assert small.near_pairs == first.near_pairs
     assert min(small.weights[:2]) > 2 * max(small.weights[2:])
@@ -268,7 +268,7 @@ def _refused(city: City) -> str:
 
 @pytest.fixture
 def small_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auto_evaluate, "AUTO_SAMPLE_PHOTOS", TRIED)
+    monkeypatch.setattr(auto_evaluation, "AUTO_SAMPLE_PHOTOS", TRIED)
 
 
 def queued(city: City) -> str | None:

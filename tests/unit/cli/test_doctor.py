@@ -11,9 +11,9 @@ import torch
 
 from services.cli.descriptors import local_weights
 from services.cli.descriptors.local_weights import WeightsRecord, suggest_extractor
-from services.cli.operations import installation_checks as extractor_checks
+from services.cli.operations import installation_checks
 from services.cli.operations.installation_checks import check_device, check_extractor, check_memory
-from shared.config import settings as machine
+from shared.config import settings as settings_module
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.descriptors.backbones import dinov2
 from shared.descriptors.backbones.dinov2 import SHAPES
@@ -63,7 +63,7 @@ def test_weights_without_the_chosen_layer_are_found_out(
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vits14", DINO_WEIGHTS=small)
     with pytest.raises(Misconfigured, match=r"it has no tensor blocks\.1\.norm1\.weight") as caught:
         check_extractor(settings)
-    assert caught.value.code == "weights_unfit"
+    assert caught.value.code == "weights_unusable"
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -144,7 +144,7 @@ def test_an_allowed_model_of_torch_hub_that_was_loaded_here_is_suggested_first(
 def test_the_suggestion_stands_behind_the_default_extractor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(extractor_checks, "suggest_extractor", lambda _settings: "a better one")
+    monkeypatch.setattr(installation_checks, "suggest_extractor", lambda _settings: "a better one")
     assert check_extractor(Settings()).endswith("; a better one")
 
 
@@ -210,17 +210,17 @@ def test_memory_of_one_large_photo_is_counted_whatever_the_batch(
 
 
 def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extractor_checks, "memory_limit_bytes", lambda: 2 * GB)
+    monkeypatch.setattr(installation_checks, "memory_limit_bytes", lambda: 2 * GB)
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")
     with pytest.raises(Misconfigured) as caught:
         check_memory(settings)
-    assert "this machine has 2.0 GB" in caught.value.detail
+    assert "this settings_module has 2.0 GB" in caught.value.detail
     assert "DEVICE=cpu" not in caught.value.detail
 
 
 def test_ram_of_a_container_is_its_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(machine, "CGROUP_MEMORY_LIMIT_FILE", limit)
+    monkeypatch.setattr(settings_module, "CGROUP_MEMORY_LIMIT_FILE", limit)
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     assert memory_limit_bytes() == whole
     for written, expected in (("max\n", whole), ("1000000\n", 1_000_000), ("9" * 30, whole)):

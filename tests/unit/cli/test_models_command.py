@@ -13,11 +13,11 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.descriptors import local_weights as weights_here
+from services.cli.descriptors import local_weights
 from services.cli.main import build_app
 from shared.config.settings import Settings
-from shared.descriptors import weight_files as download
-from shared.descriptors.backbones import torchhub as torchhub_code
+from shared.descriptors import weight_files
+from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
@@ -44,7 +44,7 @@ def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "huggingface"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setattr(download, "RETRY_PAUSE_SECONDS", 0)
+    monkeypatch.setattr(weight_files, "RETRY_PAUSE_SECONDS", 0)
     return tmp_path
 
 
@@ -58,7 +58,7 @@ def server(monkeypatch: pytest.MonkeyPatch, vits_weights: bytes) -> Iterator[Fil
         template = f"{started.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
         monkeypatch.setattr(constants, "ENDPOINT", started.url)
         monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-        monkeypatch.setattr(torchhub_code, "GITHUB", started.url)
+        monkeypatch.setattr(torchhub_module, "GITHUB", started.url)
         yield started
 
 
@@ -121,15 +121,15 @@ def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
     assert "these look like the weights of dinov2-vits14" in other["note"]
 
     read: list[Path] = []
-    config = next(r for r in weights_here.list_extractor_configs(Settings()) if r.name == VITS)
+    config = next(r for r in local_weights.list_extractor_configs(Settings()) if r.name == VITS)
     assert (
-        weights_here.inspect_weights(config, Settings(), read.append).fingerprint
+        local_weights.inspect_weights(config, Settings(), read.append).fingerprint
         == found["fingerprint"]
     )
     assert read == [], "it is known by now"
     save({name: 2 * tensor for name, tensor in weights.items()}, file)
     assert (
-        weights_here.inspect_weights(config, Settings(), read.append).fingerprint
+        local_weights.inspect_weights(config, Settings(), read.append).fingerprint
         != found["fingerprint"]
     )
     assert read == [file]
@@ -161,7 +161,7 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
 def test_an_interrupted_fetch_goes_on_where_it_ended(
     server: FilesServer, vits_weights: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(download, "MAX_DOWNLOAD_ATTEMPTS", 1)
+    monkeypatch.setattr(weight_files, "MAX_DOWNLOAD_ATTEMPTS", 1)
     server.break_after = [5_000_000]
     refused = command("fetch", VITS, exit_code=1)
     assert refused["code"] == "weights_missing"
@@ -189,7 +189,7 @@ def test_weights_of_another_network_are_refused_when_they_are_fetched(
     wide = {"cls_token": torch.zeros(1, 1, 768)}
     server.files[VITS_FILE] = save(wide, caches / "wide.safetensors").read_bytes()
     refused = command("fetch", VITS, exit_code=1)
-    assert refused["code"] == "weights_unfit"
+    assert refused["code"] == "weights_unusable"
     assert "vitb14" in refused["detail"]
 
 

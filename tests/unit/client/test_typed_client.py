@@ -19,8 +19,7 @@ import placewise
 from placewise import answers
 from services.gateway import schemas
 from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
-from services.gateway.routes import stats as figures
-from services.gateway.routes import stats as history
+from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
@@ -50,9 +49,9 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Vocabulary, schemas.VocabularyResponse),
     (answers.Generation, schemas.GenerationResponse),
     (answers.Evaluation, evaluations.EvaluationResponse),
-    (answers.Search, history.SearchHistoryEntry),
+    (answers.Search, stats_module.SearchHistoryEntry),
     (answers.Map, maps.MapResponse),
-    (answers.Stats, figures.StatsResponse),
+    (answers.Stats, stats_module.StatsResponse),
     (answers.WordWeights, evaluations.WordWeightsResponse),
     (answers.DeletedMap, maps.DeletedMapResponse),
     (answers.AddedModel, models.ModelResponse),

@@ -46,7 +46,7 @@ def test_settings_name_a_shard_and_its_workers(monkeypatch: pytest.MonkeyPatch) 
     ("name", "value"),
     [("SEARCH_SHARD", "3/3"), ("SEARCH_URLS", "search-0:8000"), ("SEARCH_URLS", "http://a/b")],
 )
-def test_unfit_settings_of_search_are_named(
+def test_invalid_settings_of_search_are_named(
     monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     monkeypatch.setenv(name, value)

@@ -140,7 +140,7 @@ def test_a_missing_file_is_refused_with_three_ways_to_get_it(tmp_path: Path) -> 
 def test_nothing_is_random_when_a_tensor_is_missing(tmp_path: Path) -> None:
     weights = random_weights(PLAIN)
     del weights["blocks.1.ls2.gamma"]
-    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unusable")
     assert (
         "w.pth can't be used for dinov2-vits14: it has no tensor blocks.1.ls2.gamma (32,)"
         in reported
@@ -148,7 +148,9 @@ def test_nothing_is_random_when_a_tensor_is_missing(tmp_path: Path) -> None:
 
 
 def test_many_missing_tensors_are_counted(tmp_path: Path) -> None:
-    reported = refusal(save(random_weights(PLAIN, blocks=1), tmp_path / "w.pth"), "weights_unfit")
+    reported = refusal(
+        save(random_weights(PLAIN, blocks=1), tmp_path / "w.pth"), "weights_unusable"
+    )
     assert "blocks.1.norm1.weight (32,)" in reported
     assert "and 15 more" in reported
 
@@ -156,22 +158,22 @@ def test_many_missing_tensors_are_counted(tmp_path: Path) -> None:
 def test_a_wrong_shape_is_named_with_the_one_expected(tmp_path: Path) -> None:
     weights = random_weights(PLAIN)
     weights["pos_embed"] = weights["pos_embed"][:, :257].clone()
-    reported = refusal(save(weights, tmp_path / "w.safetensors"), "weights_unfit")
+    reported = refusal(save(weights, tmp_path / "w.safetensors"), "weights_unusable")
     assert "pos_embed is (1, 257, 32), expected (1, 1370, 32)" in reported
 
 
 def test_weights_of_another_size_are_recognised(tmp_path: Path) -> None:
     base = {"cls_token": torch.zeros(1, 1, 768)}
-    reported = refusal(save(base, tmp_path / "w.pth"), "weights_unfit")
+    reported = refusal(save(base, tmp_path / "w.pth"), "weights_unusable")
     assert "look like the weights of dinov2-vitb14" in reported
 
 
 def test_weights_with_registers_are_not_taken_for_those_without(tmp_path: Path) -> None:
     weights = random_weights(WITH_REGISTERS)
     for file in (save(weights, tmp_path / "w.pth"), save(timms(weights), tmp_path / "w.pt")):
-        assert "4 register tokens, expected 0" in refusal(file, "weights_unfit")
+        assert "4 register tokens, expected 0" in refusal(file, "weights_unusable")
     plain = save(random_weights(PLAIN), tmp_path / "plain.pth")
-    assert "0 register tokens, expected 4" in refusal(plain, "weights_unfit", WITH_REGISTERS)
+    assert "0 register tokens, expected 4" in refusal(plain, "weights_unusable", WITH_REGISTERS)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +181,7 @@ def test_weights_with_registers_are_not_taken_for_those_without(tmp_path: Path) 
 )
 def test_numbers_that_are_no_weights_are_refused(spoilt: torch.Tensor, tmp_path: Path) -> None:
     weights = {**random_weights(PLAIN), "blocks.0.norm1.bias": spoilt}
-    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    reported = refusal(save(weights, tmp_path / "w.pth"), "weights_unusable")
     assert "blocks.0.norm1.bias holds numbers that are not finite floats" in reported
 
 
@@ -220,7 +222,7 @@ def test_what_is_no_file_of_weights_is_refused(
 ) -> None:
     file = tmp_path / "w.pth"
     file.write_bytes(content(tmp_path))
-    assert f"{file} can't be used" in refusal(file, "weights_unfit")
+    assert f"{file} can't be used" in refusal(file, "weights_unusable")
 
 
 # --- timm's file on the hub ------------------------------------------------------------------

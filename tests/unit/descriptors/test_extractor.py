@@ -313,7 +313,7 @@ def test_shipped_vocabulary_is_refused_with_other_weights(
     monkeypatch.setattr(efficientnet.backbone, "fingerprint", "0" * 64)
     with pytest.raises(Misconfigured) as caught:
         efficientnet.shipped_vocabulary()
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
 
 
 def test_extractor_without_a_shipped_vocabulary_says_so(tiny: Extractor) -> None:

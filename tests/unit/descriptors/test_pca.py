@@ -261,7 +261,7 @@ def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhi
     PcaWhiteningFile(fitted, None).check_compatible({**spec, "layer": 4})
     with pytest.raises(Unprocessable, match="layer is 4, was 3") as caught:
         known.check_compatible({**spec, "layer": 4})
-    assert caught.value.code == "pca_unfit"
+    assert caught.value.code == "pca_unusable"
     for either in (known, PcaWhiteningFile(fitted, None)):
         with pytest.raises(Unprocessable, match="of 30 dimensions, but these have 31"):
             either.check_compatible({**spec, "dimension": 31})
@@ -295,20 +295,20 @@ def test_files_that_would_spoil_descriptors_are_refused(
         del stored[name]
     else:
         stored[name] = value
-    assert message in unfit(save(stored))
+    assert message in unusable(save(stored))
 
 
 def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
     data = PcaWhiteningFile(fitted, None).encode()
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
-        assert "or it is truncated" in unfit(broken)
+        assert "or it is truncated" in unusable(broken)
     whole = load(data)
     for spec, reported in (("{", "can't be read"), ("[1]", "is not a JSON object")):
-        assert reported in unfit(save(whole, {"spec": spec}))
+        assert reported in unusable(save(whole, {"spec": spec}))
 
 
-def unfit(data: bytes) -> str:
+def unusable(data: bytes) -> str:
     with pytest.raises(Unprocessable) as caught:
         decode_whitening(data)
-    assert caught.value.code == "pca_unfit"
+    assert caught.value.code == "pca_unusable"
     return caught.value.detail

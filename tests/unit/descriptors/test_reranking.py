@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from shared.descriptors import reranking as matching
+from shared.descriptors import reranking
 from shared.descriptors.reranking import (
     VOTE_WEIGHT,
     LocalFeatures,
@@ -71,7 +71,7 @@ def test_patches_without_direction_or_likeness_match_nothing() -> None:
 def test_matches_are_the_same_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
     x, y = noise(1, 50), torch.cat([noise(1, 50)[20:40], noise(2, 30)])
     whole = mutual_matches(x, y)
-    monkeypatch.setattr(matching, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(reranking, "BLOCK_ROWS", 7)
     for one, other in zip(whole, mutual_matches(x, y), strict=True):
         torch.testing.assert_close(one, other)
     assert len(whole[0]) >= 20

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.backbones import torchhub as torchhub_code
+from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.torchhub import TorchHubBackbone
 from shared.descriptors.extractor import Extractor, spec_fingerprint
 from shared.descriptors.pca_fit import fit_pca
@@ -42,7 +42,7 @@ def extractor(folder: Path, entry: str) -> Extractor:
     return Extractor(config, CPU)
 
 
-def refusal(folder: Path, entry: str, code: str = "torchhub_unfit") -> str:
+def refusal(folder: Path, entry: str, code: str = "torchhub_unusable") -> str:
     with pytest.raises(Misconfigured) as caught:
         extractor(folder, entry)
     assert caught.value.code == code
@@ -252,7 +252,7 @@ def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(
 def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
     folder: Path, torch_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torchhub_code, "GITHUB", "http://127.0.0.1:9")
+    monkeypatch.setattr(torchhub_module, "GITHUB", "http://127.0.0.1:9")
     monkeypatch.setattr("shared.descriptors.weight_files.RETRY_PAUSE_SECONDS", 0)
     name = f"torchhub:somebody/places@{COMMIT}:colours"
     config = get_extractor_config(name, allow_test_extractors=False)
@@ -263,4 +263,4 @@ def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
     found = Extractor(config, CPU)
     assert found.backbone.card["source"] == f"somebody/places@{COMMIT}"
     assert isinstance(found.backbone, TorchHubBackbone)
-    assert found.spec(None)["code_fingerprint"] == torchhub_code.code_fingerprint(folder)
+    assert found.spec(None)["code_fingerprint"] == torchhub_module.code_fingerprint(folder)

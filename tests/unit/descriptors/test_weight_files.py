@@ -10,7 +10,7 @@ import httpx2
 import numpy as np
 import pytest
 
-from shared.descriptors import weight_files as download_module
+from shared.descriptors import weight_files
 from shared.descriptors.weight_files import MAX_DOWNLOAD_ATTEMPTS, download_file
 from shared.errors import Misconfigured
 from tests.support.files_server import FilesServer, files_server
@@ -21,7 +21,7 @@ HASH = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download_module, "RETRY_PAUSE_SECONDS", 0)
+    monkeypatch.setattr(weight_files, "RETRY_PAUSE_SECONDS", 0)
 
 
 @pytest.fixture

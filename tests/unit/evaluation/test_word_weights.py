@@ -96,7 +96,7 @@ def test_weighted_query_is_its_words_multiplied_and_of_length_one() -> None:
     )
 
 
-def test_query_without_any_weighted_word_stays_plain_and_unfit_weights_are_refused() -> None:
+def test_a_query_without_weighted_words_stays_plain_and_wrong_weights_are_refused() -> None:
     assert apply_word_weights(unit_rows(2, 1)[0], [0.0] * WORDS) is None
     with pytest.raises(ValueError, match="5 weights don't fit 12"):
         apply_word_weights(unit_rows(2, 1)[0], [1.0] * 5)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks import filter as filter_module
-from shared.tracks import photo_graph as photo_graph_module
+from shared.tracks import photo_graph
 from shared.tracks.belief import START_GAIN, Belief
 from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
 from shared.tracks.filter import (
@@ -398,7 +398,7 @@ def test_photos_that_are_weighed_together_lead_to_the_place_that_they_lead_to_on
     states: dict[int, list[TrackState]] = {}
     for limit in (900, 100):
         monkeypatch.setattr(filter_module, "MAX_NEAR", limit if is_located else 900)
-        for module in (filter_module, photo_graph_module):
+        for module in (filter_module, photo_graph):
             monkeypatch.setattr(module, "MAX_SAME_LABEL", limit)
         track_filter = TrackFilter(grid_map(is_located=is_located), WALK)
         states[limit] = [track_filter.state(belief) for belief in track_filter.smooth(frames)]

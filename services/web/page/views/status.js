@@ -13,7 +13,7 @@ export async function showStatus(view, { signal }) {
   const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
   const look = async () => {
     const [health, stats, map, { jobs }, { searches }] = await Promise.all([
-      // 503 with the same answer, where a part is away.
+      // 503 with the same answer, where a part does not respond.
       get("/health", { signal, also: [503] }), get("/database/stats", { signal }), get(`/maps/${encodeURIComponent(currentMap())}`, { signal }),
       get("/jobs", { query: { limit: 12, kind: KINDS }, signal }), get("/searches", { query: { limit: 12 }, signal }),
     ]);

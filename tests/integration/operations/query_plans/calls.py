@@ -30,7 +30,7 @@ from shared.errors import PlacewiseError
 from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
 from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.transitions import release_job
+from shared.jobs.transitions import requeue_job
 from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
 from shared.storage import FolderStore
 from tests.integration.operations.query_plans.explain import Explainer
@@ -220,7 +220,7 @@ def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], objec
         assert token is not None
         with catalog.write() as session:
             for job in lock_leased_jobs(session, token, claimed):
-                release_job(job)
+                requeue_job(job)
 
     def claim_queries() -> None:
         with catalog.write() as session:

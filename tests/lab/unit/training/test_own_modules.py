@@ -154,14 +154,14 @@ def test_own_code_that_can_not_be_used_is_named_with_the_reason(
     values: dict[str, str], reason: str
 ) -> None:
     code, detail = code_of(arguments_of(**values))
-    assert code == "own_module_unfit"
+    assert code == "own_module_unusable"
     assert reason in detail
     assert next(iter(values.values())) in detail
 
 
 def test_an_own_backbone_that_makes_no_maps_is_an_error() -> None:
     code, detail = code_of(arguments_of(backbone_arch="walks:flat_network"))
-    assert code == "backbone_unfit"
+    assert code == "backbone_unusable"
     assert "(1, 3072)" in detail
 
 

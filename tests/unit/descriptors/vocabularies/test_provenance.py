@@ -34,7 +34,7 @@ def centres(width: int = 16) -> ClusterCentres:
 def refusal(provenance: dict[str, Any], extractor: Extractor, width: int = 16) -> Unprocessable:
     with pytest.raises(Unprocessable) as caught:
         check_vocabulary_fits(provenance, centres(width), extractor)
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
     return caught.value
 
 

@@ -36,7 +36,7 @@ def npy_header(shape: str) -> bytes:
 def refusal(array: NDArray[Any], width: int | None = None) -> str:
     with pytest.raises(Unprocessable) as caught:
         parse_centres(array, width=width)
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
     return caught.value.detail
 
 
@@ -149,5 +149,5 @@ def junk_files() -> dict[str, bytes]:
 def test_files_that_are_no_array_are_refused(name: str) -> None:
     with pytest.raises(Unprocessable) as caught:
         decode_centres(junk_files()[name])
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
     assert not Untrustworthy.unpickled

@@ -117,7 +117,7 @@ def broken_archives() -> dict[str, bytes]:
 def test_an_archive_that_is_no_whole_vocabulary_is_refused_with_the_reason(reason: str) -> None:
     with pytest.raises(Unprocessable) as caught:
         decode_vocabulary(broken_archives()[reason])
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
     assert reason in caught.value.detail
     assert not Untrustworthy.unpickled
 
@@ -179,7 +179,7 @@ def test_broken_tensor_files_are_refused_and_run_nothing(name: str, tmp_path: Pa
     path.write_bytes(broken_tensor_files()[name])
     with pytest.raises(Unprocessable) as caught:
         read_vocabulary(path)
-    assert caught.value.code == "vocabulary_unfit"
+    assert caught.value.code == "vocabulary_unusable"
     assert not Untrustworthy.unpickled
 
 

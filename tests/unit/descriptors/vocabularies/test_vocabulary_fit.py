@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from shared.descriptors import vocabulary_fit as batches_module
+from shared.descriptors import vocabulary_fit
 from shared.descriptors.aggregation import assign_clusters
 from shared.descriptors.vocabulary_fit import (
     PATCHES_PER_CLUSTER,
@@ -38,7 +38,7 @@ def fit_of(points: torch.Tensor, clusters: int, seed: int) -> VocabularyFit:
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two batches of 1024 points in 16 dimensions are a block."""
-    monkeypatch.setattr(batches_module, "BLOCK_BYTES", 2 * 1024 * 16 * 4)
+    monkeypatch.setattr(vocabulary_fit, "BLOCK_BYTES", 2 * 1024 * 16 * 4)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -88,14 +88,14 @@ def test_progress_grows_to_its_end() -> None:
     assert (seen[0][0], seen[-1][0]) == (0, seen[0][1])
 
 
-def test_few_points_bear_few_clusters() -> None:
+def test_few_points_give_few_clusters() -> None:
     fit = fit_of(unit_points(2, 4 * PATCHES_PER_CLUSTER - 1, 4), 64, 0)
     assert fit.clusters == 3
     assert len(finish(fit)) == 3
     assert len(finish(fit_of(unit_points(2, 7, 4), 64, 0))) == 1
 
 
-def test_points_that_are_all_equal_bear_one_centre() -> None:
+def test_equal_points_give_one_centre() -> None:
     centres = finish(fit_of(normalize(torch.ones(300, 4), dim=1), 5, 0))
     assert centres.shape == (1, 4)
 

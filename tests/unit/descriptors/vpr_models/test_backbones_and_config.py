@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from shared.descriptors.backbones import normalise_features, normalise_pixels
 from shared.descriptors.backbones.efficientnet_lite0 import EfficientNetLite0
-from shared.descriptors.vpr_models import backbones as pretrained
+from shared.descriptors.vpr_models import backbones as backbones_module
 from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.backbones import StagedBackbone, build_backbone, build_dinov2
 from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
@@ -160,8 +160,8 @@ def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> N
         ({"agg_arch": "CosPlace", "agg_config": {"in_dim": 256}}, "bad_agg_config", "512 channels"),
         ({"agg_arch": "MixVPR", "agg_config": {"in_h": 20}}, "bad_agg_config", "2 x 3"),
         ({"agg_arch": "BoQ", "agg_config": {"proj_channels": 100}}, "bad_agg_config", "64"),
-        ({"agg_arch": "SALAD"}, "image_size_unfit", "64 clusters"),
-        ({"backbone_arch": "dinov2_vits14"}, "image_size_unfit", "70 x 98"),
+        ({"agg_arch": "SALAD"}, "image_size_unsupported", "64 clusters"),
+        ({"backbone_arch": "dinov2_vits14"}, "image_size_unsupported", "70 x 98"),
     ],
 )
 def test_what_can_not_be_built_is_refused_with_the_reason(
@@ -178,7 +178,7 @@ def test_mixvpr_and_salad_refuse_photos_of_a_size_that_they_were_not_made_for() 
     for model, size in ((mixvpr, (96, 64)), (salad, (256, 256))):
         with pytest.raises(Unprocessable, match="built for") as refused:
             model(torch.empty(1, 3, *size, device="meta"))
-        assert refused.value.code == "image_size_unfit"
+        assert refused.value.code == "image_size_unsupported"
     gem = laid_out(agg_arch="GeM")
     assert gem(torch.empty(1, 3, 96, 64, device="meta")).shape == (1, 512)
 
@@ -269,7 +269,7 @@ def test_dinov2_makes_the_tokens_of_a_whole_forward_pass_and_norms_them(tmp_path
 def test_lite0_with_its_published_weights_is_the_embedded_defaults_network() -> None:
     """Which takes another mean and deviation than ImageNet's."""
     pixels = np.random.default_rng(0).integers(0, 256, (1, 64, 96, 3), dtype=np.uint8)
-    chosen = config(backbone_arch="efficientnet_lite0", pretrained=True, layers_to_crop=[6])
+    chosen = config(backbone_arch="efficientnet_lite0", backbones_module=True, layers_to_crop=[6])
     photos = normalise_pixels(torch.from_numpy(pixels), IMAGENET_MEAN, IMAGENET_STD)
     with torch.inference_mode():
         maps = build_backbone(chosen, None)(photos).maps
@@ -285,7 +285,7 @@ def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def fail(url: str, target: Path, **_: object) -> None:
         raise httpx2.ConnectError("no route to host")
 
-    monkeypatch.setattr(pretrained, "download_file", fail)
+    monkeypatch.setattr(backbones_module, "download_file", fail)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -298,10 +298,10 @@ def test_pretrained_weights_come_from_the_cache_or_from_a_file(no_network: Path)
     expected = published["layer2.1.conv2.weight"]
     file = no_network / "mine.safetensors"
     save_file(published, file)
-    given = build_vpr_model(config(pretrained=True), weights=file)
+    given = build_vpr_model(config(backbones_module=True), weights=file)
     assert torch.equal(given.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
     torch.save(published, no_network / "resnet18-f37072fd.pth")
-    cached = build_vpr_model(config(pretrained=True))
+    cached = build_vpr_model(config(backbones_module=True))
     assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
 
 
@@ -309,10 +309,10 @@ def test_weights_that_can_not_be_had_are_missing_and_never_random(no_network: Pa
     for name, weights in (("resnet18", None), ("resnet18", no_network / "none.pth"),
                           ("efficientnet_lite0", no_network / "none.pth")):  # fmt: skip
         with pytest.raises(Misconfigured) as refused:
-            build_vpr_model(config(backbone_arch=name, pretrained=True), weights=weights)
+            build_vpr_model(config(backbone_arch=name, backbones_module=True), weights=weights)
         assert refused.value.code == "weights_missing"
     with pytest.raises(Misconfigured, match=r"no route to host.*\(1\).*\(2\).*\(3\).*\(4\)"):
-        build_vpr_model(config(pretrained=True))
+        build_vpr_model(config(backbones_module=True))
 
 
 def test_another_networks_weights_are_refused(no_network: Path) -> None:
@@ -322,8 +322,8 @@ def test_another_networks_weights_are_refused(no_network: Path) -> None:
     (no_network / "torn.pth").write_bytes(b"PK\x03\x04 torn")
     for name in ("resnet18-f37072fd.pth", "other.pth", "torn.pth"):
         with pytest.raises(Misconfigured) as refused:
-            build_vpr_model(config(pretrained=True), weights=no_network / name)
-        assert refused.value.code == "weights_unfit"
+            build_vpr_model(config(backbones_module=True), weights=no_network / name)
+        assert refused.value.code == "weights_unusable"
 
 
 @pytest.mark.parametrize("name", ["dinov2_vits14", "swin_t"])

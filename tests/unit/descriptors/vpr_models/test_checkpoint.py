@@ -140,7 +140,7 @@ def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_pat
     }
     for reported, changed in faults.items():
         error = refusal(saved(tmp_path / "other.ckpt", state | {"state_dict": changed}))
-        assert error.code == "checkpoint_unfit"
+        assert error.code == "checkpoint_unusable"
         assert reported in error.detail
 
 
@@ -150,7 +150,7 @@ def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_pat
 def test_a_file_that_does_not_say_which_network_it_holds_is_refused(
     state: Any, tmp_path: Path
 ) -> None:
-    assert refusal(saved(tmp_path / "weights.ckpt", state)).code == "checkpoint_unfit"
+    assert refusal(saved(tmp_path / "weights.ckpt", state)).code == "checkpoint_unusable"
 
 
 def test_a_checkpoint_can_not_ask_for_more_memory_than_it_has_bytes(
@@ -160,7 +160,7 @@ def test_a_checkpoint_can_not_ask_for_more_memory_than_it_has_bytes(
     state = checkpoint_state(model)
     claimed = {"agg_arch": "ConvAP", "agg_config": {"out_channels": 1 << 20, "s1": 1 << 20}}
     state["hyper_parameters"]["model"] |= claimed
-    assert refusal(saved(tmp_path / "large.ckpt", state)).code == "checkpoint_unfit"
+    assert refusal(saved(tmp_path / "large.ckpt", state)).code == "checkpoint_unusable"
 
 
 def deflated(data: bytes, path: Path, swollen: str) -> Path:

@@ -236,7 +236,7 @@ def test_the_refusal_of_an_unknown_network_names_the_way_through_torch_hub(
     torch.save(tensors, tmp_path / "vgg16.pth")
     with pytest.raises(Unprocessable) as refused:
         load_checkpoint(tmp_path / "vgg16.pth")
-    assert refused.value.code == "checkpoint_unfit"
+    assert refused.value.code == "checkpoint_unusable"
     assert "not those of a known network" in refused.value.detail
     assert "torchhub:OWNER/NAME@COMMIT:ENTRY" in refused.value.detail
 
