@@ -60,7 +60,7 @@ def resolve_device(arguments: TrainingArguments) -> Device:
 
     Raises:
         Misconfigured: `no_gpu`.
-        InvalidRequest: `several_devices`, `unknown_precision`, `precision_unsupported`.
+        InvalidRequest: `several_devices`, `unknown_precision`, `needs_gpu`.
     """
     accelerator = _resolve_accelerator(arguments.accelerator)
     index = _device_index(arguments.devices)
@@ -72,8 +72,7 @@ def resolve_device(arguments: TrainingArguments) -> Device:
         )
     if precision == "16-mixed" and accelerator != "gpu":
         raise InvalidRequest(
-            "precision_unsupported",
-            "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not.",
+            "needs_gpu", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
         )
     faiss_gpu = arguments.faiss_gpu and has_faiss_gpu()
     if accelerator != "gpu":

@@ -199,7 +199,7 @@ def test_a_missing_gpu_is_named(accelerator: str, monkeypatch: pytest.MonkeyPatc
         ({"devices": 2}, "several_devices"),
         ({"devices": (0, 1)}, "several_devices"),
         ({"precision": "8-bit"}, "unknown_precision"),
-        ({"precision": 16}, "precision_unsupported"),
+        ({"precision": 16}, "needs_gpu"),
     ],
 )
 def test_what_a_device_can_not_do_is_named(values: dict[str, object], code: str) -> None:
