@@ -35,7 +35,6 @@ def create_backup(
     store: ObjectStore,
     installation_id: UUID,
     path: Path,
-    import_prefix: str,
     progress: BackupProgress = lambda what, done, total: None,
 ) -> BackupManifest:
     """Create or update the backup in the folder `path`.
@@ -44,7 +43,6 @@ def create_backup(
     backup stays complete until the new one is finished.
 
     Args:
-        import_prefix: key prefix of the operator's own objects, which are not backed up.
         progress: called after each object and for the rows.
 
     Raises:
@@ -62,7 +60,7 @@ def create_backup(
                 "other_installation",
                 f"{path} has a backup of another Placewise. Use a separate folder for each.",
             )
-        copied = _copy_all(store, folder, import_prefix, progress)
+        copied = _copy_all(store, folder, progress)
         unlimited = catalog.with_timeouts(NO_TIMEOUTS)
         for _ in range(MAX_COPY_PASSES):
             with unlimited.read() as session:
@@ -110,11 +108,9 @@ def create_backup(
         return about
 
 
-def _copy_all(
-    store: ObjectStore, folder: BackupFolder, import_prefix: str, progress: BackupProgress
-) -> set[str]:
+def _copy_all(store: ObjectStore, folder: BackupFolder, progress: BackupProgress) -> set[str]:
     """Copy every object that is new or has changed; return the keys of all."""
-    objects = list(list_backup_objects(store, import_prefix))
+    objects = list(list_backup_objects(store))
     for done, info in enumerate(objects, start=1):
         if not is_backed_up(folder, info):
             with contextlib.suppress(NotFound):  # deleted since it was listed

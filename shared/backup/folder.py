@@ -36,6 +36,7 @@ from shared.storage.copying import copy_object
 from shared.storage.folder import FolderStore
 from shared.storage.keys import (
     FEATURES,
+    IMPORTS,
     INCOMING,
     ORIGINALS,
     OWNER_MARK,
@@ -205,17 +206,17 @@ def _unreadable(path: Path, name: str) -> Misconfigured:
 
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
-EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH)
+EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH)
 
 
-def list_backup_objects(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:
+def list_backup_objects(store: ObjectStore) -> Iterator[ObjectInfo]:
     """Iterate over the objects to back up, referenced by rows or not (thumbnails, codes).
 
-    Objects under `import_prefix` and files that people put into UPLOAD_DIR are the operator's.
+    Objects under `imports/` and files that people put into UPLOAD_DIR are the operator's.
     """
     for info in store.list(""):
         is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if is_foreign or info.key.startswith((*EXCLUDED_PREFIXES, import_prefix)):
+        if is_foreign or info.key.startswith(EXCLUDED_PREFIXES):
             continue
         yield info
 

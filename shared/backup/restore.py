@@ -53,7 +53,6 @@ def restore_backup(
     about: BackupManifest,
     catalog: Catalog,
     open_store: Callable[[], ObjectStore],
-    import_prefix: str,
     progress: BackupProgress = lambda what, done, total: None,
     *,
     store_owner: str | None = None,
@@ -63,7 +62,6 @@ def restore_backup(
     Args:
         open_store: opens the target store. It is called when the catalog has the backup's
             installation id, or has kept its own because the store is marked with that.
-        import_prefix: key prefix of the operator's own objects.
         progress: called after each object and for the rows.
         store_owner: installation id that the store is marked with; None without a mark.
 
@@ -80,7 +78,7 @@ def restore_backup(
             installation.id = UUID(about.installation_id)
     store = open_store()
     unknown_key = next(
-        (i.key for i in list_backup_objects(store, import_prefix) if i.key not in folder.index),
+        (i.key for i in list_backup_objects(store) if i.key not in folder.index),
         None,
     )
     if unknown_key is not None:

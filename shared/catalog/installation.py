@@ -70,7 +70,6 @@ def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: 
         installation.bucket,
         settings.placewise_home / "objects",
         lambda: _sample_referenced_keys(catalog),
-        settings.import_prefix,
     )
     if place != installation.bucket:
         with catalog.write() as session:
@@ -88,7 +87,7 @@ def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
     """
     file = Path(catalog.url.database or "") if catalog.is_sqlite else None
     if file is not None and (not file.exists() or file.stat().st_size == 0):
-        check_free(open_store(settings, exclusive=False), settings.import_prefix)
+        check_free(open_store(settings, exclusive=False))
 
 
 def adopt_store(catalog: Catalog, store: OwnedStore) -> None:

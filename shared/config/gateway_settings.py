@@ -113,10 +113,6 @@ class GatewaySettings(BaseSettings):
         10_737_418_240, gt=0, description="maximum bytes of all files of one batch"
     )
     max_batch_photos: int = Field(100_000, gt=0, description="maximum photos in one batch")
-    import_prefix: str = Field(
-        "imports/",
-        description="key prefix of the objects that a batch may import from the object store",
-    )
     max_model_bytes: Size = Field(
         2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
     )

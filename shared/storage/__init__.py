@@ -19,7 +19,7 @@
 | `queries/<job>.json` | the result of a comparison |
 | `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
 | `trash/<day>/<key>` | an orphan moved to the trash on that day, deleted after TRASH_DAYS |
-| `imports/...` (IMPORT_PREFIX) | the operator's files, which Placewise only reads |
+| `imports/...` | the operator's files, which Placewise only reads |
 
 Notes are small files of the store itself and not objects: `.placewise` (the catalog that owns the
 store, `shared.storage.ownership`) and `.placewise-hold` (garbage collection is suspended,

@@ -6,7 +6,7 @@ import re
 from datetime import date
 from uuid import UUID
 
-from shared.errors import Misconfigured, NotFound
+from shared.errors import NotFound
 from shared.ids import new_id
 
 OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
@@ -24,20 +24,8 @@ TRASH = "trash/"
 VOCABULARIES = "vocabularies/"
 WHITENINGS = "whitenings/"
 
-OWN_PREFIXES = (
-    CHECKPOINTS,
-    "chunks/",
-    FEATURES,
-    JOURNAL,
-    MODELS,
-    ORIGINALS,
-    PREVIEWS,
-    QUERIES,
-    THUMBNAILS,
-    TRASH,
-    VOCABULARIES,
-    WHITENINGS,
-)
+IMPORTS = "imports/"
+"""Objects of the operator, which batches may import. Placewise only reads them."""
 
 
 def is_valid_key(key: str) -> bool:
@@ -80,22 +68,6 @@ def key_before_trash(trashed: str) -> str:
     if not trashed.startswith(TRASH) or not key:
         raise ValueError(f"not the key of an object in the trash: {trashed!r}")
     return key
-
-
-def check_import_prefix(prefix: str) -> None:
-    """Raise Misconfigured (`bad_setting`) unless it is a folder that Placewise does not use."""
-    if not prefix.endswith("/") or not is_valid_key(prefix[:-1]) or prefix.startswith("."):
-        raise Misconfigured(
-            "bad_setting",
-            f"IMPORT_PREFIX is {prefix!r}. It must be a folder of the object store, such as "
-            "imports/.",
-        )
-    if prefix.startswith(OWN_PREFIXES):
-        raise Misconfigured(
-            "bad_setting",
-            f"IMPORT_PREFIX is {prefix!r}, which Placewise uses itself. Choose another folder than "
-            f"{', '.join(OWN_PREFIXES)}.",
-        )
 
 
 def new_original_key(suffix: str = "") -> str:

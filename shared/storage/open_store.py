@@ -18,7 +18,7 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage.folder import FolderStore
-from shared.storage.keys import ORIGINALS, OWNER_MARK, check_import_prefix
+from shared.storage.keys import ORIGINALS, OWNER_MARK
 from shared.storage.protocol import OwnedStore
 
 ORIGINALS_FOLDER = ORIGINALS.rstrip("/")
@@ -108,9 +108,8 @@ def open_store(settings: Settings, *, exclusive: bool = True) -> OwnedStore:
         exclusive: no other process writes to the folder, so that partial files are deleted.
 
     Raises:
-        Misconfigured: as `resolve_upload_dir`; `bad_setting` for an invalid IMPORT_PREFIX.
+        Misconfigured: as `resolve_upload_dir`.
     """
-    check_import_prefix(settings.import_prefix)
     if settings.s3_endpoint is not None:
         from shared.storage.s3 import Bucket, S3Store  # importing minio is slow
 

@@ -15,7 +15,7 @@ from uuid import UUID
 
 from shared.errors import Misconfigured
 from shared.storage.folder import PARTIAL_FOLDER, FolderStore
-from shared.storage.keys import ORIGINALS, OWNER_MARK, QUERIES, is_original_key
+from shared.storage.keys import IMPORTS, ORIGINALS, OWNER_MARK, QUERIES, is_original_key
 from shared.storage.protocol import OwnedStore
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,6 @@ def claim_store(
     previous: BucketLocation | None,
     folder: Path,
     sample_keys: Callable[[], Collection[str]],
-    import_prefix: str,
 ) -> BucketLocation | None:
     """Mark a store that is used for the first time; check its owner at every other start.
 
@@ -52,7 +51,6 @@ def claim_store(
         folder: where the catalog's objects are when it uses no bucket.
         sample_keys: returns a sample of the keys that the catalog's rows reference. A store
             without a mark that has them is marked.
-        import_prefix: key prefix of the operator's own objects.
 
     Returns:
         The location of the bucket; None for a folder.
@@ -83,7 +81,7 @@ def claim_store(
             )
         if location is not None and previous is None:
             _check_no_objects(folder)
-        _check_unmarked(store, sample_keys(), import_prefix)
+        _check_unmarked(store, sample_keys())
         store.write_note(OWNER_MARK, str(owner).encode(), replace=False)
         current_owner = read_owner(store)  # another catalog may have claimed it concurrently
     if current_owner != str(owner):
@@ -107,11 +105,11 @@ def read_owner(store: OwnedStore) -> str | None:
     return None if mark is None else mark.decode().strip()
 
 
-def check_free(store: OwnedStore, import_prefix: str) -> None:
+def check_free(store: OwnedStore) -> None:
     """Raise Misconfigured as `claim_store` for a store that a new catalog can't own."""
     if read_owner(store) is not None:
         raise store_taken_error(store, "belongs to a catalog, and this one is new")
-    _check_unmarked(store, (), import_prefix)
+    _check_unmarked(store, ())
 
 
 def store_taken_error(store: OwnedStore, reason: str) -> Misconfigured:
@@ -124,7 +122,7 @@ def store_taken_error(store: OwnedStore, reason: str) -> Misconfigured:
     )
 
 
-def _check_unmarked(store: OwnedStore, sample: Collection[str], import_prefix: str) -> None:
+def _check_unmarked(store: OwnedStore, sample: Collection[str]) -> None:
     """Reject a store without a mark, unless it is empty or has the sample of referenced keys."""
     present = sum(store.head(key) is not None for key in sample)
     if sample and 2 * present >= len(sample):  # `placewise verify` reports single lost objects
@@ -132,7 +130,7 @@ def _check_unmarked(store: OwnedStore, sample: Collection[str], import_prefix: s
             "%s has the catalog's objects and is now marked as owned by it", _display_name(store)
         )
         return
-    if _has_objects(store, import_prefix):
+    if _has_objects(store):
         raise store_taken_error(store, "has objects that this catalog does not know")
     if sample:
         raise Misconfigured(
@@ -143,15 +141,14 @@ def _check_unmarked(store: OwnedStore, sample: Collection[str], import_prefix: s
         )
 
 
-def _has_objects(store: OwnedStore, import_prefix: str) -> bool:
+def _has_objects(store: OwnedStore) -> bool:
     """Return whether the store has objects that a Placewise has written.
 
-    Objects under IMPORT_PREFIX belong to the operator. In a folder, which earlier releases did not
-    mark, files that people put into UPLOAD_DIR and temporary objects of queries and jobs don't
-    count either.
+    Objects under `imports/` belong to the operator. In a folder, files that people put into
+    UPLOAD_DIR and temporary objects of queries don't count either.
     """
     for info in store.list(""):
-        if info.key.startswith((OWNER_MARK, import_prefix)):
+        if info.key.startswith((OWNER_MARK, IMPORTS)):
             continue
         is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
         if isinstance(store, FolderStore) and (is_foreign or info.key.startswith(QUERIES)):

@@ -87,7 +87,7 @@ def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
     [failed] = client.batch_items(started, "failed")
     assert failed.error is not None
     assert failed.error["code"] == "object_not_found"
-    with pytest.raises(InvalidRequest, match="IMPORT_PREFIX"):
+    with pytest.raises(InvalidRequest, match="not below imports/"):
         client.import_objects([{"key": "originals/a.jpg"}])
 
 

@@ -91,7 +91,7 @@ def back_up(settings: Settings, out: Path, progress: BackupProgress) -> BackupMa
     with _open_storage(settings, "backup") as (catalog, store):
         with catalog.write() as session:
             installation_id = get_or_create_installation(session).id
-        return create_backup(catalog, store, installation_id, out, settings.import_prefix, progress)
+        return create_backup(catalog, store, installation_id, out, progress)
 
 
 def restore(
@@ -116,7 +116,6 @@ def restore(
             manifest,
             catalog,
             lambda: open_installation_store(catalog, settings, exclusive=exclusive),
-            settings.import_prefix,
             progress,
             store_owner=read_owner(open_store(settings, exclusive=False)),
         )

@@ -59,7 +59,7 @@ from shared.ingest.photo_metadata import (
     read_jsonl_manifest,
 )
 from shared.jobs import JobKind, JobState
-from shared.storage.keys import is_valid_key
+from shared.storage.keys import IMPORTS, is_valid_key
 
 router = APIRouter(tags=["batches"])
 
@@ -69,7 +69,7 @@ _BINARY_SCHEMA = {"type": "string", "format": "binary"}
 _MANIFEST_SCHEMA = {
     "type": "string",
     "description": "JSON lines: `filename` (of a file of the form) or `key` (of an object below "
-    "IMPORT_PREFIX), and any of the fields of `POST /upload`",
+    "`imports/`), and any of the fields of `POST /upload`",
 }
 REQUEST_BODY = {
     "requestBody": {
@@ -88,7 +88,7 @@ REQUEST_BODY = {
                         PREFIX_FIELD: {
                             "type": "string",
                             "description": "imports all photos below this key prefix, which must "
-                            "be below IMPORT_PREFIX; also accepted as s3://S3_BUCKET/...",
+                            "be below `imports/`; also accepted as s3://S3_BUCKET/...",
                         },
                     },
                 }
@@ -234,7 +234,7 @@ def _plan_items(
             {"prefix": validate_prefix(received.prefix, gateway.settings)},
         )
     entries = read_jsonl_manifest(received.manifest or b"", "the manifest", (KEY_FIELD,))
-    _validate_keys(entries, gateway.settings.import_prefix)
+    _validate_keys(entries)
     if not entries:
         raise Unprocessable("no_photos", "The manifest has no lines.")
     if len(entries) > gateway.settings.max_batch_photos:
@@ -284,11 +284,11 @@ def validate_prefix(value: str, settings: Settings) -> str:
     """Return the key prefix to import, ending with `/`.
 
     Args:
-        value: A prefix below IMPORT_PREFIX, or the same as `s3://S3_BUCKET/...`.
+        value: A prefix below `imports/`, or the same as `s3://S3_BUCKET/...`.
         settings: The settings.
 
     Raises:
-        Unprocessable: `invalid_field`, if it is another bucket or not below IMPORT_PREFIX.
+        Unprocessable: `invalid_field`, if it is another bucket or not below `imports/`.
     """
     prefix = value
     if value.startswith("s3://"):
@@ -297,22 +297,20 @@ def validate_prefix(value: str, settings: Settings) -> str:
             raise invalid_field_error(
                 PREFIX_FIELD,
                 f"names the bucket {bucket!r}, but only the bucket of this server can be imported "
-                f"from. Copy the photos below {settings.import_prefix} of it",
+                f"from. Copy the photos below {IMPORTS} of it",
             )
     prefix = prefix.rstrip("/") + "/"
-    if not (prefix.startswith(settings.import_prefix) and is_valid_key(prefix[:-1])):
-        raise invalid_field_error(
-            PREFIX_FIELD, f"is not below {settings.import_prefix} (IMPORT_PREFIX)"
-        )
+    if not (prefix.startswith(IMPORTS) and is_valid_key(prefix[:-1])):
+        raise invalid_field_error(PREFIX_FIELD, f"is not below {IMPORTS}")
     return prefix
 
 
-def _validate_keys(entries: list[ManifestEntry], prefix: str) -> None:
-    """Only objects below IMPORT_PREFIX may be imported: others may be photos of other maps."""
+def _validate_keys(entries: list[ManifestEntry]) -> None:
+    """Only objects below `imports/` may be imported: others may be photos of other maps."""
     errors = [
-        (entry.line, f"{KEY_FIELD} is not below {prefix} (IMPORT_PREFIX)")
+        (entry.line, f"{KEY_FIELD} is not below {IMPORTS}")
         for entry in entries
-        if not (entry.name.startswith(prefix) and is_valid_key(entry.name))
+        if not (entry.name.startswith(IMPORTS) and is_valid_key(entry.name))
     ]
     if errors:
         raise bad_lines_error("bad_manifest", "the manifest", errors[:MAX_REPORTED_LINES])

@@ -64,7 +64,7 @@ from shared.jobs.transitions import (
     succeed_job,
 )
 from shared.storage import ObjectStore
-from shared.storage.keys import new_original_key
+from shared.storage.keys import IMPORTS, new_original_key
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class _BatchItemImporter:
                 self._store, stored_upload, self._settings.max_image_pixels, key_id
             )
             if photo.fields.relative_path is None:
-                path = parse_relative_path(item.name.removeprefix(self._settings.import_prefix))
+                path = parse_relative_path(item.name.removeprefix(IMPORTS))
                 photo = replace(photo, fields=replace(photo.fields, relative_path=path))
             with self._reserve_quota(job, key_id):
                 result = self._commit(job, item, photo)

@@ -412,5 +412,6 @@ def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
 
 def _fit_with(workplace: Workplace, worker: ExtractorWorker) -> None:
     workplace.start(JobKind.FIT, clusters=8, sample=100, seed=0)
+    assert worker.fits.run_next(threading.Event())
     _drain(worker)
     assert workplace.active().state == GenerationState.ACTIVE

@@ -33,8 +33,6 @@ from tests.support.catalog_rows import read_job, take
 from tests.support.photos import photo_bytes
 from tests.support.servers import PostgresServer
 
-IMPORTS = "imports/"
-
 
 @pytest.fixture
 def other_catalog(
@@ -62,16 +60,14 @@ def backed_up(service: Service, tmp_path: Path) -> Callable[[], Any]:
         installation_id = get_or_create_installation(session).id
 
     def back_up() -> Any:
-        return create_backup(
-            service.catalog, service.store, installation_id, tmp_path / "backup", IMPORTS
-        )
+        return create_backup(service.catalog, service.store, installation_id, tmp_path / "backup")
 
     return back_up
 
 
 def restored(path: Path, catalog: Catalog, store: FolderStore) -> RestoreResult:
     folder, about = open_backup(path)
-    return restore_backup(folder, about, catalog, lambda: store, IMPORTS)
+    return restore_backup(folder, about, catalog, lambda: store)
 
 
 def answers(service: Service, file_ids: list[str]) -> list[Any]:
@@ -136,7 +132,7 @@ def test_restored_catalog_has_the_id_of_its_store_or_else_of_the_backup(
         own = str(get_or_create_installation(session).id)
     folder, _ = open_backup(tmp_path / "backup")
     owner = own if is_marked else None  # as after a first start, which marks the store
-    restore_backup(folder, about, other_catalog, lambda: other_store, IMPORTS, store_owner=owner)
+    restore_backup(folder, about, other_catalog, lambda: other_store, store_owner=owner)
     with other_catalog.write() as session:
         restored_id = str(get_or_create_installation(session).id)
     assert restored_id == (own if is_marked else about.installation_id)
@@ -154,9 +150,9 @@ def test_progress_has_few_stages(
         reports.setdefault(stage, []).append((done, total))
 
     path = tmp_path / "backup"
-    create_backup(service.catalog, service.store, installation_id, path, IMPORTS, report)
+    create_backup(service.catalog, service.store, installation_id, path, report)
     folder, about = open_backup(path)
-    restore_backup(folder, about, other_catalog, lambda: other_store, IMPORTS, report)
+    restore_backup(folder, about, other_catalog, lambda: other_store, report)
     assert reports.keys() <= {"objects", "new objects", "rows"}
     for stage in reports.values():
         assert stage[-1][0] == stage[-1][1] > 0
@@ -343,11 +339,11 @@ def test_a_folder_that_is_no_backup_or_anothers_is_left_alone(
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters/to-mother.txt").write_text("Dear")
     with pytest.raises(Misconfigured) as caught:
-        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "letters", IMPORTS)
+        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "letters")
     assert caught.value.code == "not_a_backup"
     backed_up()
     with pytest.raises(Misconfigured) as caught:
-        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "backup", IMPORTS)
+        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "backup")
     assert caught.value.code == "other_installation"
     file = tmp_path / "backup/backup.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))

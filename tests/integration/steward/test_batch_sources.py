@@ -151,7 +151,7 @@ def test_only_keys_that_the_operator_has_given_free_are_read(batches: Batches, k
     )
     body = problem(answer, 400, "bad_manifest")
     assert [error["line"] for error in body["errors"]] == [2]
-    assert "IMPORT_PREFIX" in body["detail"]
+    assert "not below imports/" in body["detail"]
 
 
 def test_bad_lines_of_a_manifest_are_named_and_leave_nothing(batches: Batches) -> None:
