@@ -14,7 +14,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-NICENESS = 10
+NICENESS = 19
 POLL_SECONDS = 0.5  # between two looks whether the work is still wanted
 
 Result = TypeVar("Result")

@@ -8,6 +8,7 @@ transaction. Nothing is stored before: a fit whose worker dies starts again.
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from uuid import UUID
 
 import numpy as np
+import torch
 from sqlalchemy import select
 
 from services.extractor.added_models import AddedModelLoader
@@ -151,6 +153,9 @@ def _read_rows(store: ObjectStore, request: PcaFitRequest) -> Iterator[Rows]:
 
 def _compute_in_this_process(request: FitRequest, settings: Settings, report: Report) -> Fitted:
     """Compute a fit with a catalog, a store and a model of its own."""
+    # Half of the processors are left to queries and photos.
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
+    settings = settings.model_copy(update={"decode_processes": 1})
     with contextlib.ExitStack() as stack:
         catalog = stack.enter_context(contextlib.closing(open_catalog(settings, "fit")))
         store = open_store(settings, exclusive=False)

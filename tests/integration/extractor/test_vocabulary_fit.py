@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 from uuid import UUID
 
+import numpy as np
 import pytest
 
 from services.extractor import fits
@@ -197,10 +198,14 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
     assert worker.run_next(threading.Event())
     total = with_child.job(job_id).progress_total
     with_child.finish(job_id)
-    assert (
-        with_child.vocabulary(with_child.active().vocabulary_id).sha256
-        == fitted.vocabulary(fitted.active().vocabulary_id).sha256
+    ours, expected = (
+        decode_centres(
+            workplace.store.get(workplace.vocabulary(workplace.active().vocabulary_id).object_key)
+        )
+        for workplace in (with_child, fitted)
     )
+    # The child has other threads, which sum in another order.
+    np.testing.assert_allclose(ours.array, expected.array, atol=1e-3)
     stages, done = zip(*progress, strict=True)
     assert [stage for stage, _ in itertools.groupby(stages)] == ["sample", "cluster"]
     assert list(done) == sorted(done)
