@@ -77,8 +77,9 @@ pictures: $(INSTALLED) ## test-browser, and retake the screenshots in docs/pictu
 client: $(INSTALLED) ## generate the synchronous client from the asynchronous one
 	$(BIN)/python -m tools.make_sync_client
 
-api-page: $(INSTALLED) ## generate docs/api-calls.md from the OpenAPI description
+pages: $(INSTALLED) ## generate docs/api-calls.md and docs/reference.md
 	$(BIN)/python -m tools.make_api_page
+	$(BIN)/python -m tools.make_reference
 
 lint: $(INSTALLED) ## check ruff rules, formatting, import contracts and sizes
 	$(BIN)/ruff check .

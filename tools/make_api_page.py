@@ -1,4 +1,4 @@
-"""Generates `docs/api-calls.md` from the OpenAPI description: `make api-page`."""
+"""Generates `docs/api-calls.md` from the OpenAPI description: `make pages`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.config.settings import Settings
 PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
 HEAD = """# Every call
 
-Generated from the server's OpenAPI description (`/openapi.json`) by `make api-page`. For what all
+Generated from the server's OpenAPI description (`/openapi.json`) by `make pages`. For what all
 calls have in common, see [the API in short](api.md).
 """
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tools.make_api_page import PAGE, openapi_description, render_page
+from shared.config.settings import Settings
+from tools import make_api_page, make_reference
+from tools.make_api_page import openapi_description
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "lab/benchmarks/RESULTS.md"])
@@ -24,8 +27,23 @@ def anchors(text: str) -> set[str]:
     return found
 
 
-def test_page_of_calls_is_what_the_server_describes() -> None:
-    assert PAGE.read_text() == render_page(), "run `make api-page`"
+@pytest.mark.parametrize("tool", [make_api_page, make_reference], ids=["calls", "reference"])
+def test_a_generated_page_is_what_the_code_says(tool: Any) -> None:
+    assert tool.PAGE.read_text() == tool.render_page(), "run `make pages`"
+
+
+def test_the_reference_has_every_setting() -> None:
+    page = make_reference.PAGE.read_text()
+    missing = [name for name in Settings.model_fields if f"| `{name.upper()}` |" not in page]
+    assert missing == []
+
+
+@pytest.mark.parametrize("name", ["api.md", "troubleshooting.md"])
+def test_codes_that_a_page_names_with_their_status_exist(name: str) -> None:
+    text = (ROOT / "docs" / name).read_text()
+    named = set(re.findall(r"\b[45]\d\d `([a-z_0-9]+)`", text))
+    assert named
+    assert named - make_reference.error_codes().keys() == set()
 
 
 def test_every_call_is_described_in_a_sentence() -> None:
