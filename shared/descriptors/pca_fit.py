@@ -13,24 +13,18 @@ scikit-learn's IncrementalPCA reads batches of rows and holds a matrix of compon
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import Path
-from typing import Protocol
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.descriptors.pca_whitening import PcaWhitening, Rows
 from shared.errors import Unprocessable
-from shared.storage import FolderStore, ObjectStore
 
 BLOCK_BYTES = 64_000_000  # of float64 columns in one block
 SAMPLE_BYTES = 1_000_000_000  # maximum size of the sample of rows
 MIN_SAMPLE_ROWS = 1000
 SAMPLE_PER_DIMENSION = 4
-FLOAT32 = np.dtype("<f4")
 
 
 def sample_size(dimension: int, components: int) -> int:
@@ -40,7 +34,7 @@ def sample_size(dimension: int, components: int) -> int:
     component: the time of a fit grows with the square of the number of rows.
     """
     target = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * components)
-    return min(target, max(2 * components, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
+    return min(target, max(2 * components, SAMPLE_BYTES // (4 * dimension)))
 
 
 def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
@@ -57,220 +51,10 @@ def usable_rows(rows: Rows) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(lengths) & (lengths > 0))
 
 
-class ColumnSource(Protocol):
-    """(count, dimension) float32 rows that are read in blocks of columns."""
-
-    @property
-    def count(self) -> int: ...
-
-    @property
-    def dimension(self) -> int: ...
-
-    @property
-    def width(self) -> int:
-        """Number of columns of a block; the last one may be narrower."""
-
-    def read(self, block: int) -> Rows:
-        """Return the (count, width) columns of a block, counted from 0."""
-
-
-def block_count(rows: ColumnSource) -> int:
-    """Return the number of blocks of columns."""
-    return -(-rows.dimension // rows.width)
-
-
-def block_width(count: int, dimension: int, block_bytes: int = BLOCK_BYTES) -> int:
-    """Return the number of columns in a block of (count, dimension) rows.
-
-    All columns if there are more rows than dimensions: the products of columns are the smaller
-    matrix then.
-    """
-    if count > dimension:
-        return dimension
-    return min(dimension, max(1, block_bytes // (8 * max(1, count))))
-
-
-class ArrayColumns:
-    """A ColumnSource over an array, which may be memory-mapped."""
-
-    def __init__(self, rows: Rows, block_bytes: int = BLOCK_BYTES) -> None:
-        self._rows = rows
-        self.count, self.dimension = rows.shape
-        self.width = block_width(self.count, self.dimension, block_bytes)
-
-    def read(self, block: int) -> Rows:
-        begin = block * self.width
-        return self._rows[:, begin : begin + self.width]
-
-
-class StoredColumns:
-    """A ColumnSource in an object store, one object per block of columns and batch of rows.
-
-    Objects `PREFIX<block>-<first row>.f32` are (rows, width) float32, little-endian, C order.
-    """
-
-    def __init__(
-        self, store: ObjectStore, prefix: str, dimension: int, width: int, count: int = 0
-    ) -> None:
-        """Open the rows under `prefix`.
-
-        Args:
-            dimension: Number of columns.
-            width: Number of columns of a block: `block_width` of the maximum number of rows.
-            count: Number of rows stored already.
-        """
-        self._store = store
-        self._prefix = prefix
-        self.dimension = dimension
-        self.width = width
-        self.count = count
-
-    def add(self, rows: Rows) -> None:
-        """Append (n, dimension) rows.
-
-        Rows that were written before a crash but not counted are overwritten.
-        """
-        for block in range(block_count(self)):
-            begin = block * self.width
-            piece = rows[:, begin : begin + self.width].astype(FLOAT32)
-            self._store.put(self._key(block, self.count), piece.tobytes())
-        self.count += len(rows)
-
-    def read(self, block: int) -> Rows:
-        width = min(self.width, self.dimension - block * self.width)
-        rows = np.empty((self.count, width), np.float32)
-        filled = 0
-        while filled < self.count:
-            data = self._store.get(self._key(block, filled))
-            piece = np.frombuffer(data, FLOAT32).reshape(-1, width)
-            rows[filled : filled + len(piece)] = piece
-            filled += len(piece)
-        return rows
-
-    def _key(self, block: int, first: int) -> str:
-        return f"{self._prefix}{block:05d}-{first:08d}.f32"
-
-
 # Relative to the largest variance. Below, whitening would amplify float32 rounding errors.
 MIN_VARIANCE = 1e-9
 
 Matrix = NDArray[np.float64]
-
-
-class _PcaFitStage(StrEnum):
-    """The stages of a fit, in their order."""
-
-    PRODUCTS = "products"  # Gram matrix
-    VARIANCES = "variances"  # eigenvalues
-    DIRECTIONS = "directions"
-    DONE = "done"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PcaBlock:
-    """A block of columns of the fitted whitening."""
-
-    mean: Rows
-    """(width,)"""
-    directions: Rows
-    """(components, width), each divided by its standard deviation."""
-
-
-class PcaFit:
-    """Fits a PCA whitening: call `step` until `done`.
-
-    Deterministic: the same rows give the same whitening.
-    """
-
-    def __init__(self, rows: ColumnSource, components: int) -> None:
-        """Raises Unprocessable as `check_pca_fittable` does."""
-        check_pca_fittable(rows.count, rows.dimension, components)
-        self._rows = rows
-        self._components = components
-        self._blocks = block_count(rows)
-        self.stage = _PcaFitStage.PRODUCTS
-        self._block = 0
-        """Blocks of columns done in the current stage."""
-        # The smaller one of XX' (rows) and X'X (columns).
-        self._by_columns = rows.count > rows.dimension and self._blocks == 1
-        size = rows.dimension if self._by_columns else rows.count
-        self._products: Matrix = np.zeros((size, size))
-        self._basis: Matrix = np.empty((size, 0))
-        """Multiplied with a centred block, it gives the block's directions."""
-        self._variances: Matrix = np.empty(0)
-        self._total = 0.0
-
-    @property
-    def done(self) -> bool:
-        return self.stage == _PcaFitStage.DONE
-
-    @property
-    def progress(self) -> tuple[int, int]:
-        """Steps done, and the total."""
-        steps_before = {
-            _PcaFitStage.PRODUCTS: 0,
-            _PcaFitStage.VARIANCES: 0,
-            _PcaFitStage.DIRECTIONS: self._blocks + 1,
-        }
-        total = 2 * self._blocks + 1
-        return (total if self.done else steps_before[self.stage] + self._block), total
-
-    @property
-    def parts(self) -> int:
-        """Number of blocks of the result returned so far."""
-        if self.done:
-            return self._blocks
-        return self._block if self.stage == _PcaFitStage.DIRECTIONS else 0
-
-    def step(self) -> PcaBlock | None:
-        """Process one block of columns, or compute the variances.
-
-        Returns:
-            In the stage DIRECTIONS a block of the result, else None.
-
-        Raises:
-            Unprocessable: `pca_too_many_dimensions` if the rows vary in too few directions.
-        """
-        if self.stage == _PcaFitStage.VARIANCES:
-            self._find_variances()
-            return None
-        block, mean = _centred(self._rows.read(self._block))
-        part = None
-        if self.stage == _PcaFitStage.PRODUCTS:
-            self._products += block.T @ block if self._by_columns else block @ block.T
-        else:
-            directions = self._basis.T if self._by_columns else self._basis.T @ block
-            part = PcaBlock(mean.astype(np.float32), directions.astype(np.float32))
-        self._block += 1
-        if self._block == self._blocks:
-            if self.stage == _PcaFitStage.DIRECTIONS:
-                self.stage = _PcaFitStage.DONE
-            else:
-                self.stage = _PcaFitStage.VARIANCES
-        return part
-
-    def whitening(self, parts: Sequence[PcaBlock]) -> PcaWhitening:
-        """Join the blocks of a completed fit, in the order in which `step` returned them."""
-        assert self.done
-        directions = np.concatenate([part.directions for part in parts], axis=1)
-        return PcaWhitening(
-            mean=np.concatenate([part.mean for part in parts]),
-            directions=_with_fixed_signs(directions),
-            variances=self._variances.astype(np.float32),
-            explained=float(self._variances.sum() / self._total),
-            rows=self._rows.count,
-        )
-
-    def _find_variances(self) -> None:
-        freedom = self._rows.count - 1
-        squares, vectors = _largest_eigenpairs(self._products, self._components)
-        self._variances = squares / freedom
-        self._total = float(np.trace(self._products)) / freedom
-        # p / sqrt(l) = X'u / s * sqrt(n - 1) / s; by columns the vectors are the directions p.
-        scale = 1 / np.sqrt(self._variances) if self._by_columns else np.sqrt(freedom) / squares
-        self._basis = vectors * scale
-        self._products = np.empty((0, 0))
-        self.stage, self._block = _PcaFitStage.DIRECTIONS, 0
 
 
 def check_pca_fittable(rows: int, dimension: int, components: int) -> None:
@@ -294,31 +78,58 @@ def check_pca_fittable(rows: int, dimension: int, components: int) -> None:
         )
 
 
-def fit_pca(rows: Rows, components: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhitening:
-    """Fit a whitening of (n, D) rows, which may be memory-mapped, to `components` dimensions.
-
-    Raises as `PcaFit` does.
-    """
-    return fit_pca_columns(ArrayColumns(rows, block_bytes), components)
-
-
-def fit_pca_columns(
-    rows: ColumnSource,
+def fit_pca(
+    rows: Rows,
     components: int,
+    *,
+    block_bytes: int = BLOCK_BYTES,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> PcaWhitening:
     """Fit a whitening of rows to `components` dimensions.
 
-    `on_progress` is called with the steps done and the total. Raises as `PcaFit` does.
+    Deterministic: the same rows give the same whitening.
+
+    Args:
+        rows: (n, D) float32, which may be memory-mapped.
+        block_bytes: Size of a block of columns in float64.
+        on_progress: Called with the blocks done and the total.
+
+    Raises:
+        Unprocessable: As `check_pca_fittable`; `pca_too_many_dimensions` also if the rows vary in
+            too few directions.
     """
-    fit = PcaFit(rows, components)
-    parts = []
-    while not fit.done:
-        part = fit.step()
-        if part is not None:
-            parts.append(part)
-        on_progress(*fit.progress)
-    return fit.whitening(parts)
+    count, dimension = rows.shape
+    check_pca_fittable(count, dimension, components)
+    # The products of columns are the smaller matrix if there are more rows than dimensions.
+    by_columns = count > dimension
+    width = dimension if by_columns else min(dimension, max(1, block_bytes // (8 * count)))
+    begins = range(0, dimension, width)
+    steps = 2 * len(begins) + 1
+    products: Matrix = np.zeros((min(count, dimension),) * 2)
+    for done, begin in enumerate(begins, start=1):
+        block, _ = _centred(rows[:, begin : begin + width])
+        products += block.T @ block if by_columns else block @ block.T
+        on_progress(done, steps)
+    squares, vectors = _largest_eigenpairs(products, components)
+    variances = squares / (count - 1)
+    # p / sqrt(l) = X'u / s * sqrt(n - 1) / s; by columns the vectors are the directions p.
+    scale = 1 / np.sqrt(variances) if by_columns else np.sqrt(count - 1) / squares
+    basis = vectors * scale
+    on_progress(len(begins) + 1, steps)
+    mean = np.empty(dimension, np.float32)
+    directions = np.empty((components, dimension), np.float32)
+    for done, begin in enumerate(begins, start=len(begins) + 2):
+        columns = slice(begin, begin + width)
+        block, mean[columns] = _centred(rows[:, columns])
+        directions[:, columns] = basis.T if by_columns else basis.T @ block
+        on_progress(done, steps)
+    return PcaWhitening(
+        mean=mean,
+        directions=_with_fixed_signs(directions),
+        variances=variances.astype(np.float32),
+        explained=float(squares.sum() / np.trace(products)),
+        rows=count,
+    )
 
 
 def _largest_eigenpairs(matrix: Matrix, components: int) -> tuple[Matrix, Matrix]:
@@ -356,9 +167,6 @@ def _with_fixed_signs(directions: Rows) -> Rows:
     return fixed
 
 
-ROWS_FOLDER_PREFIX = "rows-"
-
-
 def fit_pca_stream(
     batches: Iterable[Rows],
     max_rows: int,
@@ -366,7 +174,7 @@ def fit_pca_stream(
     components: int,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, max_rows: None,
 ) -> PcaWhitening:
-    """Fit a whitening to batches of rows, which are stored in a temporary folder meanwhile.
+    """Fit a whitening to batches of rows, which are stored in a temporary file meanwhile.
 
     Args:
         batches: (n, dimension) rows; rows that are zero or not finite are skipped.
@@ -376,20 +184,21 @@ def fit_pca_stream(
         on_progress: Called with the stage (`gathering`, `reducing`), the rows or steps done and
             the total.
 
-    Raises as `PcaFit` does.
+    Raises as `fit_pca` does.
     """
-    with tempfile.TemporaryDirectory(prefix="placewise-pca-") as folder:
-        store = FolderStore(Path(folder))
-        stored = StoredColumns(
-            store, ROWS_FOLDER_PREFIX, dimension, block_width(max_rows, dimension)
-        )
-        seen = 0
+    with tempfile.TemporaryFile(prefix="placewise-pca-") as file:
+        seen = kept = 0
         for batch in batches:
             rows = batch[usable_rows(batch)]
-            if len(rows):
-                stored.add(rows)
+            file.write(np.ascontiguousarray(rows, np.float32).tobytes())
+            kept += len(rows)
             seen += len(batch)
             on_progress("gathering", seen, max_rows)
-        return fit_pca_columns(
-            stored, components, lambda done, steps: on_progress("reducing", done, steps)
+        file.flush()
+        check_pca_fittable(kept, dimension, components)
+        stored = np.memmap(file, np.float32, "r", shape=(kept, dimension))
+        return fit_pca(
+            stored,
+            components,
+            on_progress=lambda done, steps: on_progress("reducing", done, steps),
         )

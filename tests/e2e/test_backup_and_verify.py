@@ -73,7 +73,7 @@ def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
     assert text["placewise_extractor_jobs_total"][(("kind", "index"), ("outcome", "succeeded"))] > 0
     assert text["placewise_search_searches_total"][(("outcome", "answered"),)] > 0
     assert text["placewise_search_rows"][()] > 0
-    assert text["placewise_steward_tasks_total"][(("task", "reclaim_leases"), ("outcome", "done"))]
+    assert text["placewise_steward_tasks_total"][(("outcome", "done"), ("task", "reclaim_leases"))]
     assert text["placewise_gateway_catalog_up"][()] == 1
 
 

@@ -126,7 +126,7 @@ def _figures(running: ServerProcess) -> dict[str, dict[tuple[tuple[str, str], ..
 
 
 def _wait_for_collection(running: ServerProcess) -> None:
-    done = (("task", "collect_orphans"), ("outcome", "done"))
+    done = (("outcome", "done"), ("task", "collect_orphans"))
     _wait_for(lambda: _figures(running).get("placewise_steward_tasks_total", {}).get(done, 0) >= 1)
 
 

@@ -214,7 +214,7 @@ def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> 
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")
     with pytest.raises(Misconfigured) as caught:
         check_memory(settings)
-    assert "this settings_module has 2.0 GB" in caught.value.detail
+    assert "this machine has 2.0 GB" in caught.value.detail
     assert "DEVICE=cpu" not in caught.value.detail
 
 

@@ -15,11 +15,8 @@ from sklearn.decomposition import PCA
 
 from shared.descriptors.pca_fit import (
     SAMPLE_BYTES,
-    ArrayColumns,
-    StoredColumns,
-    block_width,
     fit_pca,
-    fit_pca_columns,
+    fit_pca_stream,
     sample_rows,
     sample_size,
     usable_rows,
@@ -32,7 +29,6 @@ from shared.descriptors.pca_whitening import (
     decode_whitening,
 )
 from shared.errors import Unprocessable
-from shared.storage import FolderStore
 
 pytestmark = pytest.mark.numerics
 
@@ -89,17 +85,6 @@ def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, compon
     assert (ours.components, ours.dimension, ours.rows) == (components, dimension, count)
 
 
-def test_both_ways_give_the_same_projection() -> None:
-    rows = unit_rows(160, 150)
-    by_columns, by_rows = ArrayColumns(rows), ArrayColumns(rows)
-    by_rows.width = 40  # blocks: the products are those of the rows then
-    found, other = fit_pca_columns(by_columns, 20), fit_pca_columns(by_rows, 20)
-    np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
-    np.testing.assert_allclose(found.variances, other.variances, rtol=1e-6)
-    np.testing.assert_allclose(found.directions, other.directions, atol=1e-3)
-    assert found.explained == pytest.approx(other.explained)
-
-
 def test_whitened_rows_vary_equally_in_all_directions() -> None:
     rows = unit_rows(500, 80)
     by = fit_pca(rows, 16)
@@ -147,39 +132,20 @@ def test_a_row_that_is_the_mean_or_nothing_becomes_zero_and_one_that_is_nan_stay
 @pytest.mark.parametrize(("count", "dimension"), [(60, 200), (200, 60)])
 def test_progress_grows_by_a_step_to_its_end(count: int, dimension: int) -> None:
     seen: list[tuple[int, int]] = []
-    rows = ArrayColumns(unit_rows(count, dimension), block_bytes=40_000)
-    fit_pca_columns(rows, 12, lambda done, total: seen.append((done, total)))
+    rows = unit_rows(count, dimension)
+    fit_pca(rows, 12, block_bytes=40_000, on_progress=lambda *step: seen.append(step))
     assert seen == [(done, len(seen)) for done in range(1, len(seen) + 1)]
 
 
 # --- the sample ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [50, 7])
-def test_stored_rows_are_fitted_as_those_in_memory(tmp_path: Path, count: int) -> None:
-    rows = unit_rows(50, 200)[:count]
-    store, width = FolderStore(tmp_path), block_width(50, 200, block_bytes=12_000)
-    assert width == 30
-    for begin in range(0, count, 7):  # each by one who knows only how many are there
-        StoredColumns(store, "work/rows-", 200, width, begin).add(rows[begin : begin + 7])
-    stored = StoredColumns(store, "work/rows-", 200, width, count)
-    np.testing.assert_array_equal(stored.read(6), rows[:, 180:])  # the last block, a narrow one
-    assert (
-        fit_pca_columns(stored, 5).sha256
-        == fit_pca(rows, 5, block_bytes=12_000 * count // 50).sha256
-    )
-
-
-def test_rows_that_a_crash_has_left_are_written_again(tmp_path: Path) -> None:
-    rows = unit_rows(20, 40)
-    store = FolderStore(tmp_path)
-    crashed = StoredColumns(store, "work/rows-", 40, 15)
-    crashed.add(rows[:6])
-    crashed.add(rows[6:12])
-    again = StoredColumns(store, "work/rows-", 40, 15)
-    again.add(rows[1:9])  # a photo was deleted meanwhile
-    again.add(rows[9:20])
-    np.testing.assert_array_equal(again.read(1), rows[1:, 15:30])
+def test_batches_are_fitted_as_their_usable_rows_in_memory() -> None:
+    rows = unit_rows(50, 200)
+    rows[3] = 0
+    batches = [rows[begin : begin + 7] for begin in range(0, 50, 7)]
+    fitted = fit_pca_stream(batches, 50, 200, 5)
+    assert fitted.sha256 == fit_pca(np.delete(rows, 3, axis=0), 5).sha256
 
 
 def test_the_sample_is_large_enough_for_the_directions_and_small_enough_for_the_disk() -> None:

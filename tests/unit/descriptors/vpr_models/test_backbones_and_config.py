@@ -269,7 +269,7 @@ def test_dinov2_makes_the_tokens_of_a_whole_forward_pass_and_norms_them(tmp_path
 def test_lite0_with_its_published_weights_is_the_embedded_defaults_network() -> None:
     """Which takes another mean and deviation than ImageNet's."""
     pixels = np.random.default_rng(0).integers(0, 256, (1, 64, 96, 3), dtype=np.uint8)
-    chosen = config(backbone_arch="efficientnet_lite0", backbones_module=True, layers_to_crop=[6])
+    chosen = config(backbone_arch="efficientnet_lite0", pretrained=True, layers_to_crop=[6])
     photos = normalise_pixels(torch.from_numpy(pixels), IMAGENET_MEAN, IMAGENET_STD)
     with torch.inference_mode():
         maps = build_backbone(chosen, None)(photos).maps
@@ -298,10 +298,10 @@ def test_pretrained_weights_come_from_the_cache_or_from_a_file(no_network: Path)
     expected = published["layer2.1.conv2.weight"]
     file = no_network / "mine.safetensors"
     save_file(published, file)
-    given = build_vpr_model(config(backbones_module=True), weights=file)
+    given = build_vpr_model(config(pretrained=True), weights=file)
     assert torch.equal(given.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
     torch.save(published, no_network / "resnet18-f37072fd.pth")
-    cached = build_vpr_model(config(backbones_module=True))
+    cached = build_vpr_model(config(pretrained=True))
     assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
 
 
@@ -309,10 +309,10 @@ def test_weights_that_can_not_be_had_are_missing_and_never_random(no_network: Pa
     for name, weights in (("resnet18", None), ("resnet18", no_network / "none.pth"),
                           ("efficientnet_lite0", no_network / "none.pth")):  # fmt: skip
         with pytest.raises(Misconfigured) as refused:
-            build_vpr_model(config(backbone_arch=name, backbones_module=True), weights=weights)
+            build_vpr_model(config(backbone_arch=name, pretrained=True), weights=weights)
         assert refused.value.code == "weights_missing"
     with pytest.raises(Misconfigured, match=r"no route to host.*\(1\).*\(2\).*\(3\).*\(4\)"):
-        build_vpr_model(config(backbones_module=True))
+        build_vpr_model(config(pretrained=True))
 
 
 def test_another_networks_weights_are_refused(no_network: Path) -> None:
@@ -322,7 +322,7 @@ def test_another_networks_weights_are_refused(no_network: Path) -> None:
     (no_network / "torn.pth").write_bytes(b"PK\x03\x04 torn")
     for name in ("resnet18-f37072fd.pth", "other.pth", "torn.pth"):
         with pytest.raises(Misconfigured) as refused:
-            build_vpr_model(config(backbones_module=True), weights=no_network / name)
+            build_vpr_model(config(pretrained=True), weights=no_network / name)
         assert refused.value.code == "weights_unusable"
 
 
