@@ -24,11 +24,10 @@ from shared.backup.folder import (
 )
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import get_or_create_installation
-from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job
 from shared.catalog.maps import DEFAULT_MAP, Map
 from shared.catalog.processes import RegisteredSearchWorker
 from shared.errors import Conflict, Misconfigured, NotFound
-from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_job, requeue_job
 from shared.storage import ObjectStore
 from shared.storage.copying import copy_object, hash_object
@@ -45,7 +44,7 @@ class RestoreResult:
     copied_objects: int
     """Objects that were copied; the others already existed in the store."""
     cancelled_jobs: int
-    """Queries, and fits whose intermediate state is not in the backup."""
+    """Queries, whose photos are not in the backup."""
 
 
 def restore_backup(
@@ -156,16 +155,12 @@ def _copy_objects(folder: BackupFolder, store: ObjectStore, progress: BackupProg
 
 
 def _cancel_unfinished_work(session: Session) -> int:
-    """Release all leases, and cancel jobs that can't be resumed; return their number."""
+    """Release all leases, and cancel queries, which have no photo now; return their number."""
     for job in session.scalars(select(Job).where(Job.lease_token.is_not(None))).all():
         requeue_job(job)
-    jobs = session.scalars(
-        select(Job).where(
-            Job.state.in_(UNFINISHED_STATES),
-            Job.kind.in_(QUERY_JOBS)
-            | (Job.kind.in_(MODEL_CHANGE_JOBS) & Job.generation_id.is_(None)),
-        )
+    queries = session.scalars(
+        select(Job).where(Job.state.in_(UNFINISHED_STATES), Job.kind.in_(QUERY_JOBS))
     ).all()
-    for job in jobs:
-        cancel_job(job) if job.kind in QUERY_JOBS else cancel_model_change(session, job)
-    return len(jobs)
+    for job in queries:
+        cancel_job(job)
+    return len(queries)

@@ -40,10 +40,6 @@ def kill_itself(report: Report) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def leave(report: Report) -> None:
-    os._exit(3)
-
-
 def sleep(report: Report) -> None:
     report(os.getpid())
     time.sleep(600)
@@ -73,14 +69,9 @@ def test_an_error_arrives_as_it_was_raised_with_the_traceback_as_a_note() -> Non
     assert "return 1 / 0" in "\n".join(raised.value.__notes__)
 
 
-@pytest.mark.parametrize(
-    ("function", "said"), [(kill_itself, r"killed \(SIGKILL\); .* memory"), (leave, "code 3")]
-)
-def test_a_process_that_dies_is_an_error_that_says_how(
-    function: Callable[[Report], None], said: str
-) -> None:
-    with pytest.raises(ChildKilled, match=said):
-        run_in_child(function, on_progress=nothing, check=nothing)
+def test_a_process_that_dies_is_an_error_that_says_how() -> None:
+    with pytest.raises(ChildKilled, match=r"killed \(SIGKILL\); .* memory"):
+        run_in_child(kill_itself, on_progress=nothing, check=nothing)
 
 
 def test_work_that_is_not_wanted_any_more_ends_at_once() -> None:

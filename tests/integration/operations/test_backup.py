@@ -21,11 +21,13 @@ from shared.backup.restore import RestoreResult, restore_backup
 from shared.catalog.chunks import Chunk
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import get_or_create_installation
-from shared.catalog.jobs import Job, JobState
+from shared.catalog.jobs import Job, JobKind, JobState
+from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured
 from shared.integrity.verify import verify_store
+from shared.jobs.model_changes import start_model_change
 from shared.storage import FolderStore
 from shared.storage.keys import thumbnail_key
 from tests.integration.in_process_api import Service
@@ -93,6 +95,9 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     # Work of all kinds under way: queued, held by a worker, a query.
     queued = [service.upload(photo_bytes(number))["job_id"] for number in (5, 6)]
     query = service.ask(photo_bytes(7))
+    with service.catalog.write() as session:
+        default = get_map(session, "default").id
+        fit = start_model_change(session, default, JobKind.FIT, {"clusters": 2}).id
     held = {str(job.id) for job in take(service.catalog, 1)}
     about = backed_up()
     assert (about.missing, about.damaged) == ([], [])
@@ -110,6 +115,7 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     other = Service(other_catalog, other_store, settings, make_worker)
     assert answers(other, known) == answers(service, known)
     assert read_job(other_catalog, UUID(query)).state == JobState.CANCELLED
+    assert read_job(other_catalog, fit).state == JobState.QUEUED, "it starts again"
     for job_id in [*queued, *held]:
         job = read_job(other_catalog, UUID(job_id))
         assert job.lease_token is None
