@@ -77,17 +77,6 @@ def test_links_between_pages_lead_somewhere(found: Path) -> None:
     assert broken == []
 
 
-ACTIVATION = "Run `source .venv/bin/activate` first, or write `.venv/bin/placewise`"
-GUIDES = [page for page in PAGES if page.parent.name == "how-to"]
-
-
-@pytest.mark.parametrize("found", GUIDES, ids=lambda path: path.name)
-def test_a_page_with_commands_says_first_how_to_call_them(found: Path) -> None:
-    text = found.read_text()
-    command = re.search(r"^(\$ )?placewise |`placewise ", text, re.MULTILINE)
-    assert command is None or ACTIVATION in text[: command.start()]
-
-
 def test_no_text_names_placewise_as_a_package_of_an_index() -> None:
     sources = [
         path for name in ("services", "shared", "placewise") for path in (ROOT / name).rglob("*.py")
