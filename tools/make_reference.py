@@ -11,7 +11,6 @@ from typing import Any
 
 import typer
 from pydantic import SecretStr
-from pydantic_settings import BaseSettings
 
 from services.cli.main import build_app
 from shared import errors
@@ -88,18 +87,13 @@ def _makers(tree: ast.Module, call: ast.Call) -> Iterator[str]:
 
 
 def _settings() -> Iterator[str]:
-    groups = [
-        kind
-        for kind in Settings.__mro__[::-1]
-        if issubclass(kind, BaseSettings) and kind.__module__.startswith("shared.")
-    ]
-    for group in groups:
-        names = [name for name in vars(group).get("__annotations__", {}) if name.islower()]
-        rows = [
-            (f"`{name.upper()}`", _default(Settings.model_fields[name].default), description)
-            for name in names
-            if (description := Settings.model_fields[name].description)
+    for group in Settings.__mro__[::-1]:
+        fields = [
+            (name, Settings.model_fields[name])
+            for name in vars(group).get("__annotations__", {})
+            if name in Settings.model_fields
         ]
+        rows = [(f"`{n.upper()}`", _default(f.default), f.description or "") for n, f in fields]
         if rows:
             title = (inspect.getdoc(group) or "").split("\n")[0].rstrip(".")
             yield f"## Settings: {title[0].lower()}{title[1:]}\n"

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -260,9 +261,39 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     return explain_outage(error)
 
 
+LINE_SECONDS = 10.0  # between two lines of progress where stderr is not a terminal
+
+
+class _ProgressLines(Progress):
+    """Prints lines instead of bars."""
+
+    _printed_at = 0.0
+
+    def start(self) -> None:
+        self._printed_at = time.monotonic()
+
+    def update(self, task_id: TaskID, *args: Any, **changes: Any) -> None:
+        super().update(task_id, *args, **changes)
+        self._print(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._print(task_id)
+
+    def _print(self, task_id: TaskID) -> None:
+        if time.monotonic() - self._printed_at < LINE_SECONDS:
+            return
+        self._printed_at = time.monotonic()
+        task = self._tasks[task_id]
+        total = "" if task.total is None else f" of {task.total:,.0f}"
+        line = f"{task.description}: {task.completed:,.0f}{total}, {task.elapsed or 0:.0f} s"
+        self.console.print(line, soft_wrap=True)
+
+
 def progress_bar() -> Progress:
-    """A progress bar on stderr, hidden if stderr is not a terminal."""
-    return Progress(
+    """A progress bar on stderr; if that is not a terminal, a line every LINE_SECONDS."""
+    kind = Progress if err_console.is_terminal else _ProgressLines
+    return kind(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 import traceback
 from collections.abc import Callable
@@ -61,7 +60,10 @@ def run_in_child(
             on_progress(*value)
     except EOFError:
         process.join()
-        raise ChildKilled(_describe_exit(process.exitcode)) from None
+        raise ChildKilled(
+            f"its process ended with code {process.exitcode}; -9 means that it was killed, perhaps "
+            "because memory ran out"
+        ) from None
     finally:
         process.kill()
         process.join()
@@ -87,10 +89,3 @@ def _exit_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _describe_exit(exitcode: int | None) -> str:
-    if exitcode is not None and exitcode < 0:
-        name = signal.Signals(-exitcode).name
-        return f"its process was killed ({name}); if nobody killed it, memory has run out"
-    return f"its process ended with code {exitcode}"

@@ -30,7 +30,7 @@ from services.extractor.new_generations import (
 )
 from services.extractor.prepare import read_chunk_row
 from shared.catalog.chunks import Descriptor, find_descriptor_rows
-from shared.catalog.database.session import Catalog, ChangePoll
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.jobs import FIT_JOBS
 from shared.catalog.photos import Photo, PhotoRole
@@ -51,7 +51,7 @@ from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner, StepOutcome
+from shared.jobs.runner import JobInterrupted, JobRunner, StepOutcome
 from shared.storage import ObjectStore
 from shared.storage.open_store import open_store
 
@@ -240,17 +240,15 @@ class FitWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run fits until `stop` is set."""
-        poll = ChangePoll(self._catalog)
-        self._runner.run(
-            lambda: self.run_next(stop),
-            stop,
-            lambda seconds: poll.wait(stop, IDLE_POLL_SECONDS, seconds),
-        )
+        self._runner.run_jobs(lambda job: self._fit(job, stop), stop)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run the next fit; False when there is none."""
-        fits = {JobKind.FIT: self._fit_vocabulary, JobKind.PCA: self._fit_whitening}
-        return self._runner.run_next(lambda job: fits[JobKind(job.kind)](job, stop))
+        return self._runner.run_next(lambda job: self._fit(job, stop))
+
+    def _fit(self, job: Job, stop: threading.Event) -> None:
+        fit = self._fit_vocabulary if job.kind == JobKind.FIT else self._fit_whitening
+        fit(job, stop)
 
     def _fit_vocabulary(self, job: Job, stop: threading.Event) -> None:
         extractor = map_extractor(self._catalog, self._models, job)

@@ -16,7 +16,6 @@ from services.search.photo_columns import JoinedColumns
 from shared.search_api.protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
-    from services.search.exact_rerank import RowBlocks
     from services.search.gpu import GpuSnapshot
     from services.search.sign_code_search import SignCodeBlocks
 
@@ -82,10 +81,3 @@ class Snapshot:
         from services.search.sign_code_search import SignCodeBlocks
 
         return SignCodeBlocks.of(self.chunks)
-
-    @cached_property
-    def row_blocks(self) -> RowBlocks:
-        """Addresses of the rows."""
-        from services.search.exact_rerank import RowBlocks
-
-        return RowBlocks.of(self.chunks)

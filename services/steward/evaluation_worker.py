@@ -19,7 +19,7 @@ from services.steward.map_evaluation import MapEvaluation
 from services.steward.metrics import StewardMetrics
 from services.steward.word_weights import WordWeightsFit
 from shared.catalog.chunks import count_searchable
-from shared.catalog.database.session import Catalog, ChangePoll
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation, active_generation
 from shared.catalog.maps import Map, decide_label_paths
 from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
@@ -30,7 +30,7 @@ from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import IDLE_POLL_SECONDS, JobInterrupted, JobRunner
+from shared.jobs.runner import JobInterrupted, JobRunner
 from shared.jobs.transitions import succeed_job
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
@@ -98,12 +98,7 @@ class EvaluationWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run jobs until `stop` is set."""
-        poll = ChangePoll(self._catalog)
-        self._runner.run(
-            lambda: self.run_next(stop),
-            stop,
-            lambda seconds: poll.wait(stop, IDLE_POLL_SECONDS, seconds),
-        )
+        self._runner.run_jobs(lambda job: self._run_job(job, stop), stop)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run the next job; False when there is none."""

@@ -38,7 +38,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.batch_items import has_batch_items
 from shared.catalog.database.base import db_now
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import IDLE_SECONDS, Catalog
+from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
@@ -134,6 +134,15 @@ class JobRunner:
         )
         with self.catalog.read() as session:
             return session.scalar(unfinished.limit(1)) is None
+
+    def run_jobs(self, handler: Callable[[Job], None], stop: threading.Event) -> None:
+        """Run jobs one after the other with `handler` (see `run_next`) until `stop` is set."""
+        poll = ChangePoll(self.catalog)
+        self.run(
+            lambda: self.run_next(handler),
+            stop,
+            lambda seconds: poll.wait(stop, IDLE_POLL_SECONDS, seconds),
+        )
 
     def run_once(self, work: Callable[[], Result], stop: threading.Event) -> Result | None:
         """Run `work`; pause and return None if the catalog was unavailable.

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from shared.config.settings import Settings
 from tools import make_api_page, make_reference
 from tools.make_api_page import openapi_description
 
@@ -30,12 +29,6 @@ def anchors(text: str) -> set[str]:
 @pytest.mark.parametrize("tool", [make_api_page, make_reference], ids=["calls", "reference"])
 def test_a_generated_page_is_what_the_code_says(tool: Any) -> None:
     assert tool.PAGE.read_text() == tool.render_page(), "run `make pages`"
-
-
-def test_the_reference_has_every_setting() -> None:
-    page = make_reference.PAGE.read_text()
-    missing = [name for name in Settings.model_fields if f"| `{name.upper()}` |" not in page]
-    assert missing == []
 
 
 @pytest.mark.parametrize("name", ["api.md", "troubleshooting.md"])

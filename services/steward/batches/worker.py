@@ -38,7 +38,7 @@ from shared.catalog.batch_items import (
     update_batch_progress,
 )
 from shared.catalog.database.base import for_update
-from shared.catalog.database.session import Catalog, ChangePoll
+from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
@@ -56,7 +56,7 @@ from shared.ingest.validation import (
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import IDLE_POLL_SECONDS, MAX_ATTEMPTS, JobInterrupted, JobRunner
+from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner
 from shared.jobs.transitions import (
     cancel_batch_items,
     make_waiting_jobs_claimable,
@@ -256,12 +256,7 @@ class BatchWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Run batches until `stop` is set."""
-        poll = ChangePoll(self._catalog)
-        self._runner.run(
-            lambda: self.run_next(stop),
-            stop,
-            lambda seconds: poll.wait(stop, IDLE_POLL_SECONDS, seconds),
-        )
+        self._runner.run_jobs(lambda job: self._run_slice(job, stop), stop)
 
     def run_next(self, stop: threading.Event) -> bool:
         """Run a slice of the next batch; False when there is none."""

@@ -70,7 +70,7 @@ def test_an_error_arrives_as_it_was_raised_with_the_traceback_as_a_note() -> Non
 
 
 def test_a_process_that_dies_is_an_error_that_says_how() -> None:
-    with pytest.raises(ChildKilled, match=r"killed \(SIGKILL\); .* memory"):
+    with pytest.raises(ChildKilled, match=r"code -9; .* memory"):
         run_in_child(kill_itself, on_progress=nothing, check=nothing)
 
 

@@ -149,22 +149,6 @@ def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: 
     assert averages.active().id == generation
 
 
-def test_a_fit_is_the_same_for_its_seed(
-    vlads: Workplace, workplace_of: Callable[[str], Workplace]
-) -> None:
-    fingerprints = []
-    for workplace, seed in (
-        (vlads, 7),
-        (workplace_of("test-tiny-vlad"), 7),
-        (workplace_of("test-tiny-vlad"), 8),
-    ):
-        workplace.upload(*range(PHOTOS))
-        job = workplace.fit(clusters=4, sample=5, seed=seed)
-        assert job.result is not None
-        fingerprints.append(workplace.vocabulary(job.result["vocabulary_id"]).sha256)
-    assert fingerprints[0] == fingerprints[1] != fingerprints[2]
-
-
 def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
     fitted: Workplace,
     workplace_of: Callable[[str], Workplace],

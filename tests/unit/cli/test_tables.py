@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from rich.progress_bar import ProgressBar
 
 from lab.cli.training.commands import _TerminalDisplay
+from services.cli import output
 from services.cli.output import Table, print_message, print_table, progress_bar
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
@@ -131,11 +134,19 @@ def test_tab_separated_cells_hold_no_markup_tabs_or_line_breaks(
     ]
 
 
-def test_progress_leaves_no_trace_where_stderr_is_not_a_terminal(
-    capsys: pytest.CaptureFixture[str],
+def test_progress_is_a_line_from_time_to_time_where_stderr_is_not_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with progress_bar() as progress:
-        progress.add_task("scanning the folder", total=None)
+        bar = progress.add_task("reading a", total=3000)
+        progress.update(bar, completed=1000)
     with _TerminalDisplay():
         pass
-    assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == "", "a short command prints none"
+    monkeypatch.setattr(output, "LINE_SECONDS", 0)
+    progress.update(bar, completed=1000)
+    progress.advance(bar)
+    assert re.findall(r"reading a: (.*), \d+ s\n", capsys.readouterr().err) == [
+        "1,000 of 3,000",
+        "1,001 of 3,000",
+    ]
