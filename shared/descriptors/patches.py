@@ -1,16 +1,15 @@
-"""Training samples for vocabularies: random patches of each photo, in an object store.
+"""Training samples for vocabularies: random patches of each photo, in a temporary file.
 
-The patches are stored as objects and read in ranges, so memory does not depend on their number.
-`fit_vocabulary` fits a vocabulary to local photos, with the patches in a temporary folder.
+They are read in ranges, so memory does not depend on their number. `fit_vocabulary` fits a
+vocabulary to photos.
 """
 
 from __future__ import annotations
 
+import os
 import tempfile
-from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from itertools import accumulate
-from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
@@ -20,14 +19,13 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary_file import VocabularyFile, fit_provenance
 from shared.descriptors.vocabulary_fit import VocabularyFit
 from shared.imaging.preprocessing import Pixels
-from shared.storage import FolderStore, ObjectStore
 
-PATCHES_BYTES = 256_000_000  # of all photos together, in the store
+PATCHES_BYTES = 256_000_000  # of all photos together, in the file
 FLOAT32 = np.dtype("<f4")
 
 
 def max_photos_to_sample(width: int) -> int:
-    """Return how many photos fit the store with one patch each, of `width` numbers."""
+    """Return how many photos fit the file with one patch each, of `width` numbers."""
     return max(1, PATCHES_BYTES // (FLOAT32.itemsize * width))
 
 
@@ -44,17 +42,23 @@ def sample_photos(available: int, sample: int, width: int, seed: int) -> list[in
     return chosen
 
 
-class PatchStore:
-    """Writes patches as objects `PREFIX<first photo>.f32`: float32 rows, little-endian, C order."""
+class PatchFile:
+    """Keeps patches in a temporary file, which ends with the process; a `PointSource`."""
 
-    def __init__(self, store: ObjectStore, prefix: str, width: int) -> None:
+    def __init__(self, width: int) -> None:
         """`width`: the length of a local feature."""
-        self._store = store
-        self._prefix = prefix
+        self._file = tempfile.TemporaryFile(prefix="placewise-fit-")  # noqa: SIM115  (see __exit__)
+        self._patches = 0
         self.width = width
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
     def add(self, features: Iterable[torch.Tensor], first: int, photos: int, seed: int) -> None:
-        """Store a random sample of the patches of a batch of photos.
+        """Append a random sample of the patches of a batch of photos.
 
         Args:
             features: (patches, width) features of each photo of the batch.
@@ -74,48 +78,19 @@ class PatchStore:
         # with non-finite features are rejected when they are described.
         lengths = np.linalg.norm(rows, axis=1)
         rows = rows[np.isfinite(lengths) & (lengths > 0)]
-        self._store.put(
-            f"{self._prefix}{first:08d}.f32", rows.astype(FLOAT32, copy=False).tobytes()
-        )
-
-    def open(self) -> StoredPatches:
-        """Open the patches stored so far, in the order of the photos."""
-        objects = sorted((info.key, info.size_bytes) for info in self._store.list(self._prefix))
-        return StoredPatches(self._store, objects, self.width)
-
-
-class StoredPatches:
-    """Reads row ranges of the stored patches as if they were one (n, width) array."""
-
-    def __init__(self, store: ObjectStore, objects: list[tuple[str, int]], width: int) -> None:
-        """`objects`: the key and the size in bytes of each."""
-        self._store = store
-        self._keys = [key for key, _ in objects]
-        self._row_bytes = FLOAT32.itemsize * width
-        rows = [size // self._row_bytes for _, size in objects]
-        self._begins = [0, *accumulate(rows)]
-        self.width = width
+        self._file.seek(0, os.SEEK_END)
+        self._file.write(rows.astype(FLOAT32, copy=False).tobytes())
+        self._patches += len(rows)
 
     def __len__(self) -> int:
-        return self._begins[-1]
+        return self._patches
 
     def read(self, begin: int, end: int) -> torch.Tensor:
-        """Return rows [begin, end), float32 on the CPU. Raises Unavailable as the store does."""
-        parts = []
-        at = bisect_right(self._begins, begin) - 1
-        while begin < end:
-            until = min(end, self._begins[at + 1])
-            if until > begin:
-                start = (begin - self._begins[at]) * self._row_bytes
-                data = self._store.read_range(
-                    self._keys[at], start, (until - begin) * self._row_bytes
-                )
-                parts.append(np.frombuffer(data, FLOAT32).reshape(-1, self.width))
-            begin, at = until, at + 1
-        return torch.from_numpy(np.concatenate(parts).astype(np.float32, copy=False))
-
-
-PATCHES_FOLDER_PREFIX = "patches-"
+        """Return the patches [begin, end), float32 on the CPU."""
+        row_bytes = FLOAT32.itemsize * self.width
+        self._file.seek(begin * row_bytes)
+        rows = np.frombuffer(self._file.read((end - begin) * row_bytes), FLOAT32)
+        return torch.from_numpy(rows.reshape(-1, self.width).astype(np.float32))
 
 
 def fit_vocabulary(
@@ -142,16 +117,13 @@ def fit_vocabulary(
     Raises:
         Unprocessable: `no_photos` if `batches` is empty.
     """
-    with tempfile.TemporaryDirectory(prefix="placewise-fit-") as folder:
-        store = PatchStore(
-            FolderStore(Path(folder)), PATCHES_FOLDER_PREFIX, extractor.backbone.width
-        )
+    with PatchFile(extractor.backbone.width) as patches:
         described = 0
         for batch in batches:
-            store.add(extractor.local_features(batch), described, photos, seed)
+            patches.add(extractor.local_features(batch), described, photos, seed)
             described += len(batch)
             on_progress("describing", described, photos)
-        fit = VocabularyFit(store.open(), clusters, seed)
+        fit = VocabularyFit(patches, clusters, seed)
         while not fit.done:
             fit.step()
             on_progress("clustering", *fit.progress)

@@ -1,21 +1,16 @@
-"""The patches that a fit learns from: some of each photo, in objects, read piece by piece."""
+"""The patches that a vocabulary is fitted on: some of each photo, in a file, read in ranges."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 import torch
 
 from shared.descriptors import patches as patches_module
-from shared.descriptors.patches import (
-    PatchStore,
-    StoredPatches,
-    max_photos_to_sample,
-    sample_photos,
-)
-from shared.storage import FolderStore
+from shared.descriptors.patches import PatchFile, max_photos_to_sample, sample_photos
 from tests.unit.descriptors.vocabularies.points import unit_points
 
 WIDTH = 8
@@ -24,22 +19,20 @@ PATCHES = 6
 
 
 @pytest.fixture
-def stored_patches(
-    store: FolderStore, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., StoredPatches]:
-    """Stores photos in batches, each photo with a share of `bytes_in_all`; then opens them."""
-    prefixes = iter(f"work/{number}/patches-" for number in range(100))
+def stored_patches(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., PatchFile]]:
+    """Stores photos in batches, each photo with a share of `bytes_in_all`."""
+    with contextlib.ExitStack() as stack:
 
-    def keep(
-        photos: list[torch.Tensor], batch: int, seed: int = 0, bytes_in_all: int = 1_000_000
-    ) -> StoredPatches:
-        monkeypatch.setattr(patches_module, "PATCHES_BYTES", bytes_in_all)
-        found = PatchStore(store, next(prefixes), WIDTH)
-        for first in range(0, len(photos), batch):
-            found.add(photos[first : first + batch], first, len(photos), seed)
-        return found.open()
+        def keep(
+            photos: list[torch.Tensor], batch: int, seed: int = 0, bytes_in_all: int = 1_000_000
+        ) -> PatchFile:
+            monkeypatch.setattr(patches_module, "PATCHES_BYTES", bytes_in_all)
+            found = stack.enter_context(PatchFile(WIDTH))
+            for first in range(0, len(photos), batch):
+                found.add(photos[first : first + batch], first, len(photos), seed)
+            return found
 
-    return keep
+        yield keep
 
 
 def photos() -> list[torch.Tensor]:
@@ -51,14 +44,14 @@ def rows(points: torch.Tensor) -> set[tuple[float, ...]]:
 
 
 def test_all_patches_are_kept_where_there_is_room(
-    stored_patches: Callable[..., StoredPatches],
+    stored_patches: Callable[..., PatchFile],
 ) -> None:
     found = stored_patches(photos(), batch=4)
     assert len(found) == PHOTOS * PATCHES
     assert rows(found.read(0, len(found))) == rows(torch.cat(photos()))
 
 
-def test_any_piece_can_be_read(stored_patches: Callable[..., StoredPatches]) -> None:
+def test_any_piece_can_be_read(stored_patches: Callable[..., PatchFile]) -> None:
     found = stored_patches(photos(), batch=3)
     whole = found.read(0, len(found))
     for begin in range(len(found)):
@@ -66,7 +59,7 @@ def test_any_piece_can_be_read(stored_patches: Callable[..., StoredPatches]) -> 
             assert torch.equal(found.read(begin, end), whole[begin:end])
 
 
-def test_photos_share_the_room_equally(stored_patches: Callable[..., StoredPatches]) -> None:
+def test_photos_share_the_room_equally(stored_patches: Callable[..., PatchFile]) -> None:
     found = stored_patches(photos(), batch=4, bytes_in_all=PHOTOS * 2 * WIDTH * 4)
     assert len(found) == PHOTOS * 2
     for number, photo in enumerate(photos()):
@@ -74,7 +67,7 @@ def test_photos_share_the_room_equally(stored_patches: Callable[..., StoredPatch
 
 
 def test_what_is_kept_depends_on_the_seed_and_not_on_the_batches(
-    stored_patches: Callable[..., StoredPatches],
+    stored_patches: Callable[..., PatchFile],
 ) -> None:
     little = PHOTOS * 3 * WIDTH * 4
     first = stored_patches(photos(), batch=1, bytes_in_all=little)
@@ -85,7 +78,7 @@ def test_what_is_kept_depends_on_the_seed_and_not_on_the_batches(
 
 
 def test_patches_that_no_centre_can_describe_are_left_out(
-    stored_patches: Callable[..., StoredPatches],
+    stored_patches: Callable[..., PatchFile],
 ) -> None:
     flat, odd, *good = photos()[:4]
     odd[2], odd[3] = torch.nan, torch.inf
@@ -95,7 +88,7 @@ def test_patches_that_no_centre_can_describe_are_left_out(
 
 
 def test_photos_of_different_sizes_are_kept_together(
-    stored_patches: Callable[..., StoredPatches],
+    stored_patches: Callable[..., PatchFile],
 ) -> None:
     found = stored_patches([unit_points(1, 3, WIDTH), unit_points(2, 5, WIDTH)], batch=2)
     assert len(found) == 8
