@@ -15,7 +15,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
 HEAD = """# Every call
 
 Generated from the server's OpenAPI description (`/openapi.json`) by `make pages`. For what all
-calls have in common, see [the API in short](api.md).
+calls have in common, see [the API](api.md).
 """
 
 

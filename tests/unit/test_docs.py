@@ -1,4 +1,4 @@
-"""The documentation: every call stands in it, and every link leads somewhere."""
+"""The documentation: generated pages are up to date, and every link leads somewhere."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from tools.make_api_page import openapi_description
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "lab/benchmarks/RESULTS.md"])
-# What the API page says in short: `/jobs/{id}/events`, `/retry`.
-SHORT = (ROOT / "docs" / "api.md").read_text()
 
 
 def anchors(text: str) -> set[str]:
@@ -43,16 +41,6 @@ def test_every_call_is_described_in_a_sentence() -> None:
     for path, methods in openapi_description()["paths"].items():
         for method, call in methods.items():
             assert call.get("description"), f"{method} {path}"
-
-
-def test_every_call_stands_in_the_short_page() -> None:
-    """By the last word of its path that is no parameter."""
-    missing = []
-    for path in openapi_description()["paths"]:
-        words = [word for word in path.split("/") if word and not word.startswith("{")]
-        if words and f"/{words[-1]}" not in SHORT:
-            missing.append(path)
-    assert missing == []
 
 
 @pytest.mark.parametrize("found", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
