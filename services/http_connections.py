@@ -74,6 +74,8 @@ class ConnectionLimits:
     per_address: int
     head_seconds: float = HEAD_SECONDS
     body_bytes_per_second: int = BODY_BYTES_PER_SECOND
+    body_window_seconds: float = BODY_WINDOW_SECONDS
+    stalled_seconds: float = STALLED_SECONDS
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
     """Networks whose connections are not limited per address."""
 
@@ -286,7 +288,7 @@ class LimitedProtocol(H11Protocol):
         if unsent == 0 or unsent < self._unsent_bytes:
             self._unsent_since = now
         self._unsent_bytes = unsent
-        if unsent and now - self._unsent_since > STALLED_SECONDS:
+        if unsent and now - self._unsent_since > limits.stalled_seconds:
             self._connections.closed[Reason.SLOW_READER] += 1
             self.close()
         elif self._head_since is not None and now - self._head_since > limits.head_seconds:
@@ -301,7 +303,10 @@ class LimitedProtocol(H11Protocol):
                 )
             else:
                 self.close()
-        elif self._window_since is not None and now - self._window_since >= BODY_WINDOW_SECONDS:
+        elif (
+            self._window_since is not None
+            and now - self._window_since >= limits.body_window_seconds
+        ):
             min_bytes = limits.body_bytes_per_second * (now - self._window_since)
             server_paused = self._paused or self.cycle.waiting_for_100_continue
             if self._window_bytes < min_bytes and not server_paused:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
 from functools import partial
-from typing import Annotated
+from typing import Annotated, NoReturn
 from uuid import UUID
 
 from fastapi import Depends, Request
@@ -71,13 +71,10 @@ class _ConcurrencyLimit:
         """
         callers = _callers(request)
         if self.count >= self._total:
-            raise self._refusal(f"The server is already handling {self._total} {self._what}.")
+            self._refuse(f"{self._total} {self._what}")
         for caller in callers:
             if self._count_by_caller[caller] >= self._per_caller:
-                raise self._refusal(
-                    f"The server is already handling {self._per_caller} {self._what} of this "
-                    f"{caller.partition(' ')[0]}."
-                )
+                self._refuse(f"{self._per_caller} {self._what} of this {caller.partition(' ')[0]}")
         self.count += 1
         self._count_by_caller.update(callers)
         try:
@@ -87,10 +84,10 @@ class _ConcurrencyLimit:
             self._count_by_caller.subtract(callers)
             self._count_by_caller += Counter()  # removes callers whose count is 0
 
-    def _refusal(self, detail: str) -> TooManyRequests:
-        return TooManyRequests(
+    def _refuse(self, handled: str) -> NoReturn:
+        raise TooManyRequests(
             self._code,
-            f"{detail} Try again in a moment.",
+            f"The server is already handling {handled}. Try again in a moment.",
             retry_after_seconds=self._retry_after_seconds,
         )
 
@@ -158,20 +155,11 @@ class AdmissionControl:
             StorageFull: `disk_full`.
         """
         self.disk.check()
-        depth, settings = self.queue_depth(), self._settings
+        depth, limit = self.queue_depth(), self._settings.max_queued_jobs
         with self._admitted_lock:
-            for suffix, queued, limit in (
-                ("", depth.jobs + self._admitted_jobs(), settings.max_queued_jobs),
-                (
-                    f" of the map {map_name!r}",
-                    depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
-                    _half(settings.max_queued_jobs),
-                ),
-            ):
-                if queued >= limit:
-                    raise _queue_full_error(
-                        f"jobs{suffix}", queued, limit, depth.finished_per_second
-                    )
+            of_map = depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name]
+            _check_queue("jobs", depth.jobs + self._admitted_jobs(), limit, depth)
+            _check_queue(f"jobs of the map {map_name!r}", of_map, _half(limit), depth)
             self._admitted[map_name] += 1
 
     def may_block(self) -> bool:
@@ -184,11 +172,10 @@ class AdmissionControl:
         Raises:
             TooManyRequests: `queue_full`.
         """
-        depth, limit = self.queue_depth(), self._settings.max_queued_jobs
+        depth = self.queue_depth()
         with self._admitted_lock:
             queued = depth.jobs + self._admitted_jobs()
-        if queued >= limit:
-            raise _queue_full_error("jobs", queued, limit, depth.finished_per_second)
+        _check_queue("jobs", queued, self._settings.max_queued_jobs, depth)
 
     def _admitted_jobs(self) -> int:
         """Number of jobs admitted since the last poll; the caller holds the lock."""
@@ -207,9 +194,7 @@ class AdmissionControl:
         self.disk.check(QUERY_SHARE)
         depth, limit = self.queue_depth(), self._settings.max_queued_queries
         with self._admitted_lock:
-            queued = depth.queries + self._admitted[None]
-            if queued >= limit:
-                raise _queue_full_error("query photos", queued, limit, depth.finished_per_second)
+            _check_queue("query photos", depth.queries + self._admitted[None], limit, depth)
             self._admitted[None] += 1
 
     def admit_upload(self, kind: UploadKind, request: Request) -> AbstractContextManager[None]:
@@ -306,10 +291,12 @@ CHECK_DISK = Depends(_check_disk)
 """For requests that store rows, but queue no job: StorageFull (`disk_full`)."""
 
 
-def _queue_full_error(what: str, queued: int, limit: int, per_second: float) -> TooManyRequests:
-    excess = queued - RETRY_TARGET_SHARE * limit
+def _check_queue(what: str, queued: int, limit: int, depth: QueueDepth) -> None:
+    if queued < limit:
+        return
+    excess, per_second = queued - RETRY_TARGET_SHARE * limit, depth.finished_per_second
     seconds = excess / per_second if per_second > 0 else MAX_RETRY_SECONDS
-    return TooManyRequests(
+    raise TooManyRequests(
         "queue_full",
         f"The queue is full: {queued} {what} are waiting, the limit is {limit}. Retry after the "
         "seconds in Retry-After. More extractors process the queue faster.",

@@ -7,6 +7,7 @@ import re
 
 from fastapi import APIRouter, FastAPI
 from fastapi.middleware.cors import CORSMiddleware
+from fastapi.routing import APIRoute
 
 from services.gateway import metrics
 from services.gateway.admission import AdmissionControl
@@ -62,9 +63,26 @@ CORS_EXPOSED_HEADERS = (
     "X-Request-ID",
 )
 
-# Routes that parse a multipart body as it arrives, and limit it.
-FORM_PATHS = re.compile(
-    rf"{API_PREFIX}/(upload|upload/batch|similarity|models|vocabularies/import|tracks/[^/]+/frames)"
+
+# In the order of the API's description.
+RESOURCES = (
+    maps,
+    uploads,
+    batches,
+    presigned_uploads,
+    jobs,
+    similarity,
+    tracks,
+    photos,
+    positions,
+    model_changes,
+    models,
+    evaluations,
+    export,
+    stats,
+    keys,
+    webhooks,
+    health,
 )
 
 
@@ -87,7 +105,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     # Starlette runs the middleware that is added last first.
     app.add_middleware(
         BodySizeLimitMiddleware,
-        form_paths=FORM_PATHS,
+        form_paths=form_paths(),
         exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
         limits={f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES},
     )
@@ -122,25 +140,7 @@ def _create_router() -> APIRouter:
     first call, in a tenth of a second for all of them.
     """
     router = APIRouter(responses=PROBLEM_RESPONSES)
-    for module in (
-        maps,
-        uploads,
-        batches,
-        presigned_uploads,
-        jobs,
-        similarity,
-        tracks,
-        photos,
-        positions,
-        model_changes,
-        models,
-        evaluations,
-        export,
-        stats,
-        keys,
-        webhooks,
-        health,
-    ):
+    for module in RESOURCES:
         check_declared_scopes(module.router)
         router.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)
     router.include_router(health.probe_router)
@@ -148,3 +148,14 @@ def _create_router() -> APIRouter:
         metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ, ALL_MAPS]
     )
     return router
+
+
+def form_paths() -> re.Pattern[str]:
+    """Match the paths of the routes that parse a multipart body as it arrives, and limit it."""
+    forms = [
+        API_PREFIX + re.sub(r"\{\w+\}", "[^/]+", route.path)
+        for module in RESOURCES
+        for route in module.router.routes
+        if isinstance(route, APIRoute) and "multipart/form-data" in str(route.openapi_extra)
+    ]
+    return re.compile("|".join(forms))

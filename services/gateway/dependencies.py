@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 import math
 import re
+import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, TypeVar
 from uuid import UUID
 
+from cachetools import LRUCache
 from fastapi import Depends, Query, Request
 from prometheus_client import CollectorRegistry, Counter
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -22,13 +24,13 @@ from sqlalchemy import select
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Authenticator, get_caller
-from services.gateway.similarity.neighbours import NeighbourCache
 from services.http_connections import ConnectionLimits, Connections
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.maps import DEFAULT_MAP, get_map
 from shared.config.settings import Settings
 from shared.errors import NotFound, PlacewiseError, invalid_field_error
+from shared.evaluation.places.evidence import RankedPhoto
 from shared.jobs import Job, Wakeups
 from shared.search_api.protocol import SearchBackend
 from shared.storage import OwnedStore
@@ -40,6 +42,7 @@ POLL_COST_DIVISOR = 10  # polling takes at most one tenth of the time: slow poll
 MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
+CACHED_RANKINGS = 1000  # of about 50 photos: 20 MB
 
 # The columns that show a job's progress. Only these are polled: it happens often, for many jobs.
 WATCHED_COLUMNS = (
@@ -78,8 +81,11 @@ class JobNotifier:
     Must be used from one event loop. Polls only while requests are waiting.
     """
 
-    def __init__(self, catalog: Catalog) -> None:
+    def __init__(
+        self, catalog: Catalog, shutdown_wait_seconds: float = SHUTDOWN_WAIT_SECONDS
+    ) -> None:
         self._catalog = catalog
+        self._shutdown_wait_seconds = shutdown_wait_seconds
         self._waiters: set[_Waiter] = set()
         self._poll_task: asyncio.Task[None] | None = None
         self._next_change_poll = 0.0
@@ -89,9 +95,9 @@ class JobNotifier:
         """Release the waiting requests before the server stops.
 
         Those that wait for a change are released now, those that wait for the end of a job after
-        SHUTDOWN_WAIT_SECONDS at the latest.
+        `shutdown_wait_seconds` at the latest.
         """
-        self._shutdown_deadline = time.monotonic() + SHUTDOWN_WAIT_SECONDS
+        self._shutdown_deadline = time.monotonic() + self._shutdown_wait_seconds
         _release(waiter for waiter in self._waiters if waiter.last_seen is not None)
 
     async def wait_until_finished(self, job_id: UUID, seconds: float) -> None:
@@ -207,12 +213,7 @@ API_PREFIX = "/api/v1"
 NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL's text type can't store NUL
 
 
-class _HasId(Protocol):
-    @property
-    def id(self) -> Any: ...
-
-
-Row = TypeVar("Row", bound=_HasId)
+Row = TypeVar("Row")
 
 
 @dataclass(eq=False, slots=True)
@@ -230,7 +231,11 @@ class GatewayContext:
     started_monotonic: float = field(default_factory=time.monotonic)
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
-    neighbours: NeighbourCache = field(default_factory=NeighbourCache)
+    neighbours: LRUCache[Hashable, Sequence[RankedPhoto]] = field(
+        default_factory=lambda: LRUCache(CACHED_RANKINGS)
+    )
+    """Rankings by stored photos, with the key of all that they depend on."""
+    neighbours_lock: threading.Lock = field(default_factory=threading.Lock)
     lan_url: str | None = None
     """URL of this server for other devices of its network, if it is known."""
     track_frames: Counter = field(init=False)
@@ -297,10 +302,12 @@ class PageParams(BaseModel):
         except ValueError:
             raise invalid_cursor_error() from None
 
-    def split(self, rows: list[Row]) -> tuple[list[Row], str | None]:
+    def split(
+        self, rows: list[Row], cursor_of: Callable[[Any], object] = lambda row: row.id
+    ) -> tuple[list[Row], str | None]:
         """Split up to `limit + 1` rows into the page and the cursor of the next one, if any."""
         page = rows[: self.limit]
-        return page, str(page[-1].id) if len(rows) > self.limit else None
+        return page, str(cursor_of(page[-1])) if len(rows) > self.limit else None
 
 
 class MapPageParams(MapParams, PageParams):

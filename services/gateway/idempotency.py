@@ -11,8 +11,7 @@ dependency, and by storing its response in the transaction that executes the req
 and `idempotent.accept_job(session, job)` stores and returns the 202 of a job.
 
 The content of a multipart form is known only after it has been received: its routes use
-`IdempotentFormDep`, and `await idempotent.claim_form(gateway.store, received)` after
-`store_form_file`, or `claim_received` in a worker thread.
+`IdempotentFormDep`, and execute the request in `with idempotent.claim_form(upload):`.
 
 Stored are responses of executed requests, and 4xx responses that a repetition would get again;
 never a 5xx, nor responses that depend on the caller and the time (401, 403, 408, 429). A request
@@ -36,7 +35,7 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import get_caller
 from services.gateway.dependencies import GatewayContext, GatewayDep, get_map_name
-from services.gateway.schemas import JobAcceptedResponse, accepted_headers, to_job_accepted
+from services.gateway.schemas import JobAcceptedResponse
 from shared.catalog.idempotency import (
     RequestIdentity,
     StoredResponse,
@@ -101,27 +100,19 @@ class IdempotentRequest:
         self._gateway = gateway
         self._request = request
         self._response = response
-        self._key = key
+        self.key = key
         self._token: UUID | None = None
         self._response_stored = False
 
-    async def claim_form(
-        self, store: ObjectStore, received: StoredUpload, *, life_seconds: float | None = None
-    ) -> None:
-        """As `claim_received`, from the event loop."""
-        if self._key is not None:
-            await run_in_threadpool(self.claim_received, store, received, life_seconds)
+    @contextlib.contextmanager
+    def claim_form(self, upload: StoredUpload, life_seconds: float | None = None) -> Iterator[None]:
+        """Claim the key for the content of a form; the block executes the request.
 
-    def claim_received(
-        self, store: ObjectStore, received: StoredUpload, life_seconds: float | None = None
-    ) -> None:
-        """Claim the key for the content of a form.
-
-        Deletes the received file from `store` if the request is refused or was already executed.
+        Deletes the received file if the request is refused or was already executed.
         """
-        content = [received.filename, received.sha256, received.fields]
-        with delete_if_refused(store, received.key):
-            self.claim_key(content, life_seconds)
+        with delete_if_refused(self._gateway.store, upload.key):
+            self.claim_key([upload.filename, upload.sha256, upload.fields], life_seconds)
+            yield
 
     def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
         """Claim the key: from here on only this request is executed under it.
@@ -134,14 +125,14 @@ class IdempotentRequest:
             IdempotentReplay: The request was already executed.
             PlacewiseError: Those of `claim_idempotency_key`.
         """
-        if self._key is None:
+        if self.key is None:
             return
         request = self._request
         params = [item for item in request.query_params.multi_items() if item[0] != "map"]
         fingerprinted = [request.url.path, sorted(params), content]
         identity = RequestIdentity(
             scope=_key_scope(request),
-            key=self._key,
+            key=self.key,
             call=f"{request.method} {request.scope['route'].path_format}",
             fingerprint=hashlib.sha256(
                 json.dumps(fingerprinted, sort_keys=True).encode()
@@ -174,14 +165,14 @@ class IdempotentRequest:
         """Add a job to the transaction, and store and return its 202 response."""
         session.add(job)
         session.flush()
-        accepted = to_job_accepted(job, get_map_name(self._request))
-        self.store_response(session, 202, accepted, accepted_headers(accepted.status_url))
+        accepted = JobAcceptedResponse.of(job, get_map_name(self._request))
+        self.store_response(session, 202, accepted, accepted.headers)
         return accepted
 
     def accept_job(self, session: Session, job: Job) -> JobAcceptedResponse:
         """As `store_job_response`, and sets the headers of this request's response."""
         accepted = self.store_job_response(session, job)
-        self._response.headers.update(accepted_headers(accepted.status_url))
+        self._response.headers.update(accepted.headers)
         return accepted
 
     def replace_response(
@@ -208,19 +199,11 @@ class IdempotentRequest:
             store_response(session, self._token, stored)
             self._response_stored = True
 
-    async def claim_body(self, body: bytes) -> None:
-        """Claim the key for a request with a JSON body or none."""
-        if self._key is not None:
-            await run_in_threadpool(self.claim_key, hashlib.sha256(body).hexdigest())
-
-    async def release_key(self) -> None:
+    def release_key(self) -> None:
         """Release the key if no response was stored under it."""
         if self._token is not None and not self._response_stored:
-            await run_in_threadpool(self._release, self._token)
-
-    def _release(self, token: UUID) -> None:
-        with self._gateway.catalog.write() as session:
-            release_idempotency_key(session, token)
+            with self._gateway.catalog.write() as session:
+                release_idempotency_key(session, self._token)
 
 
 @contextlib.contextmanager
@@ -244,17 +227,21 @@ async def _idempotent_form_request(
     try:
         yield idempotent
     except PlacewiseError as error:
-        await run_in_threadpool(idempotent.store_refusal, error)
+        if key is not None:
+            await run_in_threadpool(idempotent.store_refusal, error)
         raise
     finally:
-        await idempotent.release_key()
+        if key is not None:
+            await run_in_threadpool(idempotent.release_key)
 
 
 async def _idempotent_request(
     request: Request, idempotent: Annotated[IdempotentRequest, Depends(_idempotent_form_request)]
 ) -> IdempotentRequest:
     """Dependency for requests with a JSON body or none; claims the key."""
-    await idempotent.claim_body(await request.body())
+    if idempotent.key is not None:
+        content = hashlib.sha256(await request.body()).hexdigest()
+        await run_in_threadpool(idempotent.claim_key, content)
     return idempotent
 
 

@@ -7,7 +7,6 @@ read from the catalog and are therefore the same on every gateway.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from fastapi import APIRouter, Request, Response
@@ -21,7 +20,6 @@ from sqlalchemy.orm import Session
 
 from services.gateway.admission import AdmissionControl, UploadKind
 from services.gateway.dependencies import GatewayContext
-from services.http_connections import Connections
 from services.request_log import RequestRecord
 from shared.catalog.database.base import db_now
 from shared.catalog.jobs import Job, JobState
@@ -33,23 +31,14 @@ QUEUE_POLL_SECONDS = 5.0
 COUNTED_STATES = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
 
 
-@dataclass(frozen=True, slots=True)
-class _JobCount:
-    """Number of jobs of one kind in one state, and the age of the oldest.
-
-    The state `waiting` is added for queued jobs that no worker may claim yet.
-    """
-
-    kind: str
-    state: str
-    count: int
-    oldest_seconds: float
-
-
-def count_jobs(session: Session) -> list[_JobCount]:
+def count_jobs(session: Session) -> Sequence[tuple[str, str, int, float]]:
     """Count the jobs of all maps by kind and state.
 
     Succeeded jobs, by far the most, are excluded, so that the index on (map, state) is used.
+
+    Returns:
+        Kind, state, number of jobs and age of the oldest in seconds. The state `waiting` is added
+        for queued jobs that no worker may claim yet.
     """
     state = case((Job.waiting_for.is_not(None), literal_column("'waiting'")), else_=Job.state)
     rows = session.execute(
@@ -59,7 +48,7 @@ def count_jobs(session: Session) -> list[_JobCount]:
         .order_by(Job.kind, state)
     )
     return [
-        _JobCount(kind, counted_state, count, max(0.0, (now - oldest).total_seconds()))
+        (kind, counted_state, count, max(0.0, (now - oldest).total_seconds()))
         for kind, counted_state, count, oldest, now in rows
     ]
 
@@ -98,7 +87,6 @@ class GatewayMetrics:
             registry=registry,
         )
         registry.register(_LoadCollector(gateway, admission))
-        registry.register(_ConnectionCollector(gateway.connections, admission))
 
     def on_request_start(self) -> None:
         """Count a request in flight."""
@@ -115,14 +103,15 @@ class GatewayMetrics:
 
 
 class _LoadCollector(Collector):
-    """Collects the job queue, the uploads of this gateway and the free disk space per scrape."""
+    """Collects the job queue, uploads, connections and the free disk space at each scrape."""
 
     def __init__(self, gateway: GatewayContext, admission: AdmissionControl) -> None:
         self._catalog = gateway.catalog
-        self._job_counts = PolledValue(self._count_jobs, QUEUE_POLL_SECONDS)
+        self._connections = gateway.connections
         self._admission = admission
+        self._job_counts = PolledValue(self._count_jobs, QUEUE_POLL_SECONDS)
 
-    def _count_jobs(self) -> Sequence[_JobCount] | None:
+    def _count_jobs(self) -> Sequence[tuple[str, str, int, float]] | None:
         """Count the jobs; None while the catalog is unreachable."""
         try:
             with self._catalog.read() as session:
@@ -134,61 +123,13 @@ class _LoadCollector(Collector):
         return []  # otherwise registering would call `collect` and query the catalog
 
     def collect(self) -> Iterable[Metric]:
-        receiving = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_receiving", "Files being received.", labels=["kind"]
-        )
+        receiving = _gauge("receiving", "Files being received.", ["kind"])
         for kind in UploadKind:
             receiving.add_metric([kind.name.lower()], self._admission.active_uploads(kind))
         yield receiving
-        free = self._admission.disk.free_bytes()
-        if free is not None:
-            yield GaugeMetricFamily(
-                f"{METRIC_PREFIX}_disk_free_bytes",
-                "Free bytes of the local disks that Placewise writes to.",
-                free,
-            )
-        queue = self._job_counts.get()
-        yield GaugeMetricFamily(
-            f"{METRIC_PREFIX}_catalog_up",
-            "1 if the catalog is reachable.",
-            float(queue is not None),
-        )
-        if queue is None:
-            return
-        jobs = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_jobs",
-            "Unfinished and failed jobs. State `waiting`: for a vocabulary, descriptors, search or "
-            "disk space.",
-            labels=["kind", "state"],
-        )
-        oldest = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_oldest_job_seconds",
-            "Age of the oldest job of this kind and state, in seconds.",
-            labels=["kind", "state"],
-        )
-        for group in queue:
-            jobs.add_metric([group.kind, group.state], group.count)
-            oldest.add_metric([group.kind, group.state], group.oldest_seconds)
-        yield jobs
-        yield oldest
-
-
-class _ConnectionCollector(Collector):
-    """Collects the open connections, the event streams and the closed connections per scrape."""
-
-    def __init__(self, connections: Connections, admission: AdmissionControl) -> None:
-        self._connections = connections
-        self._admission = admission
-
-    def collect(self) -> Iterable[Metric]:
-        yield GaugeMetricFamily(
-            f"{METRIC_PREFIX}_connections", "Open connections.", self._connections.count
-        )
-        yield GaugeMetricFamily(
-            f"{METRIC_PREFIX}_event_streams",
-            "Open event streams.",
-            self._admission.event_streams.count,
-        )
+        yield _gauge("connections", "Open connections.", value=self._connections.count)
+        streams = self._admission.event_streams.count
+        yield _gauge("event_streams", "Open event streams.", value=streams)
         closed = CounterMetricFamily(
             f"{METRIC_PREFIX}_connections_closed",
             "Connections refused or closed because of a limit.",
@@ -197,6 +138,41 @@ class _ConnectionCollector(Collector):
         for reason, count in self._connections.closed.items():
             closed.add_metric([reason], count)
         yield closed
+        if (free_bytes := self._admission.disk.free_bytes()) is not None:
+            yield _gauge(
+                "disk_free_bytes",
+                "Free bytes of the local disks that Placewise writes to.",
+                value=free_bytes,
+            )
+        queue = self._job_counts.get()
+        yield _gauge("catalog_up", "1 if the catalog is reachable.", value=float(queue is not None))
+        if queue is None:
+            return
+        jobs = _gauge(
+            "jobs",
+            "Unfinished and failed jobs. State `waiting`: for a vocabulary, descriptors, search or "
+            "disk space.",
+            ["kind", "state"],
+        )
+        oldest = _gauge(
+            "oldest_job_seconds",
+            "Age of the oldest job of this kind and state, in seconds.",
+            ["kind", "state"],
+        )
+        for job_kind, state, count, oldest_seconds in queue:
+            jobs.add_metric([job_kind, state], count)
+            oldest.add_metric([job_kind, state], oldest_seconds)
+        yield jobs
+        yield oldest
+
+
+def _gauge(
+    name: str,
+    documentation: str,
+    labels: Sequence[str] | None = None,
+    value: float | None = None,
+) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", documentation, value, labels)
 
 
 @router.get("/metrics", operation_id="metrics", response_class=Response)

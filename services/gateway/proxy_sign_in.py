@@ -19,6 +19,8 @@ from shared.config.settings import Settings
 from shared.errors import Unauthorized
 from shared.security.api_keys import Scope, expand_scopes
 
+# Those of oauth2-proxy; any proxy can be configured to send them.
+USER_HEADER, GROUPS_HEADER = "X-Forwarded-User", "X-Forwarded-Groups"
 ANY_GROUP = "*"
 MAX_USER_CHARACTERS = 200
 
@@ -30,8 +32,6 @@ class _ProxySignIn:
     keys: Authenticator
     networks: tuple[IPv4Network | IPv6Network, ...]
     """Networks of the trusted proxies."""
-    user_header: str
-    groups_header: str
     scopes_by_group: dict[str, frozenset[Scope]]
     """Scopes of each group; those of ANY_GROUP belong to every user."""
     trusted_origins: tuple[str, ...] = ()
@@ -47,23 +47,21 @@ class _ProxySignIn:
         """
         if (
             "authorization" in headers
-            or self.user_header not in headers
+            or USER_HEADER not in headers
             or not is_in_networks(peer or "", self.networks)
         ):
             return await self.keys.authenticate(headers, peer)
-        names = headers.getlist(self.user_header)
+        names = headers.getlist(USER_HEADER)
         if len(names) != 1 or not 0 < len(names[0].strip()) <= MAX_USER_CHARACTERS:
             raise Unauthorized(
                 "proxy_user_invalid",
-                f"The proxy's header {self.user_header} must have one name of at most "
+                f"The proxy's header {USER_HEADER} must have one name of at most "
                 f"{MAX_USER_CHARACTERS} characters. Let the proxy replace the header of the "
                 "client.",
             )
         check_same_origin(headers, self.trusted_origins)
         groups = [
-            group.strip()
-            for value in headers.getlist(self.groups_header)
-            for group in value.split(",")
+            group.strip() for value in headers.getlist(GROUPS_HEADER) for group in value.split(",")
         ]
         scopes: set[Scope] = set()
         for group in (*groups, ANY_GROUP):
@@ -81,8 +79,6 @@ def with_proxy_sign_in(keys: Authenticator, settings: Settings) -> Authenticator
     return _ProxySignIn(
         keys,
         tuple(map(ip_network, settings.sign_in_networks)),
-        settings.sign_in_user_header,
-        settings.sign_in_groups_header,
         settings.sign_in_scopes_by_group,
         settings.allowed_origins,
     )

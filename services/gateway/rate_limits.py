@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
 
 from limits import RateLimitItem, RateLimitItemPerDay, RateLimitItemPerMinute
 from limits.errors import StorageError
@@ -31,16 +30,6 @@ log = logging.getLogger(__name__)
 REDIS_TIMEOUT_SECONDS = 0.25  # short: a slow Redis must not delay requests
 REDIS_RETRY_SECONDS = 5.0  # after a failure, before Redis is tried again
 KEY_PREFIX = "placewise:limits"
-
-
-@dataclass(frozen=True, slots=True)
-class RateLimit:
-    """A limit of a key; `name` is the policy name in the RateLimit headers."""
-
-    name: str
-    window: RateLimitItem
-    code: str
-    message: str
 
 
 class RateLimiter:
@@ -66,33 +55,22 @@ class RateLimiter:
         limit = caller.limits.requests_per_minute or self._settings.key_requests_per_minute
         if caller.key_id is None or limit is None:
             return {}
-        quota = RateLimit(
-            "requests",
-            RateLimitItemPerMinute(limit),
-            "too_many_requests",
-            f"This key is limited to {limit} requests per minute.",
-        )
-        return self._hit(caller, quota, 1)
+        message = f"This key is limited to {limit} requests per minute."
+        window = RateLimitItemPerMinute(limit)
+        return self._hit(caller, "requests", window, 1, "too_many_requests", message)
 
-    def count_upload_bytes(self, caller: Caller, size_bytes: int) -> dict[str, str]:
+    def count_upload_bytes(self, caller: Caller, size_bytes: int) -> None:
         """Count bytes that are about to be sent against the daily quota.
-
-        Returns:
-            The RateLimit headers of the response; empty without a quota.
 
         Raises:
             TooManyRequests: `upload_quota_reached`.
         """
         limit = self.daily_upload_bytes(caller)
         if limit is None or not size_bytes:
-            return {}
-        quota = RateLimit(
-            "upload-bytes",
-            RateLimitItemPerDay(limit),
-            "upload_quota_reached",
-            f"This key is limited to {limit} bytes per day; this request has {size_bytes}.",
-        )
-        return self._hit(caller, quota, size_bytes)
+            return
+        message = f"This key is limited to {limit} bytes per day; this request has {size_bytes}."
+        window = RateLimitItemPerDay(limit)
+        self._hit(caller, "upload-bytes", window, size_bytes, "upload_quota_reached", message)
 
     def daily_upload_bytes(self, caller: Caller) -> int | None:
         """Return the daily quota of the caller in bytes; None if it is unlimited."""
@@ -100,13 +78,16 @@ class RateLimiter:
             return None
         return caller.limits.upload_bytes_per_day or self._settings.key_upload_bytes_per_day
 
-    def _hit(self, caller: Caller, quota: RateLimit, cost: int) -> dict[str, str]:
+    def _hit(
+        self, caller: Caller, name: str, window: RateLimitItem, cost: int, code: str, message: str
+    ) -> dict[str, str]:
+        """Count in a window; return the RateLimit headers, or raise `code` beyond the limit."""
         if time.monotonic() < self._redis_retry_at:
             return {}
-        names = (quota.name, str(caller.key_id))
+        names = (name, str(caller.key_id))
         try:
-            allowed = self._counter.hit(quota.window, *names, cost=cost)
-            reset_at, remaining = self._counter.get_window_stats(quota.window, *names)
+            allowed = self._counter.hit(window, *names, cost=cost)
+            reset_at, remaining = self._counter.get_window_stats(window, *names)
         except StorageError as error:
             if not self._redis_retry_at:
                 log.warning(
@@ -118,17 +99,19 @@ class RateLimiter:
             self._redis_retry_at = 0.0
             log.warning("Redis is reachable again: rate limits are on")
         seconds = max(1, math.ceil(reset_at - time.time()))
-        headers = _rate_limit_headers(quota, remaining, seconds)
         if not allowed:
             raise TooManyRequests(
-                quota.code,
-                f"{quota.message} Retry after the seconds in Retry-After, or ask an admin for a "
-                "key with a higher limit.",
+                code,
+                f"{message} Retry after the seconds in Retry-After, or ask an admin for a key with "
+                "a higher limit.",
                 retry_after_seconds=seconds,
-                limit=quota.window.amount,
+                limit=window.amount,
                 remaining=remaining,
             )
-        return headers
+        return {  # draft-ietf-httpapi-ratelimit-headers-10
+            "RateLimit-Policy": f'"{name}";q={window.amount};w={window.get_expiry()}',
+            "RateLimit": f'"{name}";r={remaining};t={seconds}',
+        }
 
 
 class RateLimitMiddleware:
@@ -177,15 +160,6 @@ class RateLimitMiddleware:
                 "This key has a daily upload quota: send the size of the body in Content-Length.",
             )
         return 0
-
-
-def _rate_limit_headers(quota: RateLimit, remaining: int, seconds: int) -> dict[str, str]:
-    """Response headers by draft-ietf-httpapi-ratelimit-headers-10."""
-    window = quota.window.get_expiry()
-    return {
-        "RateLimit-Policy": f'"{quota.name}";q={quota.window.amount};w={window}',
-        "RateLimit": f'"{quota.name}";r={remaining};t={seconds}',
-    }
 
 
 def _open_limit_storage(settings: Settings) -> MemoryStorage | RedisStorage:

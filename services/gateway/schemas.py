@@ -5,21 +5,23 @@ Times are UTC with an offset, ids are UUIDv7, sizes are bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlencode
 from uuid import UUID
 
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import API_PREFIX
-from shared.catalog.generations import Generation, GenerationState, RowType
+from shared.catalog.generations import GenerationState, RowType
 from shared.catalog.jobs import QUERY_JOBS
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
+from shared.search_api.comparison import SimilarityExplanation
 
 
 class RequestModel(BaseModel):
@@ -31,21 +33,32 @@ class RequestModel(BaseModel):
 class ResponseModel(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
+    @classmethod
+    def of_row(cls, row: object, **values: Any) -> Self:
+        """Build the response from `values` and, for the other required fields, from a row.
+
+        The row's attributes are named as the fields, or as their `validation_alias`.
+        """
+        for name, field in cls.model_fields.items():
+            if name not in values and field.is_required():
+                values[name] = getattr(row, str(field.validation_alias or name))
+        return cls(**values)
+
 
 class PhotoResponse(ResponseModel):
     """A stored photo."""
 
-    image_id: UUID
+    image_id: UUID = Field(validation_alias="id")
     image_path: str = Field(description="URL path of the image on this server")
-    original_filename: str
+    original_filename: str = Field(validation_alias="filename")
     relative_path: str | None = Field(
         description="path in the folder or archive that it was uploaded from; null if unknown"
     )
-    upload_time: datetime
-    file_size: int
+    upload_time: datetime = Field(validation_alias="uploaded_at")
+    file_size: int = Field(validation_alias="size_bytes")
     width: int
     height: int
-    metadata: dict[str, Any]
+    metadata: dict[str, Any] = Field(validation_alias="attributes")
     tags: list[str]
     latitude: float | None
     longitude: float | None
@@ -58,30 +71,20 @@ class PhotoResponse(ResponseModel):
     preview_url: str
 
     @classmethod
-    def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
-        """Return the values of the fields for `photo`, for the constructors of subclasses."""
-        image_url = url_in_map(f"/uploads/{photo.id}/image", map_name)
-        return {
-            "image_id": photo.id,
-            "image_path": image_url,
-            "original_filename": photo.filename,
-            "relative_path": photo.relative_path,
-            "upload_time": photo.uploaded_at,
-            "file_size": photo.size_bytes,
-            "width": photo.width,
-            "height": photo.height,
-            "metadata": photo.attributes,
-            "tags": photo.tags,
-            "latitude": photo.latitude,
-            "longitude": photo.longitude,
-            "heading": photo.heading,
-            "captured_at": photo.captured_at,
-            "place": photo.place,
-            "role": photo.role,
-            "image_url": image_url,
-            "thumbnail_url": url_in_map(f"/uploads/{photo.id}/thumbnail", map_name),
-            "preview_url": url_in_map(f"/uploads/{photo.id}/preview", map_name),
-        }
+    def of(cls, photo: Photo, map_name: str, **values: Any) -> Self:
+        """Build the response; `values` are the fields that subclasses add."""
+        image, thumbnail, preview = (
+            url_in_map(f"/uploads/{photo.id}/{name}", map_name)
+            for name in ("image", "thumbnail", "preview")
+        )
+        return cls.of_row(
+            photo,
+            image_path=image,
+            image_url=image,
+            thumbnail_url=thumbnail,
+            preview_url=preview,
+            **values,
+        )
 
 
 class PhotoDetailResponse(PhotoResponse):
@@ -91,27 +94,6 @@ class PhotoDetailResponse(PhotoResponse):
     media_type: str
     sha256: str
     searchable: bool = Field(description="whether the active generation has its descriptor")
-
-
-class ClusterShareResponse(ResponseModel):
-    cluster: int = Field(description="index in the vocabulary of the generation, from 0")
-    share: float = Field(description="its contribution to the similarity")
-
-
-class ExplanationResponse(ResponseModel):
-    """Contributions of clusters and patches to a similarity; they add up to it."""
-
-    clusters: list[ClusterShareResponse] | None = Field(
-        description="clusters that both photos use, largest share first; null without a vocabulary"
-    )
-    rows: int = Field(description="rows of the query's patch grid")
-    columns: int = Field(description="columns of the query's patch grid")
-    overlay: str = Field(
-        description="data URI of a PNG with one pixel per patch of the query: orange patches "
-        "raise the similarity, violet ones lower it, transparent ones do neither. Scale it to the "
-        "query photo without interpolation"
-    )
-    full_share: float = Field(description="the share at which a patch is drawn fully opaque")
 
 
 class SimilarPhotoResponse(PhotoResponse):
@@ -131,7 +113,7 @@ class SimilarPhotoResponse(PhotoResponse):
         description="probability that the photo shows the query's place, at the finest of the "
         "estimate's `levels`; null without levels, and for photos without a place",
     )
-    explanation: ExplanationResponse | None = Field(
+    explanation: SimilarityExplanation | None = Field(
         None, description="with `explain=true`: contributions of clusters and patches"
     )
 
@@ -270,9 +252,9 @@ class MetadataSearchResponse(ResponseModel):
 
 
 class JobProgress(ResponseModel):
-    done: int
-    total: int
-    failed: int
+    done: int = Field(validation_alias="progress_done")
+    total: int = Field(validation_alias="progress_total")
+    failed: int = Field(validation_alias="progress_failed")
 
 
 JOB_LABELS = {
@@ -292,7 +274,7 @@ JOB_LABELS = {
 
 
 class JobResponse(ResponseModel):
-    job_id: UUID
+    job_id: UUID = Field(validation_alias="id")
     kind: JobKind
     label: str = Field(description="the kind in plain words, such as `Improving the map`")
     state: JobState
@@ -309,7 +291,7 @@ class JobResponse(ResponseModel):
     )
     progress: JobProgress
     attempts: int
-    file_id: UUID | None
+    file_id: UUID | None = Field(validation_alias="photo_id")
     result: dict[str, Any] | None
     error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
     created_at: datetime
@@ -324,27 +306,13 @@ class JobResponse(ResponseModel):
     @classmethod
     def of(cls, job: Job, map_name: str) -> JobResponse:
         is_query = job.kind in QUERY_JOBS
-        return cls(
-            job_id=job.id,
-            kind=JobKind(job.kind),
+        return cls.of_row(
+            job,
             label=JOB_LABELS[JobKind(job.kind)],
-            state=JobState(job.state),
-            stage=job.stage,
-            waiting_for=job.waiting_for,
-            awaited=job.awaited,
-            progress=JobProgress(
-                done=job.progress_done, total=job.progress_total, failed=job.progress_failed
-            ),
-            attempts=job.attempts,
-            file_id=job.photo_id,
+            progress=JobProgress.model_validate(job),
             result=None if is_query else job.result,
-            error=job.error,
-            created_at=job.created_at,
-            started_at=job.started_at,
-            finished_at=job.finished_at,
             status_url=job_url(job.id, map_name),
             result_url=job_url(job.id, map_name, "/result") if is_query else None,
-            request_id=job.request_id,
         )
 
 
@@ -360,6 +328,27 @@ class JobAcceptedResponse(ResponseModel):
     status: JobState
     status_url: str
     result_url: str | None = None
+
+    @classmethod
+    def of(cls, job: Job, map_name: str, **values: Any) -> Self:
+        """Build the response; `values` are the fields that subclasses add."""
+        result_url = job_url(job.id, map_name, "/result") if job.kind in QUERY_JOBS else None
+        return cls(
+            job_id=job.id,
+            status=JobState(job.state),
+            status_url=job_url(job.id, map_name),
+            result_url=result_url,
+            **values,
+        )
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Headers of the response."""
+        return accepted_headers(self.status_url)
+
+    def to_http(self, headers: Mapping[str, str] | None = None) -> JSONResponse:
+        """Return the HTTP response, for routes whose response model is that of another status."""
+        return JSONResponse(self.model_dump(mode="json"), 202, {**(headers or {}), **self.headers})
 
 
 class UploadResponse(ResponseModel):
@@ -395,35 +384,21 @@ class VocabularyResponse(ResponseModel):
 
 
 class GenerationResponse(ResponseModel):
-    generation_id: UUID
+    generation_id: UUID = Field(validation_alias="id")
     state: GenerationState
     extractor: str
     dimension: int = Field(description="of its descriptors, after PCA if there is one")
     pca_from: int | None = Field(description="dimension before PCA; null without PCA")
-    rows: RowType = Field(description="type of its stored descriptors: `float32` or `float16`")
+    rows: RowType = Field(
+        validation_alias="row_type",
+        description="type of its stored descriptors: `float32` or `float16`",
+    )
     vocabulary_id: UUID | None
     photos: int = Field(description="live photos with a descriptor in this generation")
     spec: dict[str, Any]
     created_at: datetime
     activated_at: datetime | None
     ended_at: datetime | None
-
-    @classmethod
-    def of(cls, generation: Generation, photos: int) -> GenerationResponse:
-        return cls(
-            generation_id=generation.id,
-            state=GenerationState(generation.state),
-            extractor=generation.extractor,
-            dimension=generation.dimension,
-            pca_from=generation.pca_from,
-            rows=RowType(generation.row_type),
-            vocabulary_id=generation.vocabulary_id,
-            photos=photos,
-            spec=generation.spec,
-            created_at=generation.created_at,
-            activated_at=generation.activated_at,
-            ended_at=generation.ended_at,
-        )
 
 
 def url_in_map(path: str, map_name: str) -> str:
@@ -436,16 +411,6 @@ def url_in_map(path: str, map_name: str) -> str:
 def job_url(job_id: UUID, map_name: str, suffix: str = "") -> str:
     """Return the URL path of a job, or of one of its subresources such as `/result`."""
     return url_in_map(f"/jobs/{job_id}{suffix}", map_name)
-
-
-def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
-    """Build the body of the 202 response for a job."""
-    return JobAcceptedResponse(
-        job_id=job.id,
-        status=JobState(job.state),
-        status_url=job_url(job.id, map_name),
-        result_url=job_url(job.id, map_name, "/result") if job.kind in QUERY_JOBS else None,
-    )
 
 
 def accepted_headers(status_url: str) -> dict[str, str]:

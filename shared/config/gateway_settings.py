@@ -52,14 +52,8 @@ class GatewaySettings(BaseSettings):
     sign_in_proxies: str | None = Field(
         None,
         description="addresses or networks of proxies that sign users in, separated by commas. "
-        "Their headers name the user of a request without a key; unset: none",
-    )
-    sign_in_user_header: str = Field(
-        "X-Forwarded-User", description="header of SIGN_IN_PROXIES with the user's name"
-    )
-    sign_in_groups_header: str = Field(
-        "X-Forwarded-Groups",
-        description="header of SIGN_IN_PROXIES with the user's groups, separated by commas",
+        "Their headers `X-Forwarded-User` and `X-Forwarded-Groups` name the user of a request "
+        "without a key; unset: none",
     )
     sign_in_scopes: str = Field(
         "",
@@ -109,16 +103,7 @@ class GatewaySettings(BaseSettings):
     max_image_pixels: int = Field(
         200_000_000, gt=0, description="maximum width x height of one photo"
     )
-    max_batch_size: Size = Field(
-        10_737_418_240, gt=0, description="maximum bytes of all files of one batch"
-    )
     max_batch_photos: int = Field(100_000, gt=0, description="maximum photos in one batch")
-    max_model_bytes: Size = Field(
-        2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
-    )
-    presign_seconds: int = Field(
-        900, ge=1, le=604_800, description="time to send and complete a presigned upload, seconds"
-    )
 
     # Backpressure: requests are rejected before a queue or a disk fills up.
     max_queued_jobs: int = Field(
@@ -185,13 +170,6 @@ class GatewaySettings(BaseSettings):
                 raise ValueError(
                     f"{error}; expected an address or network such as 10.0.0.5 or 10.0.0.0/8"
                 ) from None
-        return value
-
-    @field_validator("sign_in_user_header", "sign_in_groups_header")
-    @classmethod
-    def _check_header_name(cls, value: str) -> str:
-        if not re.fullmatch(r"[A-Za-z0-9-]+", value):
-            raise ValueError("expected the name of a header, such as X-Forwarded-User")
         return value
 
     @field_validator("sign_in_scopes")

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 from uuid import UUID
@@ -27,7 +27,7 @@ from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields
 from shared.ingest.validation import ValidatedPhoto
-from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
+from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import requeue_job_as_new
 
 COORDINATE_TOLERANCE_DEGREES = 1e-7  # about a centimetre
@@ -40,38 +40,7 @@ class StoreResult:
     photo: Photo
     job: Job | None
     queued: bool
-    """False where the photo existed and needs no job."""
-
-
-BeforeCommit = Callable[[Session, StoreResult], StoreResult]
-"""Callback inside the transaction that stores a photo; returns the result to use."""
-
-
-def store_photo(
-    catalog: Catalog,
-    wakeups: Wakeups,
-    map_name: str,
-    incoming: ValidatedPhoto,
-    before_commit: BeforeCommit,
-) -> StoreResult:
-    """Store a photo and queue its job, or return the map's photo with the same bytes.
-
-    Args:
-        catalog: the catalog.
-        wakeups: notified when a job was queued.
-        map_name: name of the map.
-        incoming: the validated photo.
-        before_commit: called in the transaction with the result.
-
-    Raises:
-        NotFound: `map_not_found`.
-        Conflict: `photo_differs` when the same image exists with different metadata.
-    """
-    with catalog.write() as session:
-        stored = before_commit(session, insert_photo(session, map_name, incoming))
-    if stored.queued:
-        wakeups.send()
-    return stored
+    """Whether the job was queued, so that extractors are to be woken after the commit."""
 
 
 def insert_photo(
@@ -80,7 +49,7 @@ def insert_photo(
     incoming: ValidatedPhoto,
     priority: Priority = Priority.UPLOAD,
 ) -> StoreResult:
-    """Insert the rows of a photo and its job in the caller's transaction.
+    """Insert the rows of a photo and its job, or return the map's photo with the same bytes.
 
     Args:
         session: a session that writes.
@@ -90,7 +59,7 @@ def insert_photo(
 
     Raises:
         NotFound: `map_not_found`.
-        Conflict: `photo_differs`.
+        Conflict: `photo_differs` when the same image exists with different metadata.
     """
     values = _photo_values(incoming)
     dialect = session.get_bind().dialect.name

@@ -14,14 +14,16 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
-from typing import Self
+from functools import partial
+from typing import Self, TypeVar
 from uuid import UUID
 
 import httpx2
+from pydantic import BaseModel, ValidationError
 
 from shared.config.settings import Settings
 from shared.config.shards import Shard
-from shared.errors import Misconfigured, Unavailable
+from shared.errors import Misconfigured, PlacewiseError, Unavailable, error_from_response
 from shared.search_api.protocol import (
     CERTIFICATES,
     NONE,
@@ -30,12 +32,8 @@ from shared.search_api.protocol import (
     SearchResponse,
     SearchStatus,
 )
-from shared.search_api.workers import (
-    REFRESH_SECONDS,
-    WorkerDirectory,
-    WorkerUnavailable,
-    call_search,
-)
+from shared.search_api.workers import REFRESH_SECONDS, WorkerDirectory, WorkerUnavailable
+from shared.telemetry.tracing import REQUEST_ID_HEADER, current_request_id, current_traceparent
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +135,7 @@ class HttpSearchClient:
         self._http = httpx2.Client(
             limits=httpx2.Limits(max_keepalive_connections=MAX_CONCURRENT_CALLS)
         )
-        self._workers = WorkerDirectory(urls, self._http)
+        self._workers = WorkerDirectory(urls, partial(fetch_status, self._http))
         self._call_executor = ThreadPoolExecutor(
             MAX_CONCURRENT_CALLS, thread_name_prefix="search-call"
         )
@@ -278,3 +276,60 @@ def _collect(
             behind = error
             unreachable.append(shard)
     return responses, unreachable, behind
+
+
+CONNECT_SECONDS = 1.0  # workers are in the same network: a slower one counts as unreachable
+STATUS_TIMEOUT_SECONDS = 2.0  # a worker that answers more slowly gets no queries
+Message = TypeVar("Message", bound=BaseModel)
+
+
+def call_search(
+    http: httpx2.Client, url: str, request: SearchRequest, timeout_seconds: float
+) -> SearchResponse:
+    """Call `POST /search` of one worker.
+
+    Raises:
+        WorkerUnavailable: The worker could not be reached, or failed.
+        PlacewiseError: As the worker answered it.
+    """
+    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.model_dump_json())
+    return _read(SearchResponse, url, body)
+
+
+def fetch_status(
+    http: httpx2.Client, url: str, timeout_seconds: float = STATUS_TIMEOUT_SECONDS
+) -> SearchStatus:
+    """Call `GET /status` of one worker; raises as `call_search` does."""
+    return _read(SearchStatus, url, _call(http, "GET", f"{url}/status", timeout_seconds))
+
+
+def _read(kind: type[Message], url: str, body: bytes) -> Message:
+    try:
+        return kind.model_validate_json(body)
+    except ValidationError as error:
+        raise WorkerUnavailable(url, f"the response is not a {kind.__name__}") from error
+
+
+def _call(
+    http: httpx2.Client, method: str, url: str, timeout_seconds: float, content: str | None = None
+) -> bytes:
+    headers = {"Content-Type": "application/json"} if content is not None else {}
+    request_id = current_request_id()
+    if request_id is not None:
+        headers[REQUEST_ID_HEADER] = request_id
+    traceparent = current_traceparent()
+    if traceparent is not None:
+        headers["traceparent"] = traceparent
+    timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
+    try:
+        response = http.request(method, url, timeout=timeout, content=content, headers=headers)
+    except httpx2.RequestError as error:
+        silent = isinstance(error, httpx2.ReadTimeout)
+        raise WorkerUnavailable(url, type(error).__name__, silent=silent) from error
+    if response.is_success:
+        return response.content
+    problem = error_from_response(response.status_code, response.text)
+    # A proxy's error page, or an internal error of the worker.
+    if problem.code == "bad_answer" or type(problem) is PlacewiseError:
+        raise WorkerUnavailable(url, problem.detail)
+    raise problem

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from shared.errors import Gone, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
@@ -43,24 +43,24 @@ class CompareRequest(_Message):
 
 
 class ClusterContribution(_Message):
-    """Contribution of one cluster of the vocabulary to a similarity."""
-
-    cluster: int
-    share: float
+    cluster: int = Field(description="index in the vocabulary of the generation, from 0")
+    share: float = Field(description="its contribution to the similarity")
 
 
 class SimilarityExplanation(_Message):
-    """Decomposition of a similarity into shares, which sum to it within float error."""
+    """Contributions of clusters and patches to a similarity; they add up to it."""
 
-    clusters: tuple[ClusterContribution, ...] | None
-    """Clusters that both photos use, largest share first; None without a vocabulary."""
-    rows: int
-    columns: int
-    """Size of the query's patch grid."""
-    overlay: str
-    """A PNG of `columns` x `rows` pixels as a data URI, one pixel for each patch."""
-    full_share: float
-    """Share of a patch drawn fully opaque: the largest absolute share."""
+    clusters: tuple[ClusterContribution, ...] | None = Field(
+        description="clusters that both photos use, largest share first; null without a vocabulary"
+    )
+    rows: int = Field(description="rows of the query's patch grid")
+    columns: int = Field(description="columns of the query's patch grid")
+    overlay: str = Field(
+        description="data URI of a PNG with one pixel per patch of the query: orange patches "
+        "raise the similarity, violet ones lower it, transparent ones do neither. Scale it to the "
+        "query photo without interpolation"
+    )
+    full_share: float = Field(description="the share at which a patch is drawn fully opaque")
 
 
 class RerankedCandidate(_Message):

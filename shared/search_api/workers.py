@@ -1,7 +1,7 @@
-"""Directory of search workers and their shards, refreshed by polling `GET /status`; single calls.
+"""Directory of search workers and their shards, refreshed by polling their status.
 
 `WorkerDirectory` polls every worker each second and orders the workers of each shard by how well
-they can answer. `call_search` and `fetch_status` call one worker and translate its failures.
+they can answer.
 """
 
 from __future__ import annotations
@@ -9,26 +9,16 @@ from __future__ import annotations
 import logging
 import random
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
 from uuid import UUID
 
-import httpx2
-from pydantic import BaseModel, ValidationError
-
 from shared.config.shards import Shard
-from shared.errors import PlacewiseError, error_from_response
-from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
-from shared.telemetry.tracing import REQUEST_ID_HEADER, current_request_id, current_traceparent
+from shared.errors import PlacewiseError
+from shared.search_api.protocol import SearchStatus
 
 log = logging.getLogger(__name__)
-
-CONNECT_SECONDS = 1.0  # workers are in the same network: a slower one counts as unreachable
-
-
-Message = TypeVar("Message", bound=BaseModel)
 
 
 class WorkerUnavailable(Exception):
@@ -43,58 +33,7 @@ class WorkerUnavailable(Exception):
         self.silent = silent
 
 
-def call_search(
-    http: httpx2.Client, url: str, request: SearchRequest, timeout_seconds: float
-) -> SearchResponse:
-    """Call `POST /search` of one worker.
-
-    Raises:
-        WorkerUnavailable: The worker could not be reached, or failed.
-        PlacewiseError: As the worker answered it.
-    """
-    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.model_dump_json())
-    return _read(SearchResponse, url, body)
-
-
-def fetch_status(http: httpx2.Client, url: str, timeout_seconds: float) -> SearchStatus:
-    """Call one worker's `GET /status`. Raises as `call_search` does."""
-    return _read(SearchStatus, url, _call(http, "GET", f"{url}/status", timeout_seconds))
-
-
-def _read(kind: type[Message], url: str, body: bytes) -> Message:
-    try:
-        return kind.model_validate_json(body)
-    except ValidationError as error:
-        raise WorkerUnavailable(url, f"the response is not a {kind.__name__}") from error
-
-
-def _call(
-    http: httpx2.Client, method: str, url: str, timeout_seconds: float, content: str | None = None
-) -> bytes:
-    headers = {"Content-Type": "application/json"} if content is not None else {}
-    request_id = current_request_id()
-    if request_id is not None:
-        headers[REQUEST_ID_HEADER] = request_id
-    traceparent = current_traceparent()
-    if traceparent is not None:
-        headers["traceparent"] = traceparent
-    timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
-    try:
-        response = http.request(method, url, timeout=timeout, content=content, headers=headers)
-    except httpx2.RequestError as error:
-        silent = isinstance(error, httpx2.ReadTimeout)
-        raise WorkerUnavailable(url, type(error).__name__, silent=silent) from error
-    if response.is_success:
-        return response.content
-    problem = error_from_response(response.status_code, response.text)
-    # A proxy's error page, or an internal error of the worker.
-    if problem.code == "bad_answer" or type(problem) is PlacewiseError:
-        raise WorkerUnavailable(url, problem.detail)
-    raise problem
-
-
 REFRESH_SECONDS = 1.0  # polling interval
-STATUS_TIMEOUT_SECONDS = 2.0  # a worker that answers more slowly gets no queries
 
 
 @dataclass(slots=True)
@@ -124,8 +63,9 @@ class _WorkerState:
 class WorkerDirectory:
     """Polls and stores the status of the search workers at the given URLs. Thread-safe."""
 
-    def __init__(self, urls: Sequence[str], http: httpx2.Client) -> None:
-        self._http = http
+    def __init__(self, urls: Sequence[str], fetch_status: Callable[[str], SearchStatus]) -> None:
+        """`fetch_status` raises WorkerUnavailable for a URL without an answer."""
+        self._fetch_status = fetch_status
         self._lock = threading.Lock()
         self._workers = [_WorkerState(url) for url in urls]
         self._status_executor = ThreadPoolExecutor(
@@ -144,7 +84,7 @@ class WorkerDirectory:
     def _refresh(self, worker: _WorkerState) -> None:
         status, silent, reason = None, False, ""
         try:
-            status = fetch_status(self._http, worker.url, STATUS_TIMEOUT_SECONDS)
+            status = self._fetch_status(worker.url)
         except WorkerUnavailable as error:
             silent, reason = error.silent, str(error)
         except PlacewiseError as error:

@@ -31,9 +31,7 @@ from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, Id
 from services.gateway.schemas import (
     JobAcceptedResponse,
     ResponseModel,
-    accepted_headers,
     job_url,
-    to_job_accepted,
 )
 from services.gateway.uploads.batch import (
     FILES_FIELD,
@@ -155,7 +153,7 @@ async def upload_batch(
     accepted = await run_in_threadpool(
         _queue_batch, gateway, query.map, received, caller_params, idempotent
     )
-    response.headers.update(accepted_headers(accepted.status_url))
+    response.headers.update(accepted.headers)
     return accepted
 
 
@@ -170,10 +168,9 @@ def read_batch_items(
         if job.kind != JobKind.BATCH:
             raise Conflict("no_items", f"The job {job.id} ({job.kind}) is not a batch.")
         items = list_batch_items(session, job.id, query.state or [], query.limit + 1, after)
-    page = items[: query.limit]
+    page, next_cursor = query.split(items, lambda item: item.number)
     return BatchItemsResponse(
-        items=[BatchItemResponse.model_validate(item) for item in page],
-        next_cursor=str(page[-1].number) if len(items) > query.limit else None,
+        items=[BatchItemResponse.model_validate(item) for item in page], next_cursor=next_cursor
     )
 
 
@@ -201,10 +198,8 @@ def _queue_batch(
             if source != BatchSource.PREFIX:  # the steward lists its items
                 add_batch_items(session, job, rows)
             items_url = job_url(job.id, map_name, "/items")
-            job_accepted = to_job_accepted(job, map_name)
-            accepted = BatchAcceptedResponse(**job_accepted.model_dump(), items_url=items_url)
-            headers = accepted_headers(accepted.status_url)
-            idempotent.store_response(session, 202, accepted, headers)
+            accepted = BatchAcceptedResponse.of(job, map_name, items_url=items_url)
+            idempotent.store_response(session, 202, accepted, accepted.headers)
             return accepted
     except (PlacewiseError, IdempotentReplay):
         # Not for other exceptions: after a lost connection the row may have been committed.

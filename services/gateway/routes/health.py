@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 
 from fastapi import APIRouter, Response
@@ -160,7 +161,8 @@ def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response
     components: dict[str, ExtractorsStatus | ComponentStatus] = {
         **_check_components(gateway, admission),
     }
-    if components["catalog"].status == "healthy":
+    has_catalog = components["catalog"].status == "healthy"
+    if has_catalog:
         components["extractors"] = _check_extractors(gateway)
         components |= _check_stewards(gateway)
     if components["object_store"].status == "healthy":
@@ -172,9 +174,7 @@ def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response
         version=VERSION,
         uptime_seconds=time.monotonic() - gateway.started_monotonic,
         parts=components,
-        load=_load_response(gateway.settings, admission)
-        if components["catalog"].status == "healthy"
-        else None,
+        load=_load_response(gateway.settings, admission) if has_catalog else None,
     )
 
 
@@ -198,17 +198,22 @@ def _check_components(
     gateway: GatewayContext, admission: AdmissionControl
 ) -> dict[str, ComponentStatus]:
     return {
-        "catalog": _check_catalog(gateway),
-        "object_store": _check_object_store(gateway, admission),
+        "catalog": _status(lambda: _read_catalog(gateway)),
+        "object_store": _status(gateway.store.check, admission.disk.check),
         "search": _check_search(gateway),
-        "uploads": _check_uploads(admission),
+        "uploads": _status(admission.check_queue),
     }
 
 
-def _check_catalog(gateway: GatewayContext) -> ComponentStatus:
+def _status(*checks: Callable[[], object]) -> ComponentStatus:
+    """The status by checks that raise what is wrong; `degraded` if only uploads are refused."""
     try:
-        with gateway.catalog.read() as session:
-            session.scalar(select(Map.id).limit(1))
+        for check in checks:
+            check()
+    except (StorageFull, TooManyRequests) as error:
+        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
+    except PlacewiseError as error:
+        return ComponentStatus(status="unhealthy", detail=error.detail)
     except SQLAlchemyError as error:
         unavailable = to_unavailable(error)
         detail = unavailable.detail if unavailable else "the catalog is unreachable"
@@ -216,15 +221,9 @@ def _check_catalog(gateway: GatewayContext) -> ComponentStatus:
     return ComponentStatus(status="healthy")
 
 
-def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) -> ComponentStatus:
-    try:
-        gateway.store.check()
-        admission.disk.check()
-    except StorageFull as error:
-        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
-    except PlacewiseError as error:
-        return ComponentStatus(status="unhealthy", detail=error.detail)
-    return ComponentStatus(status="healthy")
+def _read_catalog(gateway: GatewayContext) -> None:
+    with gateway.catalog.read() as session:
+        session.scalar(select(Map.id).limit(1))
 
 
 def _check_collection(gateway: GatewayContext) -> ComponentStatus:
@@ -235,16 +234,6 @@ def _check_collection(gateway: GatewayContext) -> ComponentStatus:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     if hold is not None:
         return ComponentStatus(status="degraded", detail=hold.describe())
-    return ComponentStatus(status="healthy")
-
-
-def _check_uploads(admission: AdmissionControl) -> ComponentStatus:
-    try:
-        admission.check_queue()
-    except TooManyRequests as error:
-        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
-    except SQLAlchemyError:
-        return ComponentStatus(status="degraded", detail="uploads are refused: see catalog")
     return ComponentStatus(status="healthy")
 
 
@@ -315,13 +304,14 @@ def _check_stewards(gateway: GatewayContext) -> dict[str, ComponentStatus]:
     """Return the part of the stewards; none where no separate steward has ever registered."""
     with gateway.catalog.read() as session:
         stewards = [p for p in list_processes(session) if p.role == "steward"]
-    live = sum(process.is_live for process in stewards)
     if not stewards:
         return {}
+    live = sum(process.is_live for process in stewards)
+    part = ComponentStatus(status="healthy", detail=f"{live} running")
     if not live:
-        detail = (
-            "no steward is running: batches, webhooks and model changes wait, and photos of dead "
-            "extractors are not described"
+        part = ComponentStatus(
+            status="degraded",
+            detail="no steward is running: batches, webhooks and model changes wait, and photos of "
+            "dead extractors are not described",
         )
-        return {"stewards": ComponentStatus(status="degraded", detail=detail)}
-    return {"stewards": ComponentStatus(status="healthy", detail=f"{live} running")}
+    return {"stewards": part}

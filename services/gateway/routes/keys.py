@@ -93,8 +93,7 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
             limits=limits,
             maps=body.maps,
         )
-        fields = KeyResponse.model_validate(api_key).model_dump()
-        return CreatedKeyResponse(**fields, key=secret)
+        return CreatedKeyResponse.of_row(api_key, key=secret)
 
 
 @router.delete("/keys/{key_id}", operation_id="revoke_key", dependencies=[ADMIN])

@@ -141,8 +141,9 @@ class MapResponse(ResponseModel):
         description="whether evaluations decide that by the labels"
     )
     rows: RowType = Field(
+        validation_alias="row_type",
         description="type of the stored descriptors, `float32` or `float16`, of new generations; "
-        "GET /generations has the one of each generation"
+        "GET /generations has the one of each generation",
     )
     auto_fit: bool = Field(description=AUTO_FIT)
     next_fit_photos: int | None = Field(
@@ -253,10 +254,8 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
 def _map_response(session: Session, settings: Settings, map_: Map) -> MapResponse:
     generation = active_generation(session, map_.id)
     statistics, counted_at = get_map_statistics(session, map_.id)
-    return MapResponse(
-        name=map_.name,
-        extractor=map_.extractor,
-        version=map_.version,
+    return MapResponse.of_row(
+        map_,
         photos=statistics.photos,
         searchable=statistics.searchable,
         failed_photos=statistics.failed_photos,
@@ -268,12 +267,7 @@ def _map_response(session: Session, settings: Settings, map_: Map) -> MapRespons
         vocabulary=vocabulary_standing(session, generation) if generation else None,
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
-        place_labels_are_paths=map_.place_labels_are_paths,
-        place_labels_are_automatic=map_.place_labels_are_automatic,
-        rows=RowType(map_.row_type),
-        auto_fit=map_.auto_fit,
         next_fit_photos=next_fit_photos(session, map_),
-        created_at=map_.created_at,
     )
 
 

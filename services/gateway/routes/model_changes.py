@@ -12,15 +12,15 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
-from services.gateway.dependencies import NO_NUL_PATTERN, GatewayDep, MapQuery
-from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, delete_if_refused
+from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext, GatewayDep, MapQuery
+from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import (
     GenerationResponse,
     JobAcceptedResponse,
     RequestModel,
     VocabularyResponse,
 )
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
 from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map
@@ -133,22 +133,21 @@ async def start_vocabulary_import(
     its metadata a `.npz` was fitted on other features than the extractor computes.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        received = await store_form_file(
-            request,
-            gateway.store,
-            lambda _filename: new_vocabulary_key(),
-            MAX_VOCABULARY_BYTES,
-        )
-    await idempotent.claim_form(gateway.store, received)
+        async with receive_form_file(
+            request, gateway.store, lambda _filename: new_vocabulary_key(), MAX_VOCABULARY_BYTES
+        ) as file:
+            return await run_in_threadpool(_queue_import, gateway, query.map, file, idempotent)
 
-    def queue_job() -> JobAcceptedResponse:
-        params = {"object_key": received.key, "filename": received.filename}
-        with delete_if_refused(gateway.store, received.key), gateway.catalog.write() as session:
-            map_id = get_map(session, query.map).id
-            job = start_model_change(session, map_id, JobKind.IMPORT, params)
-            return idempotent.accept_job(session, job)
 
-    accepted = await run_in_threadpool(queue_job)
+def _queue_import(
+    gateway: GatewayContext, map_name: str, file: FormFile, idempotent: IdempotentRequest
+) -> JobAcceptedResponse:
+    upload = file.complete()
+    params = {"object_key": upload.key, "filename": upload.filename}
+    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+        map_id = get_map(session, map_name).id
+        job = start_model_change(session, map_id, JobKind.IMPORT, params)
+        accepted = idempotent.accept_job(session, job)
     gateway.wakeups.send()
     return accepted
 
@@ -198,7 +197,7 @@ def read_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationRes
     """List the generations of a map, newest first."""
     with gateway.catalog.read() as session:
         return [
-            GenerationResponse.of(generation, estimate_described(session, generation.id))
+            GenerationResponse.of_row(generation, photos=estimate_described(session, generation.id))
             for generation in list_generations(session, get_map(session, query.map).id)
         ]
 

@@ -21,12 +21,13 @@ from services.gateway.dependencies import (
     ALL_MAPS,
     NO_NUL_PATTERN,
     NO_PARAMETERS,
+    GatewayContext,
     GatewayDep,
     MapQuery,
 )
-from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import JobAcceptedResponse, ResponseModel
-from services.gateway.uploads.multipart import multipart_schema, store_form_file
+from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.maps import get_map
 from shared.catalog.models import (
     Model,
@@ -41,6 +42,8 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.storage.keys import new_checkpoint_key
 
+# The largest backbone (ViT-g) has 4.5 GB of weights. Only admins add models.
+MAX_CHECKPOINT_BYTES = 6_000_000_000
 MAX_LICENCE_CHARACTERS = 1000
 MAX_NOTE_CHARACTERS = 4000
 MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
@@ -65,8 +68,10 @@ ModelNamePath = Annotated[
 
 
 class ModelResponse(ResponseModel):
-    name: str
-    extractor: str = Field(description="extractor name that maps use: gsv:NAME")
+    name: str = Field(validation_alias="added_name")
+    extractor: str = Field(
+        validation_alias="name", description="extractor name that maps use: gsv:NAME"
+    )
     fingerprint: str = Field(description="SHA-256 of its configuration and weights")
     dimension: int = Field(description="dimension of its descriptors")
     image_size: tuple[int, int] = Field(description="height and width that photos are resized to")
@@ -75,30 +80,17 @@ class ModelResponse(ResponseModel):
     sha256: str = Field(description="SHA-256 of that file")
     licence: str
     note: str | None
-    about: dict[str, Any] = Field(description="source file and training details")
+    about: dict[str, Any] = Field(
+        validation_alias="card", description="source file and training details"
+    )
     added_at: datetime
     maps: list[str] = Field(description="maps that use it")
 
     @classmethod
     def of(cls, session: Session, model: Model) -> ModelResponse:
-        assert model.added_name is not None
         assert model.config is not None
-        height, width = model.config["image_size"]
-        return cls(
-            name=model.added_name,
-            extractor=model.name,
-            fingerprint=model.fingerprint,
-            dimension=model.dimension,
-            image_size=(height, width),
-            config=model.config,
-            size_bytes=model.size_bytes,
-            sha256=model.sha256,
-            licence=model.licence,
-            note=model.note,
-            about=model.card,
-            added_at=model.added_at,
-            maps=list_maps_using_model(session, model),
-        )
+        maps = list_maps_using_model(session, model)
+        return cls.of_row(model, image_size=model.config["image_size"], maps=maps)
 
 
 class ModelsResponse(ResponseModel):
@@ -134,33 +126,34 @@ async def upload_model(
     checkpoint can't be used or the name belongs to other weights.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        received = await store_form_file(
+        async with receive_form_file(
             request,
             gateway.store,
             lambda _filename: new_checkpoint_key(),
-            gateway.settings.max_model_bytes,
+            MAX_CHECKPOINT_BYTES,
             too_large=_checkpoint_too_large_error,
+        ) as file:
+            return await run_in_threadpool(_queue_model, gateway, query.map, file, idempotent)
+
+
+def _queue_model(
+    gateway: GatewayContext, map_name: str, file: FormFile, idempotent: IdempotentRequest
+) -> JobAcceptedResponse:
+    upload = file.complete()
+    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+        job = Job(
+            id=new_id(),
+            map_id=get_map(session, map_name).id,
+            kind=JobKind.ADD_MODEL,
+            priority=Priority.MODEL_CHANGE,
+            params={
+                "object_key": upload.key,
+                "filename": upload.filename,
+                "checkpoint_sha256": upload.sha256,
+                **_parse_model_fields(upload.fields),
+            },
         )
-    await idempotent.claim_form(gateway.store, received)
-
-    def queue_job() -> JobAcceptedResponse:
-        with delete_if_refused(gateway.store, received.key), gateway.catalog.write() as session:
-            params = {
-                "object_key": received.key,
-                "filename": received.filename,
-                "checkpoint_sha256": received.sha256,
-                **_parse_model_fields(received.fields),
-            }
-            job = Job(
-                id=new_id(),
-                map_id=get_map(session, query.map).id,
-                kind=JobKind.ADD_MODEL,
-                priority=Priority.MODEL_CHANGE,
-                params=params,
-            )
-            return idempotent.accept_job(session, job)
-
-    accepted = await run_in_threadpool(queue_job)
+        accepted = idempotent.accept_job(session, job)
     gateway.wakeups.send()
     return accepted
 
@@ -221,6 +214,7 @@ def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
 def _checkpoint_too_large_error(max_bytes: int) -> PlacewiseError:
     return TooLarge(
         "file_too_large",
-        f"The checkpoint is larger than {max_bytes} bytes (MAX_MODEL_BYTES).",
+        f"The checkpoint is larger than {max_bytes} bytes. Save it without the state of the "
+        "optimizer: placewise train --save_weights_only true.",
         max_bytes=max_bytes,
     )

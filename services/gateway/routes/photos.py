@@ -12,7 +12,7 @@ from urllib.parse import quote
 from uuid import UUID
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import JSONResponse, Response, StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 from sqlalchemy.orm import Session
 
@@ -34,8 +34,6 @@ from services.gateway.schemas import (
     PhotoDetailResponse,
     PhotoResponse,
     RequestModel,
-    accepted_headers,
-    to_job_accepted,
 )
 from services.gateway.similarity.search_params import (
     FilterParams,
@@ -237,10 +235,7 @@ def read_preview(
             lambda session: _queue_preview(session, admission, photo, query.map)
         )
         gateway.wakeups.send()
-        accepted = to_job_accepted(job, query.map)
-        return JSONResponse(
-            accepted.model_dump(mode="json"), 202, accepted_headers(accepted.status_url)
-        )
+        return JobAcceptedResponse.of(job, query.map).to_http()
     return Response(data, media_type="image/jpeg", headers=headers)
 
 
@@ -325,12 +320,12 @@ def search_photos_by_metadata(
     with gateway.catalog.read() as session:
         map_id = get_map(session, query.map).id
         matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
-    page = matches[: query.limit]
+    page, next_cursor = query.split(matches, _encode_cursor)
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
-        images=[PhotoResponse(**PhotoResponse.fields_of(item, query.map)) for item in page],
-        next_cursor=_encode_cursor(page[-1]) if len(matches) > query.limit else None,
+        images=[PhotoResponse.of(photo, query.map) for photo in page],
+        next_cursor=next_cursor,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
@@ -338,13 +333,7 @@ def search_photos_by_metadata(
 def _photo_detail_response(session: Session, photo: Photo, map_name: str) -> PhotoDetailResponse:
     generation = active_generation(session, photo.map_id)
     searchable = generation is not None and find_descriptor(session, generation.id, photo.id)
-    return PhotoDetailResponse(
-        **PhotoResponse.fields_of(photo, map_name),
-        job_id=photo.job_id,
-        media_type=photo.media_type,
-        sha256=photo.sha256,
-        searchable=bool(searchable),
-    )
+    return PhotoDetailResponse.of(photo, map_name, searchable=bool(searchable))
 
 
 def _read_blocks(file: BinaryIO) -> Iterator[bytes]:

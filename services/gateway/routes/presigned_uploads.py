@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-from contextlib import AbstractContextManager
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -21,7 +20,6 @@ from uuid import UUID
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 from pydantic import Field
-from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import (
@@ -41,7 +39,12 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
 from services.gateway.routes.photos import PhotoUpdate
-from services.gateway.routes.uploads import UPLOAD_RESPONSES, UploadOutcome, respond_to_upload
+from services.gateway.routes.uploads import (
+    UPLOAD_RESPONSES,
+    UploadOutcome,
+    finish_upload,
+    wait_for_description,
+)
 from services.gateway.schemas import ResponseModel, UploadResponse, accepted_headers, url_in_map
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.idempotency import StoredResponse
@@ -51,7 +54,7 @@ from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
-from shared.ingest.store_photo import StoreResult, store_photo
+from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import (
     StoredUpload,
     ValidatedPhoto,
@@ -64,6 +67,7 @@ from shared.storage.keys import incoming_key, new_original_key
 
 router = APIRouter(tags=["photos"])
 
+PRESIGN_SECONDS = 900  # to send and complete an upload: 100 MB at 1 Mbit/s
 FILE_FIELDS = ("filename", "file_size", "sha256")
 
 
@@ -116,12 +120,11 @@ def create_presigned_upload(
     _parse_photo_fields(fields)  # refuses invalid fields before the file is sent
     request.app.state.rate_limiter.count_upload_bytes(get_caller(request), body.file_size)
     upload_id = new_id()
-    seconds = gateway.settings.presign_seconds
     put = store.presign_put(
         incoming_key(upload_id),
         size_bytes=body.file_size,
         sha256=body.sha256,
-        expires_seconds=seconds,
+        expires_seconds=PRESIGN_SECONDS,
     )
     with gateway.catalog.write() as session:
         upload = PresignedUpload(
@@ -131,7 +134,7 @@ def create_presigned_upload(
             size_bytes=body.file_size,
             sha256=body.sha256,
             photo_fields=fields,
-            expires_at=db_now_plus(seconds),
+            expires_at=db_now_plus(PRESIGN_SECONDS),
         )
         session.add(upload)
         session.flush()
@@ -168,39 +171,30 @@ async def complete_presigned_upload(
 
     The responses are those of `POST /upload`. A repeated request gets the same response again.
     """
-    key = new_original_key()
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        key_id = get_caller(request).key_id
-        quota = reserve_photo_quota(request, gateway.settings)
-        stored = await run_in_threadpool(
-            _complete_upload, gateway, query.map, upload_id, key, key_id, quota
+        stored, key = await run_in_threadpool(
+            _complete_upload, request, gateway, query.map, upload_id
         )
-
-    def replace_response(outcome: UploadOutcome) -> None:
-        with gateway.catalog.write() as session:
-            upload = session.get(PresignedUpload, upload_id)
-            if upload is not None:  # its map may have been deleted during the wait
-                upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
-
-    return await respond_to_upload(
-        request, response, gateway, query.map, stored, key, replace_response
-    )
+    job = await wait_for_description(request, response, gateway, stored)
+    outcome = UploadOutcome.of(stored, job, key, query.map)
+    if outcome.status == 201:
+        await run_in_threadpool(_replace_response, gateway, upload_id, outcome)
+    return outcome.send(response)
 
 
 def _complete_upload(
-    gateway: GatewayContext,
-    map_name: str,
-    upload_id: UUID,
-    key: str,
-    key_id: UUID | None,
-    quota: AbstractContextManager[None],
-) -> StoreResult:
-    """Store the photo under `key`; IdempotentReplay if the upload was completed before."""
+    request: Request, gateway: GatewayContext, map_name: str, upload_id: UUID
+) -> tuple[StoreResult, str]:
+    """Copy the object, validate the copy and store the photo; also returns the copy's key.
+
+    Raises:
+        IdempotentReplay: The upload was completed before.
+    """
     store = _require_presigning_store(gateway)
     with gateway.catalog.read() as session:
         upload = get_presigned_upload(session, get_map(session, map_name).id, upload_id)
     _replay_if_completed(upload)
-    source_key = incoming_key(upload_id)
+    source_key, key = incoming_key(upload_id), new_original_key()
     try:
         _check_object_size(store.head(source_key), upload)
         store.copy(source_key, key)
@@ -209,39 +203,37 @@ def _complete_upload(
         with gateway.catalog.read() as session:
             _replay_if_completed(get_presigned_upload(session, upload.map_id, upload_id))
         raise _upload_incomplete_error(upload) from None
-
-    def store_response(session: Session, stored: StoreResult) -> StoreResult:
-        locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
-        _replay_if_completed(locked)
-        outcome = UploadOutcome.of(stored, stored.job, key, map_name)
-        locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
-        return stored
-
     with delete_if_refused(store, key):
-        _check_object_size(store.head(key), upload)
-        received = _verify_copied_object(store, key, upload)
-        media_type = check_photo_signature(received.first_bytes)
-        with store.open(key) as file:
-            header = read_photo_header(file, gateway.settings.max_image_pixels)
-        incoming = ValidatedPhoto(
-            received, media_type, header, _parse_photo_fields(upload.photo_fields), key_id
-        )
-        with quota:
-            stored = store_photo(
-                gateway.catalog, gateway.wakeups, map_name, incoming, store_response
-            )
-    if stored.photo.object_key != key:
-        store.delete(key)
+        photo = _validate_copy(request, gateway, store, key, upload)
+        with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
+            stored = insert_photo(session, map_name, photo)
+            locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
+            _replay_if_completed(locked)
+            outcome = UploadOutcome.of(stored, stored.job, key, map_name)
+            locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
+    finish_upload(gateway, stored, key)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
     with contextlib.suppress(Unavailable):
         store.delete(source_key)
-    return stored
+    return stored, key
 
 
-def _verify_copied_object(
-    store: PresigningStore, key: str, upload: PresignedUpload
-) -> StoredUpload:
-    """Read and hash the copied object; Unprocessable (`sha256_differs`) for another file."""
+def _replace_response(gateway: GatewayContext, upload_id: UUID, outcome: UploadOutcome) -> None:
+    with gateway.catalog.write() as session:
+        upload = session.get(PresignedUpload, upload_id)
+        if upload is not None:  # its map may have been deleted during the wait
+            upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
+
+
+def _validate_copy(
+    request: Request,
+    gateway: GatewayContext,
+    store: PresigningStore,
+    key: str,
+    upload: PresignedUpload,
+) -> ValidatedPhoto:
+    """Validate the copied object; Unprocessable (`size_differs`, `sha256_differs`)."""
+    _check_object_size(store.head(key), upload)
     received = StoredUpload.read(store, key, upload.filename)
     if received.sha256 != upload.sha256:
         raise Unprocessable(
@@ -249,7 +241,11 @@ def _verify_copied_object(
             f"The file that was sent has the SHA-256 {received.sha256}, not {upload.sha256}. "
             "Send the announced file again to the same URL, or start a new upload.",
         )
-    return received
+    media_type = check_photo_signature(received.first_bytes)
+    with store.open(key) as file:
+        header = read_photo_header(file, gateway.settings.max_image_pixels)
+    fields = _parse_photo_fields(upload.photo_fields)
+    return ValidatedPhoto(received, media_type, header, fields, get_caller(request).key_id)
 
 
 def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:

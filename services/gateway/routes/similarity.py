@@ -23,13 +23,8 @@ from services.gateway.dependencies import (
     parse_prefer_wait,
     wait_for_job,
 )
-from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest, delete_if_refused
-from services.gateway.schemas import (
-    JobAcceptedResponse,
-    SimilarityResponse,
-    accepted_headers,
-    to_job_accepted,
-)
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
+from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
 from services.gateway.similarity.rerank import (
     check_comparison_supported,
@@ -41,7 +36,7 @@ from services.gateway.similarity.search_params import (
     SearchParams,
     SimilarityParams,
 )
-from services.gateway.uploads.multipart import multipart_schema
+from services.gateway.uploads.multipart import FormFile, multipart_schema
 from services.gateway.uploads.query_photo import (
     describe_query_job,
     query_job_search_params,
@@ -51,7 +46,6 @@ from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
-from shared.ingest.validation import StoredUpload
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.comparison import query_expired_error
@@ -136,11 +130,12 @@ async def search_by_uploaded_photo(
     `Idempotency-Key` gets the 202 of the first one.
     """
     search_params = query.search_params()
-    await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
-    job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
-    job = await run_in_threadpool(
-        _queue_query, gateway, query.map, job_id, received, search_params, idempotent
-    )
+    if search_params.needs_comparison:
+        await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
+    async with receive_query_photo(request, gateway, admission) as (job_id, file):
+        job = await run_in_threadpool(
+            _queue_query, gateway, query.map, job_id, file, search_params, idempotent
+        )
     wait = parse_prefer_wait(request)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
@@ -215,10 +210,7 @@ async def _wait_for_result(
                 raise query_expired_error()
             job = current
         if job.state in UNFINISHED_STATES:
-            accepted = to_job_accepted(job, map_name)
-            headers = {**response.headers, **accepted_headers(accepted.status_url)}
-            # An explicit response, because the response model of the route is that of the 200.
-            return JSONResponse(accepted.model_dump(mode="json"), 202, headers)
+            return JobAcceptedResponse.of(job, map_name).to_http(response.headers)
         result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
         if isinstance(result, SimilarityResponse):
             return result
@@ -229,18 +221,19 @@ def _queue_query(
     gateway: GatewayContext,
     map_name: str,
     job_id: UUID,
-    received: StoredUpload,
+    file: FormFile,
     search_params: SearchParams,
     idempotent: IdempotentRequest,
 ) -> Job:
-    with delete_if_refused(gateway.store, received.key):
-        for name in received.fields:
+    upload = file.complete()
+    with idempotent.claim_form(upload, gateway.settings.query_ttl_seconds):
+        for name in upload.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
-        with received.open(gateway.store) as file:
-            read_photo_header(file, gateway.settings.max_image_pixels)
+        with upload.open(gateway.store) as photo:
+            read_photo_header(photo, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
-            job = describe_query_job(job_id, map_id, received.filename, search_params)
+            job = describe_query_job(job_id, map_id, upload.filename, search_params)
             idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job

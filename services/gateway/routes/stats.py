@@ -62,10 +62,11 @@ def read_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryRespons
 class StatsResponse(ResponseModel):
     map: str
     map_version: int
-    total_images: int
-    searchable_images: int
+    total_images: int = Field(validation_alias="photos")
+    searchable_images: int = Field(validation_alias="searchable")
     failed_images: int = Field(
-        description="stored photos that can't be searched for, because their description failed"
+        validation_alias="failed_photos",
+        description="stored photos that can't be searched for, because their description failed",
     )
     labelled_queries: int
     total_chunks: int
@@ -81,11 +82,11 @@ class StatsResponse(ResponseModel):
         description="number of photos from which the next vocabulary is fitted automatically; null "
         "if none is"
     )
-    total_searches: int
-    recent_uploads_24h: int
-    recent_searches_24h: int
-    avg_processing_time_ms: float | None
-    max_processing_time_ms: float | None
+    total_searches: int = Field(validation_alias="searches")
+    recent_uploads_24h: int = Field(validation_alias="uploads_24h")
+    recent_searches_24h: int = Field(validation_alias="searches_24h")
+    avg_processing_time_ms: float | None = Field(validation_alias="average_ms")
+    max_processing_time_ms: float | None = Field(validation_alias="longest_ms")
     jobs: dict[str, int]
     counted_at: datetime = Field(description="when the statistics were computed")
 
@@ -108,13 +109,10 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
                     Chunk.generation_id == generation.id, Chunk.superseded_at.is_(None)
                 )
             ).one()
-        return StatsResponse(
+        return StatsResponse.of_row(
+            statistics,
             map=map_.name,
             map_version=map_.version,
-            total_images=statistics.photos,
-            searchable_images=statistics.searchable,
-            failed_images=statistics.failed_photos,
-            labelled_queries=statistics.labelled_queries,
             total_chunks=chunks,
             total_storage_bytes=int(chunk_bytes) + statistics.photo_bytes,
             feature_dimension=generation.dimension if generation else None,
@@ -130,11 +128,5 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
             ),
             vocabulary=vocabulary_standing(session, generation) if generation else None,
             next_fit_photos=next_fit_photos(session, map_),
-            total_searches=statistics.searches,
-            recent_uploads_24h=statistics.uploads_24h,
-            recent_searches_24h=statistics.searches_24h,
-            avg_processing_time_ms=statistics.average_ms,
-            max_processing_time_ms=statistics.longest_ms,
-            jobs=statistics.jobs,
             counted_at=counted_at,
         )

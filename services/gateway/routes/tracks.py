@@ -36,7 +36,6 @@ from services.gateway.idempotency import (
     IdempotentDep,
     IdempotentFormDep,
     IdempotentRequest,
-    delete_if_refused,
 )
 from services.gateway.schemas import ResponseModel, accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
@@ -47,7 +46,7 @@ from services.gateway.tracks.schemas import (
     TrackStateResponse,
     parse_frame_form,
 )
-from services.gateway.uploads.multipart import multipart_schema
+from services.gateway.uploads.multipart import FormFile, multipart_schema
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
@@ -66,7 +65,6 @@ from shared.catalog.tracks import (
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
-from shared.ingest.validation import StoredUpload
 from shared.jobs.wakeups import WakeupQueue
 
 router = APIRouter(tags=["tracks"])
@@ -272,10 +270,10 @@ async def add_track_frame(
     are computed again (409, `frame_too_late`, beyond).
     """
     await run_in_threadpool(_check_track, gateway.catalog, query.map, track_id)
-    job_id, received = await receive_query_photo(request, gateway, admission, idempotent)
-    frame = await run_in_threadpool(
-        _accept_frame, request, gateway, query.map, track_id, job_id, received, idempotent
-    )
+    async with receive_query_photo(request, gateway, admission) as (job_id, file):
+        frame = await run_in_threadpool(
+            _accept_frame, request, gateway, query.map, track_id, job_id, file, idempotent
+        )
     wait = parse_prefer_wait(request)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
@@ -316,14 +314,15 @@ def _accept_frame(
     map_name: str,
     track_id: UUID,
     job_id: UUID,
-    received: StoredUpload,
+    file: FormFile,
     idempotent: IdempotentRequest,
 ) -> TrackFrame:
     """Store the frame with its job, or return the frame that it repeats."""
-    with delete_if_refused(gateway.store, received.key):
+    received = file.complete()
+    with idempotent.claim_form(received, gateway.settings.query_ttl_seconds):
         form = parse_frame_form(received.fields)
-        with received.open(gateway.store) as file:
-            read_photo_header(file, gateway.settings.max_image_pixels)
+        with received.open(gateway.store) as photo:
+            read_photo_header(photo, gateway.settings.max_image_pixels)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
             frame = TrackFrame(

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
-from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
-from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import (
@@ -27,14 +23,14 @@ from services.gateway.dependencies import (
     parse_prefer_wait,
     wait_for_job,
 )
-from services.gateway.idempotency import IdempotentFormDep, delete_if_refused
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
-from services.gateway.uploads.multipart import multipart_schema, use_form_file
+from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
-from shared.ingest.store_photo import BeforeCommit, StoreResult, store_photo
-from shared.ingest.validation import StoredUpload, check_photo_signature, validate_photo
+from shared.ingest.store_photo import StoreResult, insert_photo
+from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
 from shared.storage.keys import new_original_key
 
@@ -93,35 +89,24 @@ async def upload_photo(
     the existing photo is returned: with 200 if it is searchable, otherwise as if it had been sent
     for the first time (202 or 201). A failed or cancelled job is queued again.
     """
-    key_id = get_caller(request).key_id
-    quota = reserve_photo_quota(request, gateway.settings)
-
-    def store_row(received: StoredUpload) -> tuple[StoreResult, str]:
-        def store_response(session: Session, stored: StoreResult) -> StoreResult:
-            outcome = UploadOutcome.of(stored, stored.job, received.key, query.map)
-            idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-            return stored
-
-        idempotent.claim_received(gateway.store, received)
-        stored = _store_upload(gateway, query.map, received, key_id, quota, store_response)
-        return stored, received.key
-
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        stored, key = await use_form_file(
+        async with receive_form_file(
             request,
             gateway.store,
             lambda filename: new_original_key(photo_suffix(filename)),
             gateway.settings.max_file_size,
-            store_row,
             check_photo_signature,
+        ) as file:
+            stored = await run_in_threadpool(
+                _store_upload, request, gateway, query.map, file, idempotent
+            )
+    job = await wait_for_description(request, response, gateway, stored)
+    outcome = UploadOutcome.of(stored, job, file.upload.key, query.map)
+    if outcome.status == 201:
+        await run_in_threadpool(
+            idempotent.replace_response, outcome.status, outcome.body, outcome.headers
         )
-
-    def replace_response(outcome: UploadOutcome) -> None:
-        idempotent.replace_response(outcome.status, outcome.body, outcome.headers)
-
-    return await respond_to_upload(
-        request, response, gateway, query.map, stored, key, replace_response
-    )
+    return outcome.send(response)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,54 +143,51 @@ class UploadOutcome:
             return cls(201, {"Location": status_url}, body)
         return cls(202, accepted_headers(status_url), body)
 
+    def send(self, response: Response) -> UploadResponse:
+        """Set the status and the headers of the response, and return its body."""
+        response.status_code = self.status
+        response.headers.update(self.headers)
+        return self.body
 
-async def respond_to_upload(
-    request: Request,
-    response: Response,
-    gateway: GatewayContext,
-    map_name: str,
-    stored: StoreResult,
-    key: str,
-    on_described: Callable[[UploadOutcome], None],
-) -> UploadResponse:
-    """Build the response to an upload, after waiting for its job if the request prefers it.
 
-    `on_described` is called in a worker thread with the 201 response if the photo was described
-    within the wait, to store it for repetitions of the request.
-    """
-    job = stored.job
-    wait = parse_prefer_wait(request)
-    if wait and job is not None and job.state != JobState.SUCCEEDED:
-        response.headers["Preference-Applied"] = f"wait={wait:g}"
-        job = await wait_for_job(gateway, job.id, wait) or job
-    outcome = UploadOutcome.of(stored, job, key, map_name)
-    if outcome.status == 201:
-        await run_in_threadpool(on_described, outcome)
-    response.status_code = outcome.status
-    response.headers.update(outcome.headers)
-    return outcome.body
+async def wait_for_description(
+    request: Request, response: Response, gateway: GatewayContext, stored: StoreResult
+) -> Job | None:
+    """Return the photo's job, after waiting for its end as long as `Prefer: wait=N` allows."""
+    job, wait = stored.job, parse_prefer_wait(request)
+    if not wait or job is None or job.state == JobState.SUCCEEDED:
+        return job
+    response.headers["Preference-Applied"] = f"wait={wait:g}"
+    return await wait_for_job(gateway, job.id, wait) or job
 
 
 def _store_upload(
+    request: Request,
     gateway: GatewayContext,
     map_name: str,
-    received: StoredUpload,
-    key_id: UUID | None,
-    quota: AbstractContextManager[None],
-    before_commit: BeforeCommit,
+    file: FormFile,
+    idempotent: IdempotentRequest,
 ) -> StoreResult:
-    """Validate and store the photo; delete the received bytes if they are not used."""
-    with delete_if_refused(gateway.store, received.key):
-        incoming = validate_photo(
-            gateway.store, received, gateway.settings.max_image_pixels, key_id
+    """Validate the photo, and store its row, its job and the response in one transaction."""
+    upload = file.complete()
+    with idempotent.claim_form(upload):
+        photo = validate_photo(
+            gateway.store, upload, gateway.settings.max_image_pixels, get_caller(request).key_id
         )
-        with quota:
-            stored = store_photo(
-                gateway.catalog, gateway.wakeups, map_name, incoming, before_commit
-            )
-    if stored.photo.object_key != received.key:
-        gateway.store.delete(received.key)
+        with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
+            stored = insert_photo(session, map_name, photo)
+            outcome = UploadOutcome.of(stored, stored.job, upload.key, map_name)
+            idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
+    finish_upload(gateway, stored, upload.key)
     return stored
+
+
+def finish_upload(gateway: GatewayContext, stored: StoreResult, key: str) -> None:
+    """After the commit: wake the extractors, and delete received bytes that the map has."""
+    if stored.queued:
+        gateway.wakeups.send()
+    if stored.photo.object_key != key:
+        gateway.store.delete(key)
 
 
 def _outcome_message(stored: StoreResult, job: Job | None) -> str:

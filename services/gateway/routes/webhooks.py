@@ -99,8 +99,7 @@ def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> Created
         raise invalid_field_error("url", error.detail) from error
     with gateway.catalog.write() as session:
         webhook = create_webhook(session, body.url, body.events)
-        fields = WebhookResponse.model_validate(webhook).model_dump()
-        return CreatedWebhookResponse(**fields, secret=webhook.secret)
+        return CreatedWebhookResponse.model_validate(webhook)
 
 
 @router.delete(

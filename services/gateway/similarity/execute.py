@@ -11,9 +11,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 from uuid import UUID
 
@@ -23,13 +22,11 @@ from sqlalchemy.orm import Session
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
     EstimateResponse,
-    PhotoResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
     job_url,
 )
 from services.gateway.similarity.estimate import estimate_place, locate_hits
-from services.gateway.similarity.neighbours import Neighbours
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
@@ -40,10 +37,10 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.probability import PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
-from shared.search_api.protocol import RowReference, SearchHit, SearchRequest, SearchResponse
+from shared.search_api.protocol import Mode, RowReference, SearchHit, SearchRequest, SearchResponse
 from shared.word_weights.record import WordWeights, parse_word_weights
 
 log = logging.getLogger(__name__)
@@ -99,28 +96,13 @@ class SimilarityQuery:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
-    """Live photos that a search found."""
-
-    hits: list[SearchHit]
-    """most similar first"""
-    photos: dict[UUID, Photo]
-    response: SearchResponse
-    ranking: list[RankedPhoto]
-    """the hits with the locations of their photos"""
-
-
-@dataclass(frozen=True, slots=True)
 class SimilarityResult:
     """Result of a search: the response without photos, the hits and the history row."""
 
     response_without_photos: SimilarityResponse
-    """All fields of the response except the photos."""
     hits: list[SearchHit]
     """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
     photos: dict[UUID, Photo]
-    places: PlaceEstimate | None
-    """The levels and their probabilities; None if no photo has a location."""
     match_probabilities: dict[UUID, float]
     """Probability of each of the best photos with a place that it shows the query's."""
     word_weights: tuple[float, ...]
@@ -200,11 +182,12 @@ def find_similar(
             raise
         log.warning("the search is not added to the history: the disk of the catalog is full")
     return result.response_without_photos.with_photos(
-        SimilarPhotoResponse(
+        SimilarPhotoResponse.of(
+            result.photos[hit.photo_id],
+            query.map.name,
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
             match_probability=result.match_probabilities.get(hit.photo_id),
-            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map.name),
         )
         for hit in result.hits
     )
@@ -237,24 +220,32 @@ def run_similarity_search(
     that are not cached, and for `min_score` with word weights.
     """
     started = time.perf_counter()
+    settings, photo_filter = gateway.settings, search_params.photos
     weights = select_ranking_weights(query.generation, search_params.word_weights)
-    search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
-    depth = max(search_params.top_k, search_params.rerank or 0)
+    search = _MapSearch(gateway, query, search_params.mode, weights.values)
+
     # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
-    found = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
-    located = _find_located(search, found, search_params.photos)
-    whole_map = located if search_params.photos.is_empty else search(WITH_PLACE, EVIDENCE_DEPTH)
+    depth = max(search_params.top_k, search_params.rerank or 0)
+    found = search.find(photo_filter, max(depth, EVIDENCE_DEPTH))
+    located = found
+    if not all(ranked.location.is_known for ranked in found.ranking):
+        with_place = photo_filter.model_copy(update={"has_place": True})
+        located = search.find(with_place, len(found.hits))
+    whole_map = located if photo_filter.is_empty else search.find(WITH_PLACE, EVIDENCE_DEPTH)
+    similar = _first_similar(search, found, search_params, depth)
+
     scheme = LevelScheme(
-        labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
+        labels_are_paths=query.map.place_labels_are_paths, radii_m=settings.level_radii_m
     )
     model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
-    certainty = search_params.certainty or gateway.settings.certainty
+    certainty = search_params.certainty or settings.certainty
+    neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
         whole_map.ranking,
-        _rank_neighbours(gateway, query, search_params, whole_map.hits, weights.values),
+        [ranked for ranked in neighbours if ranked.photo != query.photo_id],
         scheme,
         certainty,
-        gateway.settings.estimate_radius_m,
+        settings.estimate_radius_m,
         located.ranking,
     )
     estimate = estimate_place(
@@ -262,55 +253,117 @@ def run_similarity_search(
         places,
         model,
         certainty,
-        gateway.settings.estimate_radius_m,
-        _no_place_reason(found.hits, search_params.photos),
+        settings.estimate_radius_m,
+        _no_place_reason(found.hits, photo_filter),
     )
-    similar = _apply_min_score(search, found, search_params, depth, weights.values)
-    elapsed_ms = (time.perf_counter() - started) * 1000
+    match_probabilities: dict[UUID, float] = {}
+    if places is not None and model.is_fitted:
+        best = (hit.photo_id for hit in located.hits)
+        match_probabilities = dict(zip(best, places.match_probabilities, strict=True))
+    response = _make_response(
+        query, similar.response, estimate, weights.state(found.hits), time.perf_counter() - started
+    )
+    is_weighted = any(hit.weighted_score is not None for hit in similar.hits)
     return SimilarityResult(
-        response_without_photos=_make_response(
-            query, similar.response, estimate, weights.state(found.hits), elapsed_ms
-        ),
+        response_without_photos=response,
         hits=similar.hits,
         photos=similar.photos,
-        places=places,
-        match_probabilities=dict(
-            zip((hit.photo_id for hit in located.hits), places.match_probabilities, strict=True)
-        )
-        if places is not None and model.is_fitted
-        else {},
-        word_weights=weights.values
-        if any(hit.weighted_score is not None for hit in similar.hits)
-        else (),
-        history=(_make_history(query, search_params, found, similar, estimate, elapsed_ms),)
+        match_probabilities=match_probabilities,
+        word_weights=weights.values if is_weighted else (),
+        history=(_make_history(query, search_params, found, similar, response),)
         if search_params.history
         else (),
     )
 
 
-def _find_located(
-    search: Callable[[PhotoFilter, int], _Found], found: _Found, photo_filter: PhotoFilter
-) -> _Found:
-    """Return the found photos; if some have no place and would hide others, only those with one."""
-    if all(ranked.location.is_known for ranked in found.ranking):
-        return found
-    return search(photo_filter.model_copy(update={"has_place": True}), len(found.hits))
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Live photos that a search found."""
+
+    hits: list[SearchHit]
+    """most similar first"""
+    photos: dict[UUID, Photo]
+    response: SearchResponse
+    ranking: list[RankedPhoto]
+    """the hits with the locations of their photos"""
 
 
-def _apply_min_score(
-    search: Callable[..., _Found],
-    found: _Found,
-    search_params: SearchParams,
-    depth: int,
-    weights: tuple[float, ...],
+@dataclass(frozen=True, slots=True)
+class _MapSearch:
+    """Searches with one query, all ranked in the same way."""
+
+    gateway: GatewayContext
+    query: SimilarityQuery
+    mode: Mode
+    weights: tuple[float, ...]
+
+    def find(self, photos: PhotoFilter, depth: int, min_score: float | None = None) -> _Found:
+        """Return the first `depth` live photos; fewer if there are no more."""
+        k, query = depth, self.query
+        while True:
+            response = self.gateway.search.search(
+                SearchRequest(
+                    map_id=query.map.id,
+                    generation_id=query.generation.id,
+                    object_key=query.object_key,
+                    row=query.row,
+                    min_version=query.map.version,
+                    k=k,
+                    photos=photos,
+                    min_score=min_score,
+                    exclude=(query.photo_id,) if query.photo_id else (),
+                    word_weights=self.weights,
+                    background=query.background,
+                    mode=self.mode,
+                )
+            )
+            with self.gateway.catalog.read() as session:
+                live = get_live_photos(session, [hit.photo_id for hit in response.hits])
+            hits = [hit for hit in response.hits if hit.photo_id in live]
+            if len(hits) >= depth or len(response.hits) < k:
+                hits = hits[:depth]
+                return _Found(hits, live, response, locate_hits(hits, live))
+            k *= 2
+
+    def rank_neighbours(self, photo_id: UUID) -> Sequence[RankedPhoto]:
+        """Return the ranking of the map by one of its photos, best first.
+
+        It is cached: queries that show the same places have the same best photos, and each of them
+        would cost a second search of the whole map. A ranking that lacks a part of the map is not
+        cached.
+        """
+        gateway, query = self.gateway, self.query
+        key = (query.generation.id, query.map.version, photo_id, self.weights, self.mode)
+        with gateway.neighbours_lock:
+            cached = gateway.neighbours.get(key)
+        if cached is not None:
+            return cached
+        with gateway.catalog.read() as session:
+            located = find_descriptor(session, query.generation.id, photo_id)
+        if located is None:  # deleted since
+            return ()
+        descriptor, chunk = located
+        photo = replace(query, object_key=chunk.object_key, row=descriptor.row, photo_id=photo_id)
+        try:
+            found = replace(self, query=photo).find(WITH_PLACE, EVIDENCE_DEPTH + 1)
+        except Gone:  # its chunk was merged into another one between the two reads
+            return ()
+        if not found.response.missing:
+            with gateway.neighbours_lock:
+                gateway.neighbours[key] = found.ranking
+        return found.ranking
+
+
+def _first_similar(
+    search: _MapSearch, found: _Found, search_params: SearchParams, depth: int
 ) -> _Found:
     """Return the first `depth` photos whose plain cosine similarity reaches `min_score`."""
-    first = replace(found, hits=found.hits[:depth])
-    if search_params.min_score is None:
+    first, min_score = replace(found, hits=found.hits[:depth]), search_params.min_score
+    if min_score is None:
         return first
-    if weights:  # matching photos may be anywhere in the ranking by weighted scores
-        return search(search_params.photos, depth, min_score=search_params.min_score)
-    return replace(first, hits=[h for h in first.hits if h.score >= search_params.min_score])
+    if search.weights:  # matching photos may be anywhere in the ranking by weighted scores
+        return search.find(search_params.photos, depth, min_score)
+    return replace(first, hits=[hit for hit in first.hits if hit.score >= min_score])
 
 
 def _make_response(
@@ -318,12 +371,13 @@ def _make_response(
     response: SearchResponse,
     estimate: EstimateResponse,
     word_weights: str,
-    elapsed_ms: float,
+    elapsed_seconds: float,
 ) -> SimilarityResponse:
-    return SimilarityResponse(
+    return SimilarityResponse.of_row(
+        response,
         query_file_id=query.photo_id,
         query_filename=query.filename,
-        processing_time_ms=elapsed_ms,
+        processing_time_ms=elapsed_seconds * 1000,
         total_similar=0,
         similar_images=[],
         estimate=estimate,
@@ -331,13 +385,7 @@ def _make_response(
         word_weights=word_weights,
         generation_id=query.generation.id,
         rows=RowType(query.generation.row_type),
-        certificate=response.certificate,
-        max_z=response.max_z,
-        rows_scanned=response.rows_scanned,
-        rows_reranked=response.rows_reranked,
-        snapshot_version=response.snapshot_version,
         degraded=bool(response.missing),
-        missing=list(response.missing),
     )
 
 
@@ -346,9 +394,9 @@ def _make_history(
     search_params: SearchParams,
     found: _Found,
     similar: _Found,
-    estimate: EstimateResponse,
-    elapsed_ms: float,
+    response: SimilarityResponse,
 ) -> Search:
+    estimate = response.estimate
     return Search(
         map_id=query.map.id,
         generation_id=query.generation.id,
@@ -356,7 +404,7 @@ def _make_history(
         query_filename=query.filename,
         top_k=search_params.top_k,
         results=min(len(similar.hits), search_params.top_k),
-        processing_ms=elapsed_ms,
+        processing_ms=response.processing_time_ms,
         best_score=found.hits[0].score if found.hits else None,
         in_map=estimate.in_map,
         answer_level=estimate.answer_level,
@@ -376,89 +424,8 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
 
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
     """Return the first `k` live photos of the map, most similar first, without an estimate."""
-    weights = select_ranking_weights(query.generation, True)
-    return _search_live_photos(
-        gateway, query, SearchParams(), NO_FILTER, k, weights=weights.values
-    ).hits
-
-
-def _rank_neighbours(
-    gateway: GatewayContext,
-    query: SimilarityQuery,
-    search_params: SearchParams,
-    hits: Sequence[SearchHit],
-    weights: tuple[float, ...],
-) -> list[RankedPhoto]:
-    """Return the ranking of the best photo itself, without it and the query."""
-    if not hits:
-        return []
-    best = hits[0].photo_id
-    neighbours = gateway.neighbours.get_or_search(
-        (query.generation.id, query.map.version, best, weights, search_params.mode),
-        partial(_search_neighbours, gateway, query, search_params, best, weights),
-    )
-    return [ranked for ranked in neighbours if ranked.photo != query.photo_id]
-
-
-def _search_neighbours(
-    gateway: GatewayContext,
-    query: SimilarityQuery,
-    search_params: SearchParams,
-    photo_id: UUID,
-    weights: tuple[float, ...],
-) -> tuple[Neighbours, bool]:
-    """Search with a stored photo; return its ranking, and whether all of the map was searched."""
-    with gateway.catalog.read() as session:
-        located = find_descriptor(session, query.generation.id, photo_id)
-    if located is None:  # deleted since
-        return (), False
-    descriptor, chunk = located
-    photo = replace(query, object_key=chunk.object_key, row=descriptor.row, photo_id=photo_id)
-    try:
-        found = _search_live_photos(
-            gateway, photo, search_params, WITH_PLACE, EVIDENCE_DEPTH + 1, weights=weights
-        )
-    except Gone:  # its chunk was merged into another one between the two reads
-        return (), False
-    return tuple(found.ranking), not found.response.missing
-
-
-def _search_live_photos(
-    gateway: GatewayContext,
-    query: SimilarityQuery,
-    search_params: SearchParams,
-    photos: PhotoFilter,
-    depth: int,
-    *,
-    weights: tuple[float, ...],
-    min_score: float | None = None,
-) -> _Found:
-    """Return the first `depth` live photos; fewer if there are no more."""
-    k = depth
-    while True:
-        response = gateway.search.search(
-            SearchRequest(
-                map_id=query.map.id,
-                generation_id=query.generation.id,
-                object_key=query.object_key,
-                row=query.row,
-                min_version=query.map.version,
-                k=k,
-                photos=photos,
-                min_score=min_score,
-                exclude=(query.photo_id,) if query.photo_id else (),
-                word_weights=weights,
-                background=query.background,
-                mode=search_params.mode,
-            )
-        )
-        with gateway.catalog.read() as session:
-            live = get_live_photos(session, [hit.photo_id for hit in response.hits])
-        hits = [hit for hit in response.hits if hit.photo_id in live]
-        if len(hits) >= depth or len(response.hits) < k:
-            hits = hits[:depth]
-            return _Found(hits, live, response, locate_hits(hits, live))
-        k *= 2
+    weights = select_ranking_weights(query.generation, True).values
+    return _MapSearch(gateway, query, Mode.AUTO, weights).find(NO_FILTER, k).hits
 
 
 def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:

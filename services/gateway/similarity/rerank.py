@@ -15,12 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.idempotency import IdempotentRequest
-from services.gateway.schemas import (
-    ExplanationResponse,
-    PhotoResponse,
-    SimilarityResponse,
-    SimilarPhotoResponse,
-)
+from services.gateway.schemas import SimilarityResponse, SimilarPhotoResponse
 from services.gateway.similarity.execute import (
     SimilarityQuery,
     run_similarity_search,
@@ -137,14 +132,14 @@ def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> Sim
     return params.frame.model_copy(
         update={"processing_time_ms": params.frame.processing_time_ms + elapsed_ms}
     ).with_photos(
-        SimilarPhotoResponse(
+        SimilarPhotoResponse.of(
+            photos[candidate.photo_id],
+            map_name,
             similarity_score=searched[candidate.photo_id].score,
             weighted_score=searched[candidate.photo_id].weighted_score,
             rerank_score=candidate.rerank_score,
             match_probability=params.match_probabilities.get(candidate.photo_id),
-            explanation=candidate.explanation
-            and ExplanationResponse.model_validate(candidate.explanation),
-            **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
+            explanation=candidate.explanation,
         )
         for candidate in live[: params.top_k]
     )

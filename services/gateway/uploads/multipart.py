@@ -1,14 +1,16 @@
 """Streaming parser of multipart/form-data bodies, and the upload of a single file.
 
-`store_form_file` writes the file of a form to the object store while it is received: with bounded
+`receive_form_file` writes the file of a form to the object store while it is received: with bounded
 memory, counted and hashed. Starlette's `request.form()` would spool the whole body to disk first.
 A body that is too large, or whose file is not a photo, is refused without reading the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+import contextlib
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 from fastapi import Request
 from python_multipart.exceptions import MultipartParseError
@@ -160,12 +162,31 @@ def _parse_boundary(request: Request) -> bytes:
 
 
 FILE_FIELD = "file"
-Result = TypeVar("Result")
 # Size of one write to the store: each write is a switch to a worker thread.
 STORE_WRITE_BYTES = 512 * 1024
 
 
-async def store_form_file(
+@dataclass(frozen=True, slots=True)
+class FormFile:
+    """A completely received file; its object is visible in the store after `complete`."""
+
+    upload: StoredUpload
+    _store: ObjectStore
+    _writer: ObjectWriter | None
+    _rest: bytes
+
+    def complete(self) -> StoredUpload:
+        """Write what is left and make the object visible. Blocks."""
+        if self._writer is None:
+            self._store.put(self.upload.key, self._rest)
+        else:
+            self._writer.write(self._rest)
+            self._writer.commit()
+        return self.upload
+
+
+@contextlib.asynccontextmanager
+async def receive_form_file(
     request: Request,
     store: ObjectStore,
     make_key: Callable[[str], str],
@@ -173,40 +194,19 @@ async def store_form_file(
     check_begin: Callable[[bytes], object] = lambda begin: None,
     *,
     too_large: Callable[[int], PlacewiseError] = file_too_large_error,
-) -> StoredUpload:
-    """Store the file of a form as `use_form_file` does, and return it."""
-    return await use_form_file(
-        request, store, make_key, max_bytes, lambda upload: upload, check_begin, too_large=too_large
-    )
+) -> AsyncIterator[FormFile]:
+    """Receive the file of a form, and write it to the object store meanwhile.
 
-
-async def use_form_file(
-    request: Request,
-    store: ObjectStore,
-    make_key: Callable[[str], str],
-    max_bytes: int,
-    use: Callable[[StoredUpload], Result],
-    check_begin: Callable[[bytes], object] = lambda begin: None,
-    *,
-    too_large: Callable[[int], PlacewiseError] = file_too_large_error,
-) -> Result:
-    """Store the file of a form in the object store while it is received, and use it.
-
-    Nothing is left in the store if it raises before `use` is called.
+    The block completes the object, best in the worker thread that uses it next: a change of
+    threads costs as much as a statement. Nothing is left in the store if it raises before.
 
     Args:
         request: The request whose body is read.
         store: The object store.
         make_key: Makes the object key of the file from its name.
         max_bytes: Maximum size of the file.
-        use: Called with the stored file and the text fields of the form, in the worker thread that
-            has completed the object: a change of threads costs as much as a statement. The object
-            belongs to it, also if it raises.
         check_begin: Called with the first bytes before the rest is read; may raise.
         too_large: Builds the exception for a file of more than `max_bytes`.
-
-    Returns:
-        What `use` returns.
 
     Raises:
         InvalidRequest: No multipart body, no file, several files or an empty file.
@@ -230,39 +230,20 @@ async def use_form_file(
         form.finish()
         parts.require_file()
         rest = parts.take_pending()
-        small_file = rest if writer is None else None
-        if small_file == b"":
-            raise InvalidRequest("empty_file", "The file is empty.")
-        key = key or make_key(parts.filename)
-
-        def finish_and_use() -> Result:
-            _finish_object(store, key, writer, rest)
-            return use(
-                StoredUpload(
-                    key=key,
-                    filename=parts.filename,
-                    size_bytes=parts.file.size_bytes,
-                    sha256=parts.file.sha256,
-                    first_bytes=parts.file.first_bytes,
-                    fields=parts.fields,
-                    content=small_file,
-                )
-            )
-
-        return await run_in_threadpool(finish_and_use)
+        upload = StoredUpload(
+            key=key or make_key(parts.filename),
+            filename=parts.filename,
+            size_bytes=parts.file.size_bytes,
+            sha256=parts.file.sha256,
+            first_bytes=parts.file.first_bytes,
+            fields=parts.fields,
+            content=rest if writer is None else None,
+        )
+        yield FormFile(upload, store, writer, rest)
     except BaseException:
         if writer is not None:
             await run_in_threadpool(writer.abort)
         raise
-
-
-def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
-    """Write the remaining bytes and make the object visible."""
-    if writer is None:
-        store.put(key, rest)
-        return
-    writer.write(rest)
-    writer.commit()
 
 
 def multipart_schema(
@@ -306,11 +287,13 @@ class _SingleFileHandler:
         return data
 
     def require_file(self) -> None:
-        """Raise InvalidRequest (`no_file`) if the form has no file."""
+        """Raise InvalidRequest (`no_file`, `empty_file`) if the form has no file, or no bytes."""
         if not self._file_seen:
             raise InvalidRequest(
                 "no_file", f"The form has no file in the field {FILE_FIELD!r}: curl -F file=@PHOTO."
             )
+        if not self.file.size_bytes:
+            raise InvalidRequest("empty_file", "The file is empty.")
 
     def begin(self, name: str, filename: str | None) -> None:
         if filename is None:

@@ -2,45 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import AsyncIterator
 from uuid import UUID
 
 from fastapi import Request
 
 from services.gateway.admission import AdmissionControl, UploadKind
 from services.gateway.dependencies import GatewayContext
-from services.gateway.idempotency import IdempotentRequest
 from services.gateway.similarity.search_params import SearchParams
-from services.gateway.uploads.multipart import store_form_file
+from services.gateway.uploads.multipart import FormFile, receive_form_file
 from shared.ids import new_id
-from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.ingest.validation import check_photo_signature
 from shared.jobs import Job, JobKind, Priority
 from shared.storage.keys import query_key
 
 
+@contextlib.asynccontextmanager
 async def receive_query_photo(
-    request: Request,
-    gateway: GatewayContext,
-    admission: AdmissionControl,
-    idempotent: IdempotentRequest,
-) -> tuple[UUID, StoredUpload]:
-    """Store the photo of a request's form; its signature is checked as it arrives.
+    request: Request, gateway: GatewayContext, admission: AdmissionControl
+) -> AsyncIterator[tuple[UUID, FormFile]]:
+    """Receive the photo of a request's form; its signature is checked as it arrives.
 
-    Returns:
-        The id of its future job, and the upload.
+    Yields the id of its future job, and the file, which the block completes.
     """
     job_id = new_id()
     with admission.admit_upload(UploadKind.QUERY, request):
-        received = await store_form_file(
+        async with receive_form_file(
             request,
             gateway.store,
             lambda _filename: query_key(job_id),
             gateway.settings.max_file_size,
             check_photo_signature,
-        )
-    await idempotent.claim_form(
-        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
-    )
-    return job_id, received
+        ) as file:
+            yield job_id, file
 
 
 def describe_query_job(

@@ -20,9 +20,8 @@ from shared.errors import NotFound
 from shared.imaging.photo_header import PhotoHeader
 from shared.ingest import store_photo as store_photo_module
 from shared.ingest.photo_metadata import PhotoFields
-from shared.ingest.store_photo import StoreResult, insert_photo, store_photo
+from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto
-from shared.jobs import InProcessWakeups
 from tests.support.catalog_rows import add_map, delete
 
 NAME = "of the photo"
@@ -40,12 +39,9 @@ def photo(number: int = 0, key: str = "originals/a") -> ValidatedPhoto:
     return ValidatedPhoto(received, "image/jpeg", header, PhotoFields(place="hall", tags=["day"]))
 
 
-def stay(_session: Session, result: StoreResult) -> StoreResult:
-    return result
-
-
 def store(catalog: Catalog, incoming: ValidatedPhoto) -> StoreResult:
-    return store_photo(catalog, InProcessWakeups(), NAME, incoming, stay)
+    with catalog.write() as session:
+        return insert_photo(session, NAME, incoming)
 
 
 @contextmanager

@@ -251,10 +251,9 @@ def test_metadata_of_a_model_is_validated(service: Service, field: str, value: s
 
 
 def test_a_checkpoint_over_the_limit_is_refused_while_it_comes(service: Service) -> None:
-    small = service.settings.model_copy(update={"max_model_bytes": 100_000})
-    limited = Service(service.catalog, service.store, small, service.make_worker)
-    body = problem(send(limited, bytes(1_000_000)), 413, "file_too_large")
-    assert "MAX_MODEL_BYTES" in body["detail"]
+    form = {"data": {"name": "walks"}, "files": {"file": ("best.ckpt", b"whatever")}}
+    answer = service("POST", "/models", **form, headers={"Content-Length": "7000000000"})
+    assert "--save_weights_only" in problem(answer, 413, "file_too_large")["detail"]
     assert keys(service, CHECKPOINTS) == []
 
 

@@ -23,7 +23,7 @@ from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.queue_depth import THROUGHPUT_WINDOW_SECONDS, measure_queue_depth
+from shared.jobs.queue_depth import THROUGHPUT_WINDOW_SECONDS, QueueDepth, measure_queue_depth
 from shared.security.api_keys import ALL_SCOPES
 from shared.storage import FolderStore
 from tests.integration.in_process_api import Service
@@ -239,8 +239,10 @@ def test_a_look_is_taken_once_for_many_calls(
 def test_the_time_to_come_again_follows_from_the_queue_and_its_speed(
     waiting: int, per_second: float, seconds: int
 ) -> None:
-    error = admission._queue_full_error("jobs", waiting, 1000, per_second)
-    assert error.extra["retry_after_seconds"] == seconds
+    depth = QueueDepth({}, 0, finished_per_second=per_second)
+    with pytest.raises(TooManyRequests) as caught:
+        admission._check_queue("jobs", waiting, 1000, depth)
+    assert caught.value.extra["retry_after_seconds"] == seconds
 
 
 def test_a_full_disk_takes_no_photo_and_answers_all_else(

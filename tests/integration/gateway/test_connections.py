@@ -20,7 +20,6 @@ import pytest
 from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
-from services import http_connections
 from services.http_connections import ConnectionLimits, Connections, Reason, address_group
 from services.http_server import http_server, listen
 from services.request_log import RequestLogMiddleware, RequestRecord
@@ -198,16 +197,10 @@ def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
         server.wait_for(lambda: server.connections.count == 0)
 
 
-@pytest.fixture
-def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_connections, "BODY_WINDOW_SECONDS", 0.5)
-
-
-@pytest.mark.usefixtures("short_window")
 def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with serving(body_bytes_per_second=1000) as server:
+    with serving(body_bytes_per_second=1000, body_window_seconds=0.5) as server:
         with server.connect() as slow, server.connect() as fast, server.connect() as unread:
             slow.sendall(HEAD + b"x")
             # Answered before its body has come, which goes on to be read.
@@ -228,10 +221,9 @@ def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
-@pytest.mark.usefixtures("short_window")
 def test_a_client_is_not_blamed_for_a_server_that_does_not_read() -> None:
     with (
-        serving(body_bytes_per_second=1_000_000) as server,
+        serving(body_bytes_per_second=1_000_000, body_window_seconds=0.5) as server,
         server.connect() as client,
         server.connect() as polite,
     ):
@@ -256,9 +248,8 @@ def test_a_client_that_disconnects_counts_as_499_without_a_traceback(
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
-def test_an_answer_that_nobody_reads_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_connections, "STALLED_SECONDS", 1.0)
-    with serving() as server:
+def test_an_answer_that_nobody_reads_ends_the_connection() -> None:
+    with serving(stalled_seconds=1.0) as server:
         with server.connect() as reading, server.connect() as stalled:
             for client in (reading, stalled):
                 client.sendall(ASK.replace(b"whoami", b"much"))

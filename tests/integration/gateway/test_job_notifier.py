@@ -1,21 +1,23 @@
-"""Waiting for jobs: many requests share one look at the table, and none is answered too early."""
+"""Waiting for jobs: many requests share one poll of the table, and none is answered too early."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from uuid import UUID
 
 import pytest
+from sqlalchemy import event
 from sqlalchemy.exc import OperationalError
 
-from services.gateway import dependencies
-from services.gateway.dependencies import Change, JobNotifier, WatchedState
+from services.gateway.dependencies import NOTIFIER_POLL_SECONDS, Change, JobNotifier
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.ids import new_id
-from shared.jobs import Job, JobState
+from shared.jobs import JobState
 from tests.support.catalog_rows import add_job, add_map, set_columns
 
 LONG = 30.0
@@ -36,15 +38,15 @@ def jobs(catalog: Catalog) -> list[UUID]:
 
 
 async def started(*waits: asyncio.Task[None]) -> None:
-    """Returns when they have looked at least once."""
-    await asyncio.sleep(5 * dependencies.NOTIFIER_POLL_SECONDS)
+    """Return when the job table was polled at least once."""
+    await asyncio.sleep(5 * NOTIFIER_POLL_SECONDS)
     assert not any(wait.done() for wait in waits)
 
 
 def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUID]) -> None:
     async def scenario() -> None:
-        watch = JobNotifier(catalog)
-        waits = [asyncio.create_task(watch.wait_until_finished(job, LONG)) for job in jobs]
+        notifier = JobNotifier(catalog)
+        waits = [asyncio.create_task(notifier.wait_until_finished(job, LONG)) for job in jobs]
         await started(*waits)
         for job, wait in zip(jobs, waits, strict=True):
             assert not wait.done()
@@ -54,20 +56,24 @@ def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUI
     asyncio.run(scenario())
 
 
-def test_one_slow_look_does_not_hold_up_the_next_ones(
-    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@contextlib.contextmanager
+def on_each_select(catalog: Catalog, act: Callable[[str], object]) -> Iterator[None]:
+    """Call `act` with each SELECT of the block, before it is executed."""
+
+    def listen(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        if statement.startswith("SELECT"):
+            act(statement)
+
+    event.listen(catalog.engine, "before_cursor_execute", listen)
+    try:
+        yield
+    finally:
+        event.remove(catalog.engine, "before_cursor_execute", listen)
+
+
+def test_one_slow_poll_does_not_delay_the_next_ones(catalog: Catalog, jobs: list[UUID]) -> None:
     """A tenth of the time would be a pause of 20 seconds."""
-    look, looks = dependencies._load_watched_states, 0
-
-    def slow_at_first(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
-        nonlocal looks
-        looks += 1
-        states = look(catalog, job_ids)
-        time.sleep(2.0 if looks == 1 else 0.0)
-        return states
-
-    monkeypatch.setattr(dependencies, "_load_watched_states", slow_at_first)
+    pauses = iter([2.0])
 
     async def scenario() -> None:
         wait = asyncio.create_task(JobNotifier(catalog).wait_until_finished(jobs[0], LONG))
@@ -75,7 +81,8 @@ def test_one_slow_look_does_not_hold_up_the_next_ones(
         set_columns(catalog, jobs[0], state=JobState.FAILED)
         await asyncio.wait_for(wait, LONG / 2)
 
-    asyncio.run(scenario())
+    with on_each_select(catalog, lambda _: time.sleep(next(pauses, 0.0))):
+        asyncio.run(scenario())
 
 
 def test_job_that_is_gone_is_not_waited_for(catalog: Catalog) -> None:
@@ -86,120 +93,95 @@ def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) ->
     asyncio.run(JobNotifier(catalog).wait_until_finished(jobs[0], 0.05))
 
 
-def test_stopping_server_lets_nobody_wait_for_long(
-    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+def test_a_stopping_server_releases_the_waiting_requests(
+    catalog: Catalog, jobs: list[UUID]
 ) -> None:
-    monkeypatch.setattr(dependencies, "SHUTDOWN_WAIT_SECONDS", 0.0)
-
     async def scenario() -> None:
-        watch = JobNotifier(catalog)
-        wait = asyncio.create_task(watch.wait_until_finished(jobs[0], 10 * LONG))
+        notifier = JobNotifier(catalog, shutdown_wait_seconds=0.0)
+        wait = asyncio.create_task(notifier.wait_until_finished(jobs[0], 10 * LONG))
         await started(wait)
-        watch.begin_shutdown()
+        notifier.begin_shutdown()
         await asyncio.wait_for(wait, LONG)
 
     asyncio.run(scenario())
 
 
-def count_looks(monkeypatch: pytest.MonkeyPatch, looks: list[set[UUID]]) -> None:
-    real = dependencies._load_watched_states
-
-    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
-        looks.append(job_ids)
-        return real(catalog, job_ids)
-
-    monkeypatch.setattr(dependencies, "_load_watched_states", counted)
-
-
-def test_all_that_wait_share_one_look(
-    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looks: list[set[UUID]] = []
-    count_looks(monkeypatch, looks)
+def test_waiting_requests_share_one_poll(catalog: Catalog, jobs: list[UUID]) -> None:
+    polls: list[str] = []
 
     async def scenario() -> None:
-        watch = JobNotifier(catalog)
+        notifier = JobNotifier(catalog)
         waits = [
-            asyncio.create_task(watch.wait_until_finished(jobs[n % 3], LONG)) for n in range(60)
+            asyncio.create_task(notifier.wait_until_finished(jobs[n % 3], LONG)) for n in range(60)
         ]
         await started(*waits)
-        before = len(looks)
-        assert before <= 6, "one look serves all sixty"
-        assert looks[-1] == set(jobs)
+        assert len(polls) <= 6, "one poll serves all sixty"
         for job in jobs:
             set_columns(catalog, job, state=JobState.SUCCEEDED)
         await asyncio.wait_for(asyncio.gather(*waits), LONG)
-        after = len(looks)
-        await asyncio.sleep(5 * dependencies.NOTIFIER_POLL_SECONDS)
-        assert len(looks) == after, "nobody waits, nobody looks"
+        polls.clear()
+        await asyncio.sleep(5 * NOTIFIER_POLL_SECONDS)
+        assert polls == [], "nothing is polled while no request waits"
 
-    asyncio.run(scenario())
+    with on_each_select(catalog, polls.append):
+        asyncio.run(scenario())
 
 
-def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
-    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+def test_event_streams_share_one_poll_and_wake_at_their_jobs_change(
+    catalog: Catalog, jobs: list[UUID]
 ) -> None:
-    looks: list[set[UUID]] = []
-    read: list[set[UUID]] = []
-    count_looks(monkeypatch, looks)
-    real = dependencies._load_jobs
+    polls: list[str] = []
 
-    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
-        read.append(job_ids)
-        return real(catalog, job_ids)
-
-    monkeypatch.setattr(dependencies, "_load_jobs", counted)
-    monkeypatch.setattr(dependencies, "CHANGE_POLL_SECONDS", 0.1)
+    def whole_rows() -> list[str]:
+        return [statement for statement in polls if "jobs.params" in statement]
 
     async def scenario() -> None:
-        watch = JobNotifier(catalog)
-        seen = await asyncio.gather(*(watch.wait_for_change(job, (), LONG) for job in jobs))
-        marks = {change.job.id: change.state for change in seen if change}
-        looks.clear()
-        read.clear()
+        notifier = JobNotifier(catalog)
+        seen = await asyncio.gather(*(notifier.wait_for_change(job, (), LONG) for job in jobs))
+        states = {change.job.id: change.state for change in seen if change}
+        polls.clear()
         waits = [
-            asyncio.create_task(watch.wait_for_change(jobs[n % 3], marks[jobs[n % 3]], LONG))
+            asyncio.create_task(notifier.wait_for_change(jobs[n % 3], states[jobs[n % 3]], LONG))
             for n in range(500)
         ]
-        await asyncio.sleep(0.5)
-        assert 1 <= len(looks) <= 6, "not one for each stream"
-        assert read == [], "nothing has changed: nothing is read"
+        await asyncio.sleep(1.0)
+        assert 1 <= len(polls) <= 6, "not one for each stream"
+        assert whole_rows() == [], "nothing has changed"
         assert not any(wait.done() for wait in waits)
         set_columns(catalog, jobs[1], progress_done=7)
         for change in await asyncio.wait_for(asyncio.gather(*waits[1::3]), LONG):
             assert change is not None
             assert change.job.progress_done == 7
-        assert read == [{jobs[1]}]
         assert not any(wait.done() for wait in waits[0::3])
-        watch.begin_shutdown()
+        notifier.begin_shutdown()
         ended = await asyncio.wait_for(asyncio.gather(*waits[0::3]), LONG)
         assert set(ended) == {None}, "a server that stops ends its streams"
-        assert await watch.wait_for_change(jobs[0], (), LONG) is None
+        assert await notifier.wait_for_change(jobs[0], (), LONG) is None
 
-    asyncio.run(scenario())
+    with on_each_select(catalog, polls.append):
+        asyncio.run(scenario())
 
 
 def test_waiting_for_a_change_ends_with_an_outage_of_the_catalog_and_with_the_timeout(
-    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+    catalog: Catalog, jobs: list[UUID]
 ) -> None:
-    def fail(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
-        raise OperationalError("select", {}, Exception("away"))
+    def fail(statement: str) -> None:
+        raise OperationalError(statement, {}, Exception("unreachable"))
 
     async def wait(seconds: float) -> Change | None:
         return await JobNotifier(catalog).wait_for_change(jobs[0], (), seconds)
 
     with pytest.raises(TimeoutError):
         asyncio.run(wait(0.001))
-    monkeypatch.setattr(dependencies, "_load_watched_states", fail)
-    with pytest.raises(OperationalError):
+    with on_each_select(catalog, fail), pytest.raises(OperationalError):
         asyncio.run(wait(LONG))
 
 
 def test_a_client_that_disconnects_ends_no_other_wait(catalog: Catalog, jobs: list[UUID]) -> None:
     async def scenario() -> None:
-        watch = JobNotifier(catalog)
+        notifier = JobNotifier(catalog)
         goes, stays = (
-            asyncio.create_task(watch.wait_until_finished(jobs[0], LONG)) for _ in range(2)
+            asyncio.create_task(notifier.wait_until_finished(jobs[0], LONG)) for _ in range(2)
         )
         await started(goes, stays)
         goes.cancel()

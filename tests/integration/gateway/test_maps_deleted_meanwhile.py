@@ -20,7 +20,7 @@ from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
-from shared.ingest.store_photo import store_photo
+from shared.ingest.validation import validate_photo
 from shared.jobs import Job, JobState
 from shared.storage import FolderStore
 from tests.integration.gateway.deleted_maps import id_of, objects, remove_all, rows
@@ -218,14 +218,14 @@ def test_an_upload_whose_map_went_meanwhile_is_not_found_and_leaves_no_bytes(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "gone"})
-    real = store_photo
+    real = validate_photo
 
     def delete_first(*arguments: Any) -> Any:
         service.json("DELETE", "/maps/gone")
         remove_all(catalog, store)
         return real(*arguments)
 
-    monkeypatch.setattr(uploads_module, "store_photo", delete_first)
+    monkeypatch.setattr(uploads_module, "validate_photo", delete_first)
     files = {"file": photo_bytes(1)}
     answer = service("POST", "/upload", params={"map": "gone"}, files=files)
     assert "placewise maps create gone" in problem(answer, 404, "map_not_found")["detail"]

@@ -15,8 +15,7 @@ from shared.jobs import InProcessWakeups
 from tests.integration.in_process_api import Service
 from tests.support.problems import field_refused, problem
 
-# tests/e2e/test_vocabulary_command.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = pytest.mark.databases("sqlite")
 
 PHOTOS = 8
 

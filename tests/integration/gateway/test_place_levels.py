@@ -9,12 +9,12 @@ import pytest
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.evaluation.places.probability import PlaceModel
+from shared.search_api.protocol import SearchRequest, SearchResponse
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_estimates.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = pytest.mark.databases("sqlite")
 
 PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
 
@@ -191,3 +191,28 @@ def test_a_certainty_is_a_share(service: Service, certainty: str) -> None:
         service("POST", "/similarity", params={"certainty": certainty}, files=files).status_code
         == 422
     )
+
+
+def test_the_neighbours_of_a_best_photo_are_searched_once_in_an_unchanged_map(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.indexed(0, 1, place="hall")
+    real = service.search.search
+    missing: tuple[str, ...] = ("shard 1/2",)
+    requests: list[SearchRequest] = []
+
+    def search(request: SearchRequest) -> SearchResponse:
+        requests.append(request)
+        return real(request).model_copy(update={"missing": missing})
+
+    def searches() -> int:
+        requests.clear()
+        ask(service, 0)
+        return len(requests)
+
+    monkeypatch.setattr(service.search, "search", search)
+    assert [searches(), searches()] == [2, 2], "a ranking that lacks a shard is not cached"
+    missing = ()
+    assert [searches(), searches()] == [2, 1]
+    service.indexed(2, place="hall")
+    assert [searches(), searches()] == [2, 1], "the map has changed"

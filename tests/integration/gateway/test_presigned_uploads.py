@@ -22,7 +22,6 @@ from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.config.settings import Settings
-from shared.imaging.photo_header import read_photo_header
 from shared.storage import FolderStore
 from shared.storage.keys import JOURNAL, TRASH
 from shared.storage.s3 import S3Store
@@ -31,8 +30,7 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.servers import S3Server, start_moto
 
-# tests/e2e/test_s3.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = pytest.mark.databases("sqlite")
 
 PHOTO = photo_bytes(1)
 
@@ -149,6 +147,7 @@ def test_completing_twice_gives_the_same_answer_and_one_photo(
     assert (photos(catalog), len(keys(store, "originals/"))) == (1, 1)
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_completing_many_times_at_once_gives_one_answer_and_one_photo(
     service: Service, store: S3Store, catalog: Catalog
 ) -> None:
@@ -239,13 +238,9 @@ def test_what_is_no_photo_is_refused_and_leaves_no_original(
     sent: bytes,
     status: int,
     code: str,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if code == "too_many_pixels":
-        monkeypatch.setattr(
-            "services.gateway.routes.presigned_uploads.read_photo_header",
-            lambda file, _: read_photo_header(file, 100),
-        )
+    settings = service.settings.model_copy(update={"max_image_pixels": 100})
+    service = Service(catalog, store, settings, service.make_worker)
     upload = presign(service, sent)
     assert put(upload, sent) == 200
     problem(complete(service, upload), status, code)

@@ -13,8 +13,7 @@ from shared.storage.keys import preview_key
 from tests.integration.in_process_api import Service
 from tests.support.photos import encoded, photo_image
 
-# tests/e2e/test_photos.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
+pytestmark = pytest.mark.databases("sqlite")
 
 SERIAL = "camera-serial-0815"
 

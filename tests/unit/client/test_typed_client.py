@@ -21,6 +21,7 @@ from services.gateway import schemas
 from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
 from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
+from shared.search_api.comparison import ClusterContribution, SimilarityExplanation
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
@@ -32,8 +33,8 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Uploaded, schemas.UploadResponse),
     (answers.Similar, schemas.SimilarityResponse),
     (answers.Estimate, schemas.EstimateResponse),
-    (answers.Explanation, schemas.ExplanationResponse),
-    (answers.ClusterShare, schemas.ClusterShareResponse),
+    (answers.Explanation, SimilarityExplanation),
+    (answers.ClusterShare, ClusterContribution),
     (answers.TrackState, TrackStateResponse),
     (answers.Track, tracks.TrackResponse),
     (answers.OneTrack, tracks.TrackDetailResponse),

@@ -90,7 +90,6 @@ def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) 
         ("MAX_QUEUED_JOBS", "0"),
         ("MAX_CONCURRENT_UPLOADS", "0"),
         ("MIN_FREE_BYTES", "-1"),
-        ("PRESIGN_SECONDS", "604801"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(

@@ -20,7 +20,6 @@ from services.gateway.authentication import (
     parse_bearer,
 )
 from shared.catalog.database.session import Catalog
-from shared.config.embedded_home import announce_server, find_running_server
 from shared.config.private_files import write_private
 from shared.config.settings import Settings
 from shared.errors import Forbidden, Unauthorized, Unavailable
@@ -113,6 +112,19 @@ def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
         assert len(key) - len(api_key_prefix(key)) > 32
 
 
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        *((host, True) for host in ("127.8.9.10", "::1", "LocalHost")),
+        *((host, False) for host in ("0.0.0.0", "::", "fe80::1", "", "localhost.example")),
+    ],
+)
+def test_loopback_addresses_are_those_that_only_this_machine_reaches(
+    host: str, expected: bool
+) -> None:
+    assert is_loopback(host) is expected
+
+
 def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
     assert expand_scopes([Scope.ADMIN]) == set(Scope)
     assert expand_scopes([Scope.WRITE]) == {Scope.WRITE}
@@ -156,12 +168,9 @@ def test_without_keys_no_page_of_elsewhere_may_call(fields: dict[str, str]) -> N
     with pytest.raises(Forbidden) as caught:
         check(LocalhostAuthenticator(), **fields)
     assert caught.value.code == "foreign_page"
-    refused = fields.get("origin") if is_local(fields.get("host", "")) else fields.get("host", "")
-    assert repr(refused) in caught.value.detail, "what was refused is named"
-
-
-def is_local(host: str) -> bool:
-    return host.startswith("localhost:")
+    host = fields.get("host", "")
+    refused = fields.get("origin") if host.startswith("localhost:") else host
+    assert repr(refused) in caught.value.detail
 
 
 @pytest.mark.parametrize(
@@ -204,21 +213,6 @@ def test_a_chosen_key_is_masked_and_an_empty_one_is_none(monkeypatch: pytest.Mon
     assert Settings().admin_key is None
 
 
-# --- where it is needed ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.9.10", "::1", "localhost", "LocalHost"])
-def test_loopback_is_reached_by_this_machine_alone(host: str) -> None:
-    assert is_loopback(host)
-
-
-@pytest.mark.parametrize(
-    "host", ["0.0.0.0", "::", "192.168.1.5", "fe80::1", "places.example", "", "localhost.example"]
-)
-def test_every_other_address_is_beyond_loopback(host: str) -> None:
-    assert not is_loopback(host)
-
-
 # --- the folder ------------------------------------------------------------------------------
 
 
@@ -233,8 +227,3 @@ def test_what_is_written_privately_is_readable_by_its_user_alone(tmp_path: Path)
     assert file.read_text() == "new"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert list(tmp_path.iterdir()) == [file]
-
-
-def test_a_folder_without_a_server_gives_no_key_away(tmp_path: Path) -> None:
-    with announce_server(tmp_path, "http://127.0.0.1:1", KEY):
-        assert find_running_server(tmp_path) is None, "nobody holds the folder's lock"

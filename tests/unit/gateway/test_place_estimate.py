@@ -13,7 +13,6 @@ from shared.evaluation.places.evidence import (
     PhotoLocation,
     RankedPhoto,
     estimate_location,
-    is_same_place,
 )
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
@@ -32,22 +31,6 @@ def north(metres: float, place: str | None = None) -> PhotoLocation:
 
 def ranking(*pairs: tuple[float, PhotoLocation]) -> list[RankedPhoto]:
     return [RankedPhoto(score, spot) for score, spot in pairs]
-
-
-# --- places ----------------------------------------------------------------------------------
-
-
-def test_near_photos_and_photos_of_one_label_show_one_place() -> None:
-    assert is_same_place(north(0), north(24.9), RADIUS_M)
-    assert not is_same_place(north(0), north(25.2), RADIUS_M)
-    assert is_same_place(
-        PhotoLocation(None, None, "lab"), PhotoLocation(None, None, "lab"), RADIUS_M
-    )
-    assert is_same_place(north(0, "square"), north(80, "square"), RADIUS_M)
-    assert not is_same_place(
-        PhotoLocation(None, None, None), PhotoLocation(None, None, None), RADIUS_M
-    )
-    assert not is_same_place(north(0), PhotoLocation(None, None, "lab"), RADIUS_M)
 
 
 # --- position --------------------------------------------------------------------------------

@@ -154,7 +154,6 @@ def test_the_peer_is_the_connection_and_not_what_its_headers_say(settings: Setti
     ("name", "value"),
     [
         ("SIGN_IN_PROXIES", "proxy.example"),
-        ("SIGN_IN_USER_HEADER", "X Forwarded"),
         ("SIGN_IN_SCOPES", "editors"),
         ("SIGN_IN_SCOPES", "editors:everything"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from uuid import UUID
 
 import httpx2
@@ -11,8 +12,9 @@ import pytest
 from shared.config.shards import Shard
 from shared.errors import Gone, NotFound, Unavailable
 from shared.ids import new_id
+from shared.search_api.client import call_search, fetch_status
 from shared.search_api.protocol import SearchRequest, SearchStatus
-from shared.search_api.workers import WorkerDirectory, WorkerUnavailable, call_search, fetch_status
+from shared.search_api.workers import WorkerDirectory, WorkerUnavailable
 
 GENERATION = new_id()
 
@@ -33,7 +35,7 @@ class FakeWorkers:
         return found
 
     def seen(self) -> WorkerDirectory:
-        workers = WorkerDirectory(list(self.answers), self.http)
+        workers = WorkerDirectory(list(self.answers), partial(fetch_status, self.http))
         workers.refresh()
         return workers
 
@@ -141,7 +143,7 @@ def test_whoever_does_not_answer_as_a_search_worker_does_is_away(
     with pytest.raises(WorkerUnavailable, match="http://a"):
         call_search(fake.http, "http://a", REQUEST, 1.0)
     with pytest.raises(WorkerUnavailable):
-        fetch_status(fake.http, "http://a", 1.0)
+        fetch_status(fake.http, "http://a")
 
 
 @pytest.mark.parametrize("kind", [Gone, NotFound, Unavailable])
