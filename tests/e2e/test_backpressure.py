@@ -82,21 +82,6 @@ def test_one_concurrent_upload_too_many_gets_retry_after(server: ServerProcess) 
     assert receiving(server) == 0
 
 
-def test_a_full_queue_refuses_uploads_and_asks_queries(server: ServerProcess) -> None:
-    with server.no_decoding():
-        answers = [server.upload(photo_bytes(200 + number)) for number in range(6)]
-        refused = [answer for answer in answers if answer.status_code != 202]
-        assert refused
-        for answer in refused:
-            problem(answer, 429, "queue_full")
-            assert int(answer.headers["retry-after"]) >= 1
-        response = server.ask(near_copy(0), wait=0)
-        assert response.status_code == 202
-        load = server.client.get("/api/v1/health").json()["load"]
-        assert load["max_queued_jobs"] == 1
-    assert server.finished(response.json()["job_id"])["state"] == "succeeded"
-
-
 def test_index_waits_for_a_full_queue_says_so_and_goes_on(
     server: ServerProcess, tmp_path: Path
 ) -> None:

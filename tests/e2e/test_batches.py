@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import placewise
 from placewise.client import Client
 from shared.errors import InvalidRequest
 from tests.e2e.test_separate_services import Deployment, until
@@ -202,20 +201,6 @@ def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -
     assert index(server, listed)["uploaded"] == 1
     refused = index(server, listed, "--journal", str(tmp_path / "j.jsonl"), code=1)
     assert refused["code"] == "unsupported_option"
-
-
-def test_the_client_brings_in_a_prefix(server: ServerProcess) -> None:
-    imports = server.home / "objects" / "imports" / "prefix"
-    imports.mkdir(parents=True)
-    for name, data in photos(190, 191).items():
-        (imports / name).write_bytes(data)
-    with placewise.connect(str(server.client.base_url)) as places:
-        started = places.import_prefix("imports/prefix")
-        assert places.wait(started).progress.done == 2
-        assert [item.name for item in places.batch_items(started)] == [
-            "imports/prefix/190.jpg",
-            "imports/prefix/191.jpg",
-        ]
 
 
 def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import httpx2
 import pytest
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import problem
 from tests.support.server import ServerProcess
 
 AUTOMATIC = 64  # located photos from which a map is evaluated by itself
@@ -189,18 +188,6 @@ def test_rooms_have_a_label_and_no_coordinates(server: ServerProcess) -> None:
     assert (figures["queries"], figures["without_positive"]) == (6, 0)
 
 
-def test_photos_of_nowhere_give_a_reason_instead_of_a_place(server: ServerProcess) -> None:
-    numbers = [next(fresh) for _ in range(2)]
-    fill(server, "nowhere", numbers, {}, {})
-    answer = ask(server, "nowhere", re_encoded(numbers[0]))
-    estimate = answer["estimate"]
-    assert (estimate["in_map"], estimate["latitude"], estimate["place"]) == (None, None, None)
-    assert estimate["reason"].startswith("None of the photos that were found has coordinates")
-    assert answer["matches_without_place"] == 2
-    described = got(server.client.get("/api/v1/maps/nowhere"))
-    assert (described["located"], described["measurement"]) == (0, "too_few_photos")
-
-
 def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProcess) -> None:
     numbers = [next(fresh) for _ in range(MANY)]
     fill(server, "many", numbers, *({} for _ in numbers))
@@ -234,9 +221,3 @@ def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> N
         ]
     assert found[0]["automatic"]
     assert ask(server, "grown", re_encoded(numbers[1]))["estimate"]["in_map"] is not None
-
-
-def test_there_is_nothing_to_evaluate_in_an_empty_map(server: ServerProcess) -> None:
-    got(server.client.post("/api/v1/maps", json={"name": "empty"}), 201)
-    answer = server.client.post("/api/v1/evaluations", params={"map": "empty"})
-    problem(answer, 409, "nothing_to_evaluate")

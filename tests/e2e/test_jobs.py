@@ -184,14 +184,6 @@ def test_a_job_is_watched_until_its_final_state(server: ServerProcess) -> None:
     assert all(job["state"] in ("queued", "running") for job in jobs[:-1])
 
 
-def test_a_finished_job_is_one_event(server: ServerProcess) -> None:
-    job_id = failed_job(server)
-    with server.client.stream("GET", f"{JOBS}/{job_id}/events") as answer:
-        seen = list(events(answer.iter_lines()))
-    assert [event["id"] for event in seen] == ["1"]
-    assert json.loads(seen[0]["data"])["error"]["code"] == "undecodable_photo"
-
-
 def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess) -> None:
     with server.no_decoding():
         uploaded = queued_job(server)

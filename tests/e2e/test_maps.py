@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import re
-import time
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -250,45 +249,6 @@ def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProce
     assert len(got(server.client.get("/api/v1/vocabularies", params={"map": other}))) == 1
     assert len(got(server.client.get("/api/v1/generations", params={"map": one}))) == 3
     assert generation(one)["searchable"] == generation(other)["searchable"] == 3
-
-
-# --- deleted ---------------------------------------------------------------------------------
-
-
-def test_a_deleted_map_is_gone_at_once_and_its_bytes_soon(server: ServerProcess) -> None:
-    name = make(server)
-    (file_id,) = store(server, name, next(fresh))
-    objects = server.home / "objects"
-    thumbnail = objects / "thumbnails" / f"{file_id}.jpg"
-    assert thumbnail.exists()
-    with server.no_decoding():
-        files = {"file": photo_bytes(next(fresh))}
-        job_id = got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)[
-            "job_id"
-        ]
-        deleted = got(server.client.delete(f"{MAPS}/{name}"))
-        assert (deleted["success"], deleted["deleted_map"]) == (True, name)
-        for path in (f"/uploads/{file_id}", f"/jobs/{job_id}", "/search", "/database/stats"):
-            answer = server.client.get(f"/api/v1{path}", params={"map": name})
-            problem(answer, 404, "map_not_found")
-        problem(server.client.delete(f"{MAPS}/{name}"), 404, "map_not_found")
-        assert name not in {map_["name"] for map_ in got(server.client.get(MAPS))}
-        assert make_again(server, name)["photos"] == 0
-    wait_until_gone(thumbnail)
-    (again,) = store(server, name, next(fresh))
-    assert got(server.similar(again, map=name))["similar_images"] == []
-
-
-def make_again(server: ServerProcess, name: str) -> dict[str, Any]:
-    made: dict[str, Any] = got(server.client.post(MAPS, json={"name": name}), 201)
-    return made
-
-
-def wait_until_gone(path: Path) -> None:
-    deadline = time.monotonic() + 60
-    while path.exists():
-        assert time.monotonic() < deadline, f"{path} is still there"
-        time.sleep(0.05)
 
 
 # --- by command ------------------------------------------------------------------------------

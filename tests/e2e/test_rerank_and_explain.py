@@ -28,17 +28,6 @@ def test_stored_photo_is_answered_in_one_call(server: ServerProcess, places: lis
     assert all(one["explanation"]["overlay"] for one in found)
 
 
-def test_new_photo_is_described_and_compared_in_one_call(
-    server: ServerProcess, places: list[str]
-) -> None:
-    answer = server.ask(near_copy(PLACES[1]), top_k=2, rerank=50)
-    assert answer.status_code == 200, answer.text
-    best, second = answer.json()["similar_images"]
-    assert best["image_id"] == places[1]
-    assert best["rerank_score"] > second["rerank_score"]
-    assert best["explanation"] is None
-
-
 def test_command_shows_both(server: ServerProcess, places: list[str], tmp_path: Path) -> None:
     photo = tmp_path / "again.jpg"
     photo.write_bytes(near_copy(PLACES[2]))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import urllib3
 
 from placewise.client import Client
 from shared.storage.s3 import Bucket, S3Store
@@ -18,7 +16,6 @@ from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import S3Server
 
 GONE_SECONDS = 30.0  # the steward's round, and some
-PRESIGN_SECONDS = 10
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +28,7 @@ def server(
     s3: S3Server, bucket: Bucket, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[ServerProcess]:
     home = tmp_path_factory.mktemp("server") / "home"
-    settings = {**s3.variables(bucket.name), "presign_seconds": PRESIGN_SECONDS}
-    with ServerProcess(home, **settings) as started:
+    with ServerProcess(home, **s3.variables(bucket.name)) as started:
         yield started
 
 
@@ -108,27 +104,3 @@ def test_a_photo_sent_straight_to_the_bucket_is_found(
     best = server.ask(photo_bytes(20)).json()["similar_images"][0]
     assert best["image_id"] == str(found.image_id)
     assert keys(bucket, "incoming/") == set()
-
-
-def test_a_photo_that_was_sent_and_never_completed_is_removed(
-    server: ServerProcess, bucket: Bucket
-) -> None:
-    data = photo_bytes(21)
-    about = {
-        "filename": "forgotten.jpg",
-        "file_size": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-    }
-    begun = server.client.post("/api/v1/uploads/presign", json=about)
-    assert begun.status_code == 201, begun.text
-    put = urllib3.request("PUT", begun.json()["url"], body=data, headers=begun.json()["headers"])
-    assert put.status == 200
-    assert keys(bucket, "incoming/") == {f"incoming/{begun.json()['upload_id']}"}
-    time.sleep(PRESIGN_SECONDS)
-    # Without a commit, an idle server looks for what has expired every IDLE_SECONDS only.
-    assert server.client.post("/api/v1/uploads/presign", json=about).status_code == 201
-    deadline = time.monotonic() + GONE_SECONDS
-    while keys(bucket, "incoming/"):
-        assert time.monotonic() < deadline, server.log()
-        time.sleep(0.2)
-    problem(server.client.post(begun.json()["complete_url"]), 404, "upload_not_found")
