@@ -1,24 +1,21 @@
-"""Dataset types: photos, evaluation sets, training sets, their fingerprints, published results.
+"""Dataset types: photos, evaluation sets, training sets, and their fingerprints.
 
 Every layout (`lab/datasets/layouts`) is read into these types; training, evaluation and reports
 use nothing else. `lab/datasets/open_dataset.py` opens datasets.
 
-Published results are comparable only with the same protocol and fingerprint: the same photos, the
-same positives, the same set of counted queries. Most differences such as "92.2 instead of 95.1"
-come from different sets of the same name. The lists of the published sets can't be shipped, so
-PUBLISHED_RESULTS gets an entry only after its fingerprint was checked against the publication;
-until then results are reported without a comparison.
+Results are comparable only with the same protocol and fingerprint: the same photos, the same
+positives, the same set of counted queries. Most differences such as "92.2 instead of 95.1" come
+from different sets of the same name.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,34 +162,3 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except OSError:
         return MISSING_FILE_BYTES
-
-
-@dataclass(frozen=True, slots=True)
-class PublishedResult:
-    """A published result and the exact evaluation set that it was measured on."""
-
-    protocol: str
-    fingerprint: str
-    """`EvaluationSet.fingerprint` of the set"""
-    method: str
-    recall: dict[int, float]
-    """Recall@k by k, 0 to 1"""
-    source: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as JSON values."""
-        return asdict(self) | {"recall": {str(k): share for k, share in self.recall.items()}}
-
-
-PUBLISHED_RESULTS: tuple[PublishedResult, ...] = ()
-
-
-def find_published_results(
-    evaluation: EvaluationSet, known: tuple[PublishedResult, ...] = PUBLISHED_RESULTS
-) -> tuple[PublishedResult, ...]:
-    """Return the published results of exactly this set, by protocol and fingerprint."""
-    return tuple(
-        result
-        for result in known
-        if (result.protocol, result.fingerprint) == (evaluation.protocol, evaluation.fingerprint)
-    )

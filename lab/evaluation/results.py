@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from lab.datasets.check import SuspectLabel
-from lab.datasets.dataset import PublishedResult
 from lab.datasets.open_dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, Scores
 from lab.evaluation.recall import compute_hits
@@ -232,8 +231,6 @@ class EvaluationResult:
     """`dimension`, `describe_ms_per_photo`, ... as far as known"""
     against: RunComparison | None = None
     """comparison with an earlier run"""
-    published: tuple[PublishedResult, ...] = ()
-    """published results on the same set and protocol"""
     suspects: tuple[SuspectLabel, ...] = ()
     """confident first matches that count as wrong but are just outside the positive criterion"""
     places: dict[str, Any] | None = None
@@ -263,7 +260,6 @@ class EvaluationResult:
             **self.about,
             **self.measured.as_json(),
             "against": self.against.as_json() if self.against else None,
-            "published": [each.as_json() for each in self.published],
             "suspects": [asdict(suspect) for suspect in self.suspects],
             "places": self.places,
         }

@@ -297,15 +297,7 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         evaluation_set.name, *(Column(name, justify="right", no_wrap=True) for name in columns)
     )
     for result in compared:
-        interval = result.measured.recall_intervals
-        table.add_row(
-            result.name,
-            *(f"{100 * share:.1f}" for share in result.measured.recalls.recall_all.values()),
-            interval[0].as_percent() if interval else "-",
-            "-" if result.milliseconds_a_photo is None else f"{result.milliseconds_a_photo:.1f}",
-            f"{result.bytes_a_photo:,}",
-            result.against_first(),
-        )
+        table.add_row(result.name, *result.table_cells())
     print_table(table)
     clusters = compared[0].measured.clusters
     print_message(

@@ -15,7 +15,6 @@ from rich.table import Column
 
 from lab.cli.evaluation.commands import ReportOptions
 from lab.datasets.check import find_suspect_labels
-from lab.datasets.dataset import find_published_results
 from lab.datasets.ground_truth_files import read_ground_truth, read_integer_lists
 from lab.datasets.open_dataset import DatasetPhoto, EvaluationSet, open_evaluation_set
 from lab.datasets.photo_lists import read_photo_list
@@ -113,7 +112,6 @@ def evaluate_rankings(
         measured,
         about,
         against=against,
-        published=find_published_results(evaluation_set),
         suspects=(
             tuple(
                 find_suspect_labels(

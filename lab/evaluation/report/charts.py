@@ -10,10 +10,10 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lab.datasets.open_dataset import DatasetPhoto
@@ -57,7 +57,7 @@ def percent_chart(
     return figure, axes
 
 
-def render_chart(figure: Figure, title: str) -> str:
+def render_chart(figure: Figure, title: str) -> Markup:
     """Render a chart as an `<img>` element; the title is its alternative text."""
     from matplotlib import rc_context
 
@@ -65,10 +65,10 @@ def render_chart(figure: Figure, title: str) -> str:
     with rc_context({"svg.hashsalt": title, "svg.fonttype": "none"}):
         figure.savefig(svg, format="svg", metadata={"Creator": None, "Date": None})
     encoded = base64.b64encode(svg.getvalue().encode()).decode()
-    return f'<img src="data:image/svg+xml;base64,{encoded}" alt="{escape(title)}">'
+    return Markup('<img src="data:image/svg+xml;base64,{}" alt="{}">').format(encoded, title)
 
 
-def recall_chart(result: EvaluationResult) -> str:
+def recall_chart(result: EvaluationResult) -> Markup:
     """Render recall@k over k."""
     curve = np.asarray(result.measured.recall_curve)
     ks = np.arange(1, len(curve) + 1)
@@ -86,7 +86,7 @@ def recall_chart(result: EvaluationResult) -> str:
     return render_chart(figure, "Recall@k")
 
 
-def precision_chart(result: EvaluationResult) -> str | None:
+def precision_chart(result: EvaluationResult) -> Markup | None:
     """Render the precision-recall curve; None without scores."""
     curve = result.measured.curve
     if curve is None:
@@ -97,7 +97,7 @@ def precision_chart(result: EvaluationResult) -> str | None:
     return render_chart(figure, "Precision and recall of the first match")
 
 
-def reliability_chart(levels: Sequence[dict[str, Any]]) -> str:
+def reliability_chart(levels: Sequence[dict[str, Any]]) -> Markup:
     """Render the observed share of right answers over the stated probability, a line a level.
 
     Args:
@@ -117,7 +117,7 @@ def reliability_chart(levels: Sequence[dict[str, Any]]) -> str:
     return render_chart(figure, "Reliability of the probabilities of levels")
 
 
-def distance_chart(result: EvaluationResult) -> str | None:
+def distance_chart(result: EvaluationResult) -> Markup | None:
     """Render the cumulative distance error of first matches; None without positions."""
     metres = result.measured.metres
     error = None if metres is None else distance_error(metres[:, 0])
@@ -141,7 +141,7 @@ MAX_DATABASE_POINTS = 4000
 MAX_QUERY_POINTS = 2000
 
 
-def positions_chart(result: EvaluationResult) -> tuple[str, str] | None:
+def positions_chart(result: EvaluationResult) -> tuple[Markup, str] | None:
     """Render a map of the queries and their first matches, in UTM metres.
 
     Returns:
@@ -187,21 +187,3 @@ def _utm_positions(photos: Sequence[DatasetPhoto], zone: str | None) -> NDArray[
         if photo.easting is not None and photo.northing is not None and photo.zone == zone:
             positions[index] = photo.easting, photo.northing
     return positions
-
-
-STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;color:#1a1a1a;background:#fff;max-width:1180px;
-margin:0 auto;padding:1rem 1.5rem}
-h1{font-size:1.6rem}h2{margin-top:2.4rem;border-top:2px solid #ddd;padding-top:1rem}
-table{border-collapse:collapse;margin:.6rem 0}td,th{padding:.25rem .7rem;text-align:left;
-border-bottom:1px solid #e5e5e5;vertical-align:top}td.n{text-align:right;
-font-variant-numeric:tabular-nums}.charts{display:flex;flex-wrap:wrap;gap:1rem}
-.charts figure{margin:0;flex:1 1 420px;max-width:560px}figure>img{width:100%;max-width:760px}
-.wide{overflow-x:auto}.grid td{padding:.3rem;border:0}
-.grid img,.grid .none{width:180px;height:135px;object-fit:cover;display:block;border:5px solid}
-.grid .none{background:#f2f2f2;color:#666;display:grid;place-items:center}
-.grid .query{border-color:#0057d9}.grid .right{border-color:#128a3a}
-.grid .wrong{border-color:#d32020}
-.grid .missed{border-style:dashed}.grid small{display:block;max-width:190px;overflow-wrap:anywhere}
-code{overflow-wrap:anywhere}figcaption,.note{color:#555;font-size:.9rem}
-"""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
 from lab.datasets.open_dataset import EvaluationSet
-from lab.evaluation.report.charts import GREY, STYLE, percent_chart, render_chart
+from lab.evaluation.report.charts import GREY, percent_chart, render_chart
+from lab.evaluation.report.page import render_page
 from lab.evaluation.retrieval_metrics import RetrievalMetrics
 from shared.evaluation.bootstrap import PairedDifference
 
@@ -64,6 +66,18 @@ class ComparedExtractor:
         interval = self.difference.interval_in_points()
         return mean if interval is None else f"{mean} ({interval})"
 
+    def table_cells(self) -> list[str]:
+        """Format recalls, interval of R@1, time, size and difference for a table."""
+        interval = self.measured.recall_intervals
+        milliseconds = self.milliseconds_a_photo
+        return [
+            *(f"{100 * recall:.1f}" for recall in self.measured.recalls.recall_all.values()),
+            interval[0].as_percent() if interval else "-",
+            "-" if milliseconds is None else f"{milliseconds:.1f}",
+            f"{self.bytes_a_photo:,}",
+            self.against_first(),
+        ]
+
     def as_json(self) -> dict[str, Any]:
         metrics = self.measured.as_json()
         names = ("recall", "recall_interval", "recall_findable", "mean_average_precision")
@@ -81,61 +95,26 @@ class ComparedExtractor:
 
 def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> str:
     """Render the HTML page that compares extractors on one evaluation set."""
-    ks = list(compared[0].measured.recalls.recall_all)
-    heads = [
-        "",
-        *(f"R@{k}" for k in ks),
-        "R@1, 95 % interval",
-        "CPU ms per photo",
-        "bytes per photo",
-        "R@1 minus the first extractor's",
-    ]
-    rows = "".join(_table_row(each) for each in compared)
-    charts = [
-        _cost_chart(
-            "Recall and size", "bytes per photo", compared, [c.bytes_a_photo for c in compared]
-        ),
-        _cost_chart(
-            "Recall and time", "CPU ms per photo", compared, [c.milliseconds for c in compared]
-        ),
-    ]
-    figures = "".join(f"<figure>{chart}</figure>" for chart in charts if chart)
-    clusters = compared[0].measured.clusters
-    title = f"Descriptors on {evaluation_set.name}"
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
-        f"<h1>{escape(title)}</h1><p>{len(evaluation_set.database)} database photos, "
-        f"{len(evaluation_set.queries)} "
-        f"queries; positive-match criterion: {escape(evaluation_set.rule)}; protocol "
-        f"{escape(evaluation_set.protocol)}; fingerprint "
-        f"<code>{evaluation_set.fingerprint}</code>.</p>"
-        f"<div class='wide'><table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{rows}</table>"
-        f'</div><p class="note">Intervals: bootstrap over {clusters.count} {clusters.kind}; '
-        "differences are paired by query. Time: CPU time of network and aggregation (on a GPU, "
-        "its time), measured when the descriptors were computed. Size: as a map stores it.</p>"
-        f'<div class="charts">{figures}</div></body></html>\n'
+    sizes, times = (
+        [each.bytes_a_photo for each in compared],
+        [each.milliseconds for each in compared],
     )
-
-
-def _table_row(extractor: ComparedExtractor) -> str:
-    values = [f"{100 * recall:.1f}" for recall in extractor.measured.recalls.recall_all.values()]
-    interval = extractor.measured.recall_intervals
-    values.append(interval[0].as_percent() if interval else "-")
-    milliseconds = extractor.milliseconds_a_photo
-    values += [
-        "-" if milliseconds is None else f"{milliseconds:.1f}",
-        f"{extractor.bytes_a_photo:,}",
-        extractor.against_first(),
-    ]
-    cells = "".join(f'<td class="n">{escape(text)}</td>' for text in values)
-    return f"<tr><th>{escape(extractor.name)}</th>{cells}</tr>"
+    return render_page(
+        "comparison.html",
+        title=f"Descriptors on {evaluation_set.name}",
+        data_set=evaluation_set,
+        compared=compared,
+        clusters=compared[0].measured.clusters,
+        charts=(
+            _cost_chart("Recall and size", "bytes per photo", compared, sizes),
+            _cost_chart("Recall and time", "CPU ms per photo", compared, times),
+        ),
+    )
 
 
 def _cost_chart(
     title: str, label: str, compared: Sequence[ComparedExtractor], costs: Sequence[float]
-) -> str | None:
+) -> Markup | None:
     """Render R@1 over a cost, with the Pareto front as a line; None if no cost is known."""
     recalls = [each.recall_at_1 for each in compared]
     known = [cost for cost in costs if cost > 0]  # excludes NaN
