@@ -2,7 +2,7 @@
 
 `inspect_dataset` opens every set in a folder and collects problems, for `placewise datasets check`.
 
-`_find_undecodable` decodes every photo completely, on all cores.
+`find_undecodable_photos` decodes every photo completely, on all cores.
 
 `find_suspect_labels` lists confident first matches that the ground truth counts as wrong although
 they are close: a match 30 m away, or at the right position with another heading, often shows the
@@ -14,9 +14,9 @@ from __future__ import annotations
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,34 +36,13 @@ from lab.datasets.open_dataset import (
     open_training_set,
 )
 from lab.datasets.utm_coordinates import has_position, pairwise_distances_m
+from lab.evaluation.recall import compute_hits
 from shared.errors import InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import open_photo
 
 MAX_DECODED_PIXELS = 100_000_000
 """Maximum of width x height of a decoded photo; larger ones would exhaust memory."""
-PHOTOS_PER_TASK = 1024
-
-
-def _find_undecodable(
-    paths: Sequence[Path], on_progress: Callable[[int], None] = lambda count: None
-) -> list[tuple[Path, str]]:
-    """Return the photos that can't be decoded, with the reason.
-
-    `on_progress` is called with 1 after each photo.
-    """
-    broken = []
-    # Threads suffice, because Pillow releases the GIL while decoding. Its warnings about unusual
-    # EXIF are ignored around all threads, because warning filters are process-wide.
-    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        warnings.simplefilter("ignore")
-        for start in range(0, len(paths), PHOTOS_PER_TASK):
-            chunk = paths[start : start + PHOTOS_PER_TASK]
-            for path, reason in zip(chunk, pool.map(_decode_error, chunk), strict=True):
-                on_progress(1)
-                if reason is not None:
-                    broken.append((path, reason))
-    return broken
 
 
 def _decode_error(path: Path) -> str | None:
@@ -102,11 +81,15 @@ class DatasetReport:
     evaluation: tuple[EvaluationSet, ...]
     layouts: tuple[str, ...]
     """Layout names: of the training set, if there is one, then of each evaluation set"""
-    problems: tuple[DatasetProblem, ...]
+    problems: list[DatasetProblem]
 
     def photos(self) -> tuple[Path, ...]:
         """Return all photos of all sets, in order and without duplicates."""
-        return tuple(dict.fromkeys(_photos(self.training, self.evaluation)))
+        places = self.training.places if self.training else ()
+        paths = [path for place in places for path in place.photos]
+        for opened in self.evaluation:
+            paths += [photo.path for photo in (*opened.database, *opened.queries)]
+        return tuple(dict.fromkeys(paths))
 
 
 def inspect_dataset(
@@ -148,8 +131,11 @@ def inspect_dataset(
         else:
             evaluation.append(opened)
             problems += _find_problems(opened)
-    report = DatasetReport(root, training, tuple(evaluation), tuple(layouts), tuple(problems))
-    return _add_missing_files(report)
+    report = DatasetReport(root, training, tuple(evaluation), tuple(layouts), problems)
+    missing = [str(path) for path in report.photos() if not path.is_file()]
+    if missing:
+        problems.append(_problem("missing_photo", missing, "listed photos do not exist"))
+    return report
 
 
 def find_undecodable_photos(
@@ -162,16 +148,16 @@ def find_undecodable_photos(
     photos = report.photos()
     existing = [path for path in photos if path.is_file()]
     on_progress(len(photos) - len(existing))  # missing photos are reported already
-    broken = [f"{path}: {reason}" for path, reason in _find_undecodable(existing, on_progress)]
+    broken = []
+    # Threads suffice, because Pillow releases the GIL while decoding. Its warnings about unusual
+    # EXIF are ignored around all threads, because warning filters are process-wide.
+    with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        warnings.simplefilter("ignore")
+        for path, reason in zip(existing, pool.map(_decode_error, existing), strict=True):
+            on_progress(1)
+            if reason is not None:
+                broken.append(f"{path}: {reason}")
     return [_problem("undecodable_photo", broken, "photos can't be decoded")] if broken else []
-
-
-def _add_missing_files(report: DatasetReport) -> DatasetReport:
-    missing = [str(path) for path in report.photos() if not path.is_file()]
-    if not missing:
-        return report
-    problem = _problem("missing_photo", missing, "listed photos do not exist")
-    return replace(report, problems=(*report.problems, problem))
 
 
 def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
@@ -216,14 +202,6 @@ def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:
     return DatasetProblem(
         code, len(examples), f"{len(examples)} {what}.", tuple(examples[:MAX_EXAMPLES])
     )
-
-
-def _photos(training: TrainingSet | None, evaluation: Iterable[EvaluationSet]) -> Iterator[Path]:
-    for place in training.places if training else ():
-        yield from place.photos
-    for opened in evaluation:
-        for photo in (*opened.database, *opened.queries):
-            yield photo.path
 
 
 MAX_RULE_MULTIPLE = 4.0
@@ -282,46 +260,30 @@ def find_suspect_labels(
     if not ranked.size:
         return []
     first = ranked[:, 0]
-    correct = np.array(
-        [match in positives for match, positives in zip(first, evaluation.positives, strict=True)],
-        dtype=bool,
-    )
+    correct = compute_hits(ranked[:, :1], evaluation.positives)[:, 0]
     confident = ~correct
     if scores is not None:
         if min_score is None:
             min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
         confident &= scores[:, 0] >= min_score
-    suspects = _just_outside(evaluation, first, np.flatnonzero(confident), scores)
-    return sorted(suspects, key=lambda suspect: (-(suspect.score or 0.0), suspect.query))
-
-
-def _just_outside(
-    evaluation: EvaluationSet,
-    first: Indices,
-    candidates: Indices,
-    scores: NDArray[np.float32] | None,
-) -> list[SuspectLabel]:
-    queries = [evaluation.queries[number] for number in candidates]
-    matches = [evaluation.database[number] for number in first[candidates]]
+    candidates = np.flatnonzero(confident).tolist()
+    pairs = [(evaluation.queries[n], evaluation.database[first[n]]) for n in candidates]
+    metres = pairwise_distances_m([query for query, _ in pairs], [match for _, match in pairs])
     rule = _rule_of(evaluation)
-    metres = pairwise_distances_m(queries, matches)
-    suspects = []
-    for number, query, match, distance in zip(
-        candidates.tolist(), queries, matches, metres, strict=True
-    ):
-        if _is_just_outside(rule, query, match, float(distance)):
-            suspects.append(
-                SuspectLabel(
-                    number,
-                    int(first[number]),
-                    query.name,
-                    match.name,
-                    None if scores is None else float(scores[number, 0]),
-                    None if np.isnan(distance) else float(distance),
-                    _degrees(query, match),
-                )
-            )
-    return suspects
+    suspects = [
+        SuspectLabel(
+            number,
+            int(first[number]),
+            query.name,
+            match.name,
+            None if scores is None else float(scores[number, 0]),
+            None if np.isnan(distance) else distance,
+            _degrees(query, match),
+        )
+        for number, (query, match), distance in zip(candidates, pairs, metres.tolist(), strict=True)
+        if _is_just_outside(rule, query, match, distance)
+    ]
+    return sorted(suspects, key=lambda suspect: (-(suspect.score or 0.0), suspect.query))
 
 
 def _is_just_outside(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto, Indices
 from lab.datasets.utm_coordinates import group_by_utm_plane, utm_positions
@@ -119,22 +120,17 @@ def _within(
 def _same_heading(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    query_headings = _required_values(
-        "heading", "no_headings", queries, lambda photo: photo.heading
+    query_headings, headings = (
+        _required_values("heading", "no_headings", photos, lambda photo: photo.heading)
+        for photos in (queries, database)
     )
-    database_headings = _required_values(
-        "heading", "no_headings", database, lambda photo: photo.heading
-    )
-    within_radius = _within(rule, queries, database)
     return [
-        rows[heading_differences(database_headings[rows], heading) <= rule.degrees]
-        for rows, heading in zip(within_radius, query_headings, strict=True)
+        rows[heading_differences(headings[rows], heading) <= rule.degrees]
+        for rows, heading in zip(_within(rule, queries, database), query_headings, strict=True)
     ]
 
 
-def heading_differences(
-    headings: np.ndarray[tuple[int, ...], np.dtype[np.float64]], heading: float
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def heading_differences(headings: NDArray[np.float64], heading: float) -> NDArray[np.float64]:
     """Return the angles between headings, 0 to 180 degrees; headings of 360 or more are valid."""
     return np.abs(np.mod(headings - heading + 180.0, 360.0) - 180.0)
 
@@ -142,18 +138,16 @@ def heading_differences(
 def _frames(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    query_frames = _required_values(
-        "frame number", "no_frames", queries, lambda photo: photo.frame
-    ).astype(np.int64)
-    frames = _required_values(
-        "frame number", "no_frames", database, lambda photo: photo.frame
-    ).astype(np.int64)
-    groups: dict[str | None, list[int]] = {}
+    query_frames, frames = (
+        _required_values("frame number", "no_frames", photos, lambda photo: photo.frame)
+        for photos in (queries, database)
+    )
+    by_sequence: dict[str | None, list[int]] = {}
     for number, photo in enumerate(database):
-        groups.setdefault(photo.sequence if rule.same_sequence else None, []).append(number)
+        by_sequence.setdefault(photo.sequence if rule.same_sequence else None, []).append(number)
     ordered = {
         key: np.array(numbers)[np.argsort(frames[numbers], kind="stable")]
-        for key, numbers in groups.items()
+        for key, numbers in by_sequence.items()
     }
     positives = []
     for photo, frame in zip(queries, query_frames, strict=True):
@@ -181,7 +175,7 @@ def _required_values(
     code: str,
     photos: Sequence[DatasetPhoto],
     get_value: Callable[[DatasetPhoto], float | None],
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+) -> NDArray[np.float64]:
     values = [get_value(photo) for photo in photos]
     missing = [photo for photo, value in zip(photos, values, strict=True) if value is None]
     if missing:

@@ -12,7 +12,6 @@ arguments. The result is lists of integers, or an error.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import pickle
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
+from pydantic import BaseModel
 
 from lab.datasets.dataset import Indices, list_fingerprint
 from shared.errors import InvalidRequest, PlacewiseError
@@ -77,6 +77,12 @@ def read_numbered_ground_truth(
     return positives
 
 
+_BROKEN_PICKLE_ERRORS = (
+    TypeError, AttributeError, LookupError, OverflowError, RecursionError, MemoryError,
+)  # fmt: skip
+"""What the unpickler raises for damaged and malicious pickles, beside its own errors"""
+
+
 @contextlib.contextmanager
 def _refusing_bad_files(path: Path) -> Iterator[None]:
     """Convert the errors of damaged and malicious files to `bad_ground_truth`."""
@@ -84,18 +90,9 @@ def _refusing_bad_files(path: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise _bad_ground_truth_error(path, str(error)) from error
-    except (
-        TypeError,
-        AttributeError,
-        LookupError,
-        OverflowError,
-        RecursionError,
-        MemoryError,
-    ) as error:
-        # Raised by the unpickler for damaged and malicious pickles.
-        raise _bad_ground_truth_error(
-            path, f"its pickle is broken ({type(error).__name__})"
-        ) from error
+    except _BROKEN_PICKLE_ERRORS as error:
+        reason = f"its pickle is broken ({type(error).__name__})"
+        raise _bad_ground_truth_error(path, reason) from error
 
 
 def _stored_rows(path: Path) -> list[Any]:
@@ -237,14 +234,6 @@ def _as_bytes(data: object) -> bytes:
     raise ValueError("an array in it has no data")
 
 
-def _encode(text: str, _: str) -> bytes:
-    return text.encode("latin1")
-
-
-def _no_bytes() -> bytes:
-    return b""
-
-
 class _Unpickler(pickle.Unpickler):
     """Resolves names to stand-ins, and rejects all others."""
 
@@ -257,15 +246,29 @@ class _Unpickler(pickle.Unpickler):
 _STAND_INS: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
-    ("_codecs", "encode"): _encode,
-    ("builtins", "bytes"): _no_bytes,
-    ("__builtin__", "bytes"): _no_bytes,  # its name in protocols before 3
+    ("_codecs", "encode"): lambda text, _: text.encode("latin1"),
+    ("builtins", "bytes"): lambda: b"",
+    ("__builtin__", "bytes"): lambda: b"",  # its name in protocols before 3
     **{
         (f"numpy.{core}.multiarray", name): stand_in
         for core in ("core", "_core")
         for name, stand_in in (("_reconstruct", _Array), ("scalar", _Scalar))
     },
 }
+
+
+class _ListIdentity(BaseModel):
+    count: int
+    sha256: str
+
+
+class _Sidecar(BaseModel):
+    """Content of the `.json` file beside a ground truth."""
+
+    made_by: str = "placewise datasets ground-truth"
+    rule: str
+    database: _ListIdentity
+    queries: _ListIdentity
 
 
 def write_ground_truth(
@@ -285,18 +288,17 @@ def write_ground_truth(
         queries: Names of the queries, in order.
     """
     write_integer_lists(path, positives)
-    sidecar = {
-        "made_by": "placewise datasets ground-truth",
-        "rule": rule,
-        "database": {"count": len(database), "sha256": list_fingerprint(database)},
-        "queries": {"count": len(queries), "sha256": list_fingerprint(queries)},
-    }
-    sidecar_path(path).write_text(json.dumps(sidecar, indent=1) + "\n", encoding="utf-8")
+    sidecar = _Sidecar(
+        rule=rule,
+        database=_ListIdentity(count=len(database), sha256=list_fingerprint(database)),
+        queries=_ListIdentity(count=len(queries), sha256=list_fingerprint(queries)),
+    )
+    sidecar_path(path).write_text(sidecar.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def read_ground_truth(
     path: Path, *, database: Sequence[str], queries: Sequence[str]
-) -> tuple[list[Indices], str | None]:
+) -> tuple[list[Indices], str]:
     """Read a ground truth and check that it belongs to these lists.
 
     Args:
@@ -305,13 +307,13 @@ def read_ground_truth(
         queries: Names of the queries, in order.
 
     Returns:
-        The positives of each query, and the rule if the file has a sidecar.
+        The positives of each query, and the rule: that of the sidecar, or `given by gt.npy`.
 
     Raises:
         InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
     """
     positives = read_integer_lists(path)
-    rule = _check_sidecar(path, database, queries)
+    rule = _check_sidecar(path, database, queries) or f"given by {path.name}"
     if len(positives) != len(queries):
         raise _mismatch_error(path, f"it has {len(positives)} rows for {len(queries)} queries")
     _check_indices(path, positives, database)
@@ -335,29 +337,25 @@ def _check_sidecar(path: Path, database: Sequence[str], queries: Sequence[str]) 
     """Return the sidecar's rule; None without one, as for all published ground truths."""
     sidecar_file = sidecar_path(path)
     try:
-        sidecar: Any = json.loads(sidecar_file.read_text(encoding="utf-8"))
-        stored = {role: (sidecar[role]["count"], sidecar[role]["sha256"]) for role in ROLES}
-        rule = str(sidecar["rule"])
+        sidecar = _Sidecar.model_validate_json(sidecar_file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError) as error:
         raise InvalidRequest(
             "bad_ground_truth",
             f"{sidecar_file} does not identify the lists of {path.name} ({error}). Create both "
             "files again with `placewise datasets ground-truth`.",
         ) from error
-    for role, names in zip(ROLES, (database, queries), strict=True):
-        count, fingerprint = stored[role]
-        if count != len(names):
-            raise _mismatch_error(
-                path, f"it was created for {count} {role}, but there are {len(names)}"
-            )
-        if fingerprint != list_fingerprint(names):
+    for role, stored, names in (
+        ("database", sidecar.database, database),
+        ("queries", sidecar.queries, queries),
+    ):
+        if stored.count != len(names):
+            reason = f"it was created for {stored.count} {role}, but there are {len(names)}"
+            raise _mismatch_error(path, reason)
+        if stored.sha256 != list_fingerprint(names):
             raise _mismatch_error(path, f"the {role} differ, or have another order")
-    return rule
-
-
-ROLES = ("database", "queries")
+    return sidecar.rule
 
 
 def _mismatch_error(path: Path, reason: str) -> PlacewiseError:

@@ -12,33 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from lab.datasets.dataset import (
-    PHOTO_TABLE_HEADER,
-    DatasetPhoto,
-    EvaluationSet,
-    TrainingPlace,
-    TrainingSet,
-)
+from lab.datasets.dataset import PHOTO_TABLE_HEADER, EvaluationSet, TrainingSet
 from lab.datasets.ground_truth import find_positives, parse_rule
 from lab.datasets.layouts import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
-from lab.datasets.layouts.base import EvaluationLayout, ListedSet, TrainingLayout
+from lab.datasets.layouts.base import EvaluationLayout, TrainingLayout
 from lab.datasets.layouts.folder_pairs import RIDES, SEASONS
 from shared.errors import InvalidRequest, NotFound
-
-__all__ = [
-    "DatasetPhoto",
-    "DiscoveredSet",
-    "EvaluationSet",
-    "TrainingPlace",
-    "TrainingSet",
-    "evaluation_set_names",
-    "find_evaluation_sets",
-    "find_training_layout",
-    "open_evaluation_set",
-    "open_training_set",
-]
 
 PART_FOLDERS = frozenset(
     {
@@ -124,7 +103,8 @@ def find_evaluation_sets(root: Path) -> tuple[DiscoveredSet, ...]:
                 for name, key in layout.sets(base, prefix).items():
                     folder_sets.setdefault(name, DiscoveredSet(name, layout, base, key))
         for name, discovered in folder_sets.items():
-            unique = next(n for n in _numbered_names(name) if n not in sets)
+            numbered = (name if n == 1 else f"{name}_{n}" for n in itertools.count(1))
+            unique = next(each for each in numbered if each not in sets)
             sets[unique] = replace(discovered, name=unique)
     return tuple(sets[name] for name in sorted(sets))
 
@@ -159,39 +139,28 @@ def open_evaluation_set(
             f"{chosen.name} ({chosen.layout.name}) has no protocol {protocol!r}. "
             f"Valid protocols: {', '.join(protocols)}.",
         )
-    chosen_protocol = protocol or protocols[0]
-    parsed_rule = parse_rule(rule) if rule is not None else None
-    listed = chosen.layout.open(chosen.base, chosen.key, chosen_protocol)
+    given_rule = parse_rule(rule) if rule is not None else None
+    listed = chosen.layout.open(chosen.base, chosen.key, protocol or protocols[0])
     for role, photos in (("database photo", listed.database), ("query", listed.queries)):
         if not photos:
             raise InvalidRequest("empty_set", f"{chosen.name} in {chosen.base} has no {role}.")
-    return _make_evaluation_set(
-        chosen, listed, chosen_protocol, str(parsed_rule) if parsed_rule else None
-    )
-
-
-def _make_evaluation_set(
-    chosen: DiscoveredSet, listed: ListedSet, protocol: str, rule: str | None
-) -> EvaluationSet:
-    if rule is None and listed.positives is not None:
-        applied_rule, positives = listed.rule, listed.positives
-    else:
-        parsed_rule = parse_rule(rule or listed.rule)
-        applied_rule = str(parsed_rule)
-        positives = tuple(find_positives(parsed_rule, listed.queries, listed.database))
-    queries = listed.queries
+    queries, positives, applied_rule = listed.queries, listed.positives, listed.rule
+    if given_rule is not None or positives is None:
+        computed_rule = given_rule or parse_rule(listed.rule)
+        positives = find_positives(computed_rule, queries, listed.database)
+        applied_rule = str(computed_rule)
     if listed.drops_queries:
-        with_positives = [index for index, rows in enumerate(positives) if len(rows)]
-        queries = tuple(queries[index] for index in with_positives)
-        positives = tuple(positives[index] for index in with_positives)
+        kept = [index for index, rows in enumerate(positives) if len(rows)]
+        queries = tuple(queries[index] for index in kept)
+        positives = [positives[index] for index in kept]
     return EvaluationSet(
         name=chosen.name,
         root=chosen.base,
         database=listed.database,
         queries=queries,
-        positives=tuple(rows.astype(np.int64, copy=False) for rows in positives),
+        positives=tuple(positives),
         rule=applied_rule,
-        protocol=protocol,
+        protocol=protocol or protocols[0],
     )
 
 
@@ -226,12 +195,6 @@ def _candidate_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     for home in (root, *children):
         images = home / "images"
         yield home, [home, images] if images.is_dir() else [home]
-
-
-def _numbered_names(name: str) -> Iterator[str]:
-    yield name
-    for number in itertools.count(2):
-        yield f"{name}_{number}"
 
 
 def _set_prefix(name: str) -> str:

@@ -1,7 +1,7 @@
 """Photo lists: CSV with positions, `.npy` arrays of paths, text files with one path per line.
 
-Also reads positions from `@UTM@` file names and EXIF, and CSV tables by column names, with errors
-that name file and line.
+Also reads positions from `@UTM@` file names and EXIF, and rows of CSV tables, with errors that name
+file and line.
 """
 
 from __future__ import annotations
@@ -11,6 +11,17 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Self, TypeVar
+
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
 
 from lab.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto
 from lab.datasets.ground_truth_files import read_names
@@ -47,12 +58,20 @@ def photo_from_filename(path: Path, name: str, place: str | None = None) -> Data
     )
 
 
-def add_exif_positions(photos: Iterable[DatasetPhoto]) -> list[DatasetPhoto]:
-    """Add positions from EXIF to photos without one.
+def photos_of_names(folder: Path, names: Iterable[str]) -> tuple[DatasetPhoto, ...]:
+    """Create the photos of a list; names are relative to the folder, also with a leading slash."""
+    return tuple(photo_from_filename(folder / name.lstrip("/"), name) for name in names)
+
+
+def locate_photos(photos: Iterable[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
+    """Add UTM metres to photos without any, from latitude and longitude or from EXIF.
 
     Photos without EXIF, and unreadable ones, are returned unchanged.
     """
-    return [photo if photo.easting is not None else _add_exif_position(photo) for photo in photos]
+    located = add_utm_positions(photos)
+    return add_utm_positions(
+        photo if photo.easting is not None else _add_exif_position(photo) for photo in located
+    )
 
 
 def _add_exif_position(photo: DatasetPhoto) -> DatasetPhoto:
@@ -71,54 +90,61 @@ def _add_exif_position(photo: DatasetPhoto) -> DatasetPhoto:
     )
 
 
-def read_table(path: Path, needed: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the line number and the cells by column name of each row of a CSV file.
+class TableRow(BaseModel):
+    """A row of a CSV table; its fields are the columns that are read. An empty cell is no value."""
 
-    `needed`: required columns; others are returned, too. Raises InvalidRequest: `missing_column`
-    (which lists the existing columns), `bad_table`.
+    model_config = ConfigDict(frozen=True, str_strip_whitespace=True)
+
+
+Row = TypeVar("Row", bound=TableRow)
+
+
+def read_table(path: Path, row_type: type[Row]) -> Iterator[tuple[int, Row]]:
+    """Yield the line number and the row of each line of a CSV file; other columns are ignored.
+
+    Raises InvalidRequest: `missing_column` (which lists the existing columns), `bad_table`.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             columns = reader.fieldnames or []
-            missing = [column for column in needed if column not in columns]
-            if missing:
-                raise InvalidRequest(
-                    "missing_column",
-                    f"{path} has no column {', '.join(missing)}. Its first line, separated by "
-                    f"commas, is: {', '.join(columns) or 'empty'}.",
-                    missing=missing,
-                )
-            for row in reader:
-                line = reader.line_num
-                if None in row or None in row.values():
-                    raise bad_row_error(
-                        path,
-                        line,
-                        f"it does not have the {len(columns)} cells of the first line",
-                    )
-                yield line, row
+            _check_columns(path, row_type, columns)
+            for cells in reader:
+                if None in cells or None in cells.values():
+                    reason = f"it does not have the {len(columns)} cells of the first line"
+                    raise bad_row_error(path, reader.line_num, reason)
+                try:
+                    values = {column: cell for column, cell in cells.items() if cell.strip()}
+                    yield reader.line_num, row_type.model_validate(values)
+                except ValidationError as error:
+                    raise bad_row_error(path, reader.line_num, _reason(error)) from error
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidRequest("bad_table", f"Can't read {path}: {error}.") from error
 
 
-def parse_integer(path: Path, line: int, row: dict[str, str], column: str) -> int:
-    """Parse a cell as an integer; accepts `7.0`, as pandas writes integers."""
-    value = parse_number(path, line, row, column)
-    if value != int(value):
-        raise bad_row_error(path, line, f"{column} {row[column]!r} is not an integer")
-    return int(value)
+def _check_columns(path: Path, row_type: type[Row], columns: Sequence[str]) -> None:
+    missing = []
+    for name, field in row_type.model_fields.items():
+        alias = field.validation_alias
+        names = [str(each) for each in alias.choices] if isinstance(alias, AliasChoices) else [name]
+        if field.is_required() and not set(names) & set(columns):
+            missing.append(" or ".join(names))
+    if missing:
+        raise InvalidRequest(
+            "missing_column",
+            f"{path} has no column {', '.join(missing)}. Its first line, separated by commas, is: "
+            f"{', '.join(columns) or 'empty'}.",
+            missing=missing,
+        )
 
 
-def parse_number(path: Path, line: int, row: dict[str, str], column: str) -> float:
-    """Parse a cell as a finite number; raises InvalidRequest (`bad_table`)."""
-    try:
-        value = float(row[column])
-        if abs(value) < float("inf"):
-            return value
-    except ValueError:
-        pass
-    raise bad_row_error(path, line, f"{column} {row[column]!r} is not a number")
+def _reason(error: ValidationError) -> str:
+    first = error.errors()[0]
+    column = f"{first['loc'][0]} " if first["loc"] else ""
+    if first["type"] == "missing":
+        return f"{column}is empty"
+    value = "" if first["type"] == "value_error" else f"{first['input']!r}: "
+    return f"{column}{value}{first['msg'].removeprefix('Value error, ')}"
 
 
 def bad_row_error(path: Path, line: int, reason: str) -> PlacewiseError:
@@ -126,10 +152,26 @@ def bad_row_error(path: Path, line: int, reason: str) -> PlacewiseError:
     return InvalidRequest("bad_table", f"{path}, line {line}: {reason}.", line=line)
 
 
-PATH_COLUMNS = ("path", "filename", "file")
-COLUMN_ALIASES = {"lat": "latitude", "lon": "longitude", "UTMx": "easting", "UTMy": "northing"}
-"""Canonical columns by the names that other datasets use"""
-NUMBER_COLUMNS = ("latitude", "longitude", "easting", "northing", "heading")
+class PhotoRow(TableRow):
+    """A photo of a list."""
+
+    path: Annotated[str, Field(validation_alias=AliasChoices("path", "filename", "file"))]
+    latitude: FiniteFloat | None = Field(None, validation_alias=AliasChoices("latitude", "lat"))
+    longitude: FiniteFloat | None = Field(None, validation_alias=AliasChoices("longitude", "lon"))
+    easting: FiniteFloat | None = Field(None, validation_alias=AliasChoices("easting", "UTMx"))
+    northing: FiniteFloat | None = Field(None, validation_alias=AliasChoices("northing", "UTMy"))
+    zone: str | None = None
+    heading: FiniteFloat | None = None
+    place: str | None = None
+    frame: int | None = None
+    sequence: str | None = None
+
+    @model_validator(mode="after")
+    def _check_pairs(self) -> Self:
+        for first, second in (("latitude", "longitude"), ("easting", "northing")):
+            if (getattr(self, first) is None) != (getattr(self, second) is None):
+                raise ValueError(f"{first} and {second} must be given together")
+        return self
 
 
 def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhoto, ...]:
@@ -147,24 +189,22 @@ def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhot
     root = path.parent if folder is None else folder
     match path.suffix.lower():
         case ".csv":
-            photos = [
-                _row(path, line, row, root, _path_column(path, row))
-                for line, row in read_table(path, ())
-            ]
+            photos = tuple(_photo_of_row(root, row) for _, row in read_table(path, PhotoRow))
         case ".npy":
-            photos = [_photo_of_name(root, name) for name in read_names(path)]
+            photos = photos_of_names(root, read_names(path))
         case _:
-            photos = [_photo_of_name(root, name) for name in _lines(path)]
+            photos = photos_of_names(root, read_lines(path))
     if not photos:
-        raise InvalidRequest("bad_list", f"{path} lists no photos.")
-    return add_utm_positions(add_exif_positions(add_utm_positions(photos)))
+        raise InvalidRequest(
+            "bad_list",
+            f"{path} lists no photos. The header of a CSV is, for example, {PHOTO_TABLE_HEADER}; "
+            "all columns but path are optional.",
+        )
+    return locate_photos(photos)
 
 
-def _photo_of_name(root: Path, name: str) -> DatasetPhoto:
-    return photo_from_filename(root / name.lstrip("/"), name)
-
-
-def _lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Read the lines of a text file that are not empty; raises InvalidRequest (`bad_list`)."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -172,46 +212,18 @@ def _lines(path: Path) -> list[str]:
     return [line.strip() for line in lines if line.strip()]
 
 
-def _path_column(path: Path, row: dict[str, str]) -> str:
-    column = next((column for column in PATH_COLUMNS if column in row), None)
-    if column is None:
-        raise InvalidRequest(
-            "missing_column",
-            f"{path} has no column {' or '.join(PATH_COLUMNS)}. Its columns are: {', '.join(row)}. "
-            f"A header is, for example, {PHOTO_TABLE_HEADER}; all but the first are optional.",
-            missing=[PATH_COLUMNS[0]],
-        )
-    return column
-
-
-def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: str) -> DatasetPhoto:
-    """Read a row of a CSV list; empty cells are unknown values, other columns are ignored."""
-    name = row[path_column].strip()
-    if not name:
-        raise bad_row_error(path, line, f"its {path_column} is empty")
-    values = {
-        COLUMN_ALIASES.get(column, column): cell for column, cell in row.items() if cell.strip()
-    }
-    numbers = {
-        column: parse_number(path, line, values, column)
-        for column in NUMBER_COLUMNS
-        if column in values
-    }
-    for first, second in (("latitude", "longitude"), ("easting", "northing")):
-        if (first in numbers) != (second in numbers):
-            raise bad_row_error(path, line, f"{first} and {second} must be given together")
-    named = _photo_of_name(root, name)
-    location = named if not numbers.keys() & {"latitude", "easting"} else None
-    return DatasetPhoto(
-        named.path,
-        name,
-        easting=numbers.get("easting", location.easting if location else None),
-        northing=numbers.get("northing", location.northing if location else None),
-        zone=values.get("zone", location.zone if location else None),
-        latitude=numbers.get("latitude", location.latitude if location else None),
-        longitude=numbers.get("longitude", location.longitude if location else None),
-        heading=numbers["heading"] % 360 if "heading" in numbers else named.heading,
-        place=values.get("place"),
-        frame=parse_integer(path, line, values, "frame") if "frame" in values else named.frame,
-        sequence=values.get("sequence"),
+def _photo_of_row(root: Path, row: PhotoRow) -> DatasetPhoto:
+    (named,) = photos_of_names(root, [row.path])
+    position = named if row.latitude is None and row.easting is None else row
+    return replace(
+        named,
+        easting=position.easting,
+        northing=position.northing,
+        zone=row.zone or position.zone,
+        latitude=position.latitude,
+        longitude=position.longitude,
+        heading=named.heading if row.heading is None else row.heading % 360,
+        place=row.place,
+        frame=named.frame if row.frame is None else row.frame,
+        sequence=row.sequence,
     )

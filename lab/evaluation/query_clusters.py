@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.datasets.open_dataset import DatasetPhoto
+from lab.datasets.dataset import DatasetPhoto
 from shared.evaluation.bootstrap import MIN_CLUSTERS
 from shared.geodesy import EARTH_RADIUS_M
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.datasets.open_dataset import EvaluationSet
+from lab.datasets.dataset import EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, exact_knn
 from lab.evaluation.recall import recall_at_k
 from shared.errors import PlacewiseError, Unprocessable

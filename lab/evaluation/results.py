@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lab.datasets.check import SuspectLabel
-from lab.datasets.open_dataset import DatasetPhoto, EvaluationSet
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, Scores
 from lab.evaluation.recall import compute_hits
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, hits_at_k

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.datasets.open_dataset import DatasetPhoto
+from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.utm_coordinates import pairwise_distances_m
 from lab.evaluation.exact_knn import Indices, Scores
 from lab.evaluation.query_clusters import QueryClusters

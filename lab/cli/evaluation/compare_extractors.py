@@ -18,7 +18,8 @@ from rich.progress import Progress
 from rich.table import Column
 
 from lab.cli.evaluation.describers import checkpoint_describer, extractor_describer
-from lab.datasets.open_dataset import EvaluationSet, open_evaluation_set
+from lab.datasets.dataset import EvaluationSet
+from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set

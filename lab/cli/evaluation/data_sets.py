@@ -24,8 +24,9 @@ from rich.progress import Progress
 from lab.cli.evaluation.commands import ReportOptions
 from lab.cli.evaluation.describers import Describer, checkpoint_describer, extractor_describer
 from lab.cli.evaluation.results import check_output_folders, evaluate_rankings, output_results
+from lab.datasets.dataset import EvaluationSet
 from lab.datasets.ground_truth_files import read_ground_truth
-from lab.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
+from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from lab.evaluation.exact_knn import Rankings, exact_knn
 from lab.evaluation.places import measure_places
 from lab.evaluation.ranking import (
@@ -304,7 +305,7 @@ def _replace_ground_truth(evaluation_set: EvaluationSet, path: Path) -> Evaluati
         database=[photo.name for photo in evaluation_set.database],
         queries=[photo.name for photo in evaluation_set.queries],
     )
-    return replace(evaluation_set, positives=tuple(positives), rule=rule or f"given by {path.name}")
+    return replace(evaluation_set, positives=tuple(positives), rule=rule)
 
 
 def make_describer(

@@ -15,8 +15,9 @@ from rich.table import Column
 
 from lab.cli.evaluation.commands import ReportOptions
 from lab.datasets.check import find_suspect_labels
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth_files import read_ground_truth, read_integer_lists
-from lab.datasets.open_dataset import DatasetPhoto, EvaluationSet, open_evaluation_set
+from lab.datasets.open_dataset import open_evaluation_set
 from lab.datasets.photo_lists import read_photo_list
 from lab.evaluation.exact_knn import Indices, Rankings
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
@@ -239,7 +240,7 @@ def evaluate_predictions(
     check_output_folders(options)
     ranked = read_predictions(predictions)
     name = _only_set(sets) or ground_truth.stem
-    rule = None
+    rule = f"given by {ground_truth.name}"
     photo_lists: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
     if database is not None and queries is not None:
         photo_lists = read_photo_list(database, photos), read_photo_list(queries, photos)
@@ -262,7 +263,7 @@ def evaluate_predictions(
         database=photo_lists[0],
         queries=photo_lists[1],
         positives=tuple(positives),
-        rule=rule or f"given by {ground_truth.name}",
+        rule=rule,
         protocol=PREDICTIONS_PROTOCOL,
     )
     _output_predictions(predictions, ranked, evaluation_set, options)

@@ -11,7 +11,8 @@ from rich.progress import Progress
 from rich.table import Column
 
 from lab.cli.evaluation.data_sets import EvaluationTarget, make_describer
-from lab.datasets.open_dataset import EvaluationSet, evaluation_set_names, open_evaluation_set
+from lab.datasets.dataset import EvaluationSet
+from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from lab.evaluation.ranking import describe_evaluation_set
 from lab.evaluation.sequences import (
     evaluate_kidnapped,

@@ -10,23 +10,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lab.datasets.dataset import DatasetPhoto, TrainingSet
+from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.layouts.base import (
     DEFAULT_RULE,
-    PLACEWISE_PROTOCOL,
     CityPhotos,
+    EvaluationLayout,
     ListedSet,
-    number_places,
-    select_cities,
+    TrainingLayout,
 )
-from lab.datasets.photo_lists import bad_row_error, read_photo_list, read_table
+from lab.datasets.photo_lists import TableRow, read_photo_list, read_table
 
 
-class CsvTables:
+class CsvTables(EvaluationLayout):
     """Evaluation sets as CSV tables."""
 
     name = "CSV tables"
-    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         exists = all((base / name).is_file() for name in ("database.csv", "queries.csv"))
@@ -48,8 +46,14 @@ def _read_photos(base: Path, role: str) -> tuple[DatasetPhoto, ...]:
     return read_photo_list(table, base / role) if is_inside else beside
 
 
-class CsvTrainingTable:
-    """Training sets as a CSV table."""
+class _PlaceRow(TableRow):
+    path: str
+    place: str
+    city: str | None = None
+
+
+class CsvTrainingTable(TrainingLayout):
+    """Training sets as a CSV table; without a column `city` there is one city."""
 
     name = "CSV table of places"
 
@@ -57,30 +61,17 @@ class CsvTrainingTable:
         return (base / "train.csv").is_file()
 
     def cities(self, base: Path) -> tuple[str, ...]:
-        return tuple(sorted(_by_city(base)))
+        rows = read_table(base / "train.csv", _PlaceRow)
+        return tuple(sorted({row.city or base.resolve().name for _, row in rows}))
 
-    def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
-        by_city = _by_city(base)
-        chosen = select_cities(base, cities, sorted(by_city))
-        places = number_places(
-            [(city, _number_labels(by_city[city])) for city in chosen], min_photos
-        )
-        return TrainingSet(base.resolve().name, base, self.name, places)
-
-
-def _by_city(base: Path) -> dict[str, dict[str, list[Path]]]:
-    """Group photos by city and place label; without a column `city` there is one city."""
-    table = base / "train.csv"
-    by_city: dict[str, dict[str, list[Path]]] = {}
-    for line, row in read_table(table, ("path", "place")):
-        if not (row["path"].strip() and row["place"].strip()):
-            raise bad_row_error(table, line, "path and place are required")
-        city = row.get("city", "").strip() or base.resolve().name
-        photos = by_city.setdefault(city, {}).setdefault(row["place"].strip(), [])
-        photos.append(base / row["path"].strip())
-    return by_city
-
-
-def _number_labels(labels: Mapping[str, list[Path]]) -> CityPhotos:
-    """Number the places of a city by the rank of their labels."""
-    return {number: labels[label] for number, label in enumerate(sorted(labels))}
+    def photos(self, base: Path, cities: Sequence[str]) -> dict[str, CityPhotos]:
+        """Place ids are the ranks of their labels."""
+        labels: dict[str, dict[str, list[Path]]] = {city: {} for city in cities}
+        for _, row in read_table(base / "train.csv", _PlaceRow):
+            city = labels.get(row.city or base.resolve().name)
+            if city is not None:
+                city.setdefault(row.place, []).append(base / row.path)
+        return {
+            city: dict(enumerate(places[label] for label in sorted(places)))
+            for city, places in labels.items()
+        }

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lab.datasets.dataset import DatasetPhoto
-from lab.datasets.layouts.base import PLACEWISE_PROTOCOL, ListedSet
+from lab.datasets.layouts.base import EvaluationLayout, ListedSet
 from shared.errors import InvalidRequest, Misconfigured
 
 FIELDS = 8
@@ -22,11 +22,10 @@ DATABASE_FOLDERS = (".", "images", "database", "..")
 QUERY_FOLDERS = ("queries_real", ".", "images", "queries", "../queries_real", "..")
 
 
-class DbStruct:
+class DbStruct(EvaluationLayout):
     """Evaluation sets as dbStruct files."""
 
     name = "dbStruct .mat"
-    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         return {path.stem: path.name for path in sorted(base.glob("*.mat"))}

@@ -20,9 +20,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from lab.datasets.dataset import DatasetPhoto
-from lab.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
-from lab.datasets.photo_lists import add_exif_positions, photo_from_filename
-from lab.datasets.utm_coordinates import add_utm_positions
+from lab.datasets.layouts.base import (
+    DEFAULT_RULE,
+    PLACEWISE_PROTOCOL,
+    EvaluationLayout,
+    ListedSet,
+    photos_below,
+)
+from lab.datasets.photo_lists import locate_photos, photo_from_filename, read_lines
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
@@ -34,7 +39,7 @@ VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
 
-class FolderPairs:
+class FolderPairs(EvaluationLayout):
     """Evaluation sets as pairs of folders, named by dataset folder, split and query version."""
 
     name = "database and queries folders"
@@ -49,17 +54,17 @@ class FolderPairs:
             for queries in (home / "queries", *sorted(home.glob("queries_v[0-9]*")))
             if queries.is_dir()
         }
-        rides = {f"{prefix}_{RIDES}": RIDES} if _has_rides(base) else {}
-        seasons = [season for season in SEASONS if (base / season).is_dir()]
-        return {**pairs, **rides, **{f"{prefix}_{season}": season for season in seasons[1:]}}
+        if (base / "database").is_dir() and (base / RIDES).is_dir():
+            pairs[f"{prefix}_{RIDES}"] = RIDES
+        return pairs | {f"{prefix}_{season}": season for season in _seasons(base)[1:]}
 
     def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         if key == RIDES:
             photos = _read_photos(base / "database", base)
             return ListedSet(photos, _read_rides(base), _default_rule(photos))
         if key in SEASONS:
-            first = next(season for season in SEASONS if (base / season).is_dir())
-            before, after = (_number(_read_photos(base / each, base)) for each in (first, key))
+            pair = (_seasons(base)[0], key)
+            before, after = (_number(_read_photos(base / season, base)) for season in pair)
             return ListedSet(before, after, SAME_INDEX_RULE)
         folder = base / key
         database, queries = (
@@ -80,8 +85,8 @@ def _is_placed(photo: DatasetPhoto) -> bool:
     return any(value is not None for value in (photo.easting, photo.place, photo.frame))
 
 
-def _has_rides(folder: Path) -> bool:
-    return (folder / "database").is_dir() and (folder / RIDES).is_dir()
+def _seasons(base: Path) -> list[str]:
+    return [season for season in SEASONS if (base / season).is_dir()]
 
 
 def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
@@ -111,9 +116,9 @@ def _read_photos(folder: Path, base: Path) -> tuple[DatasetPhoto, ...]:
         photo_from_filename(path, path.relative_to(base).as_posix(), _place(path, folder))
         for path in _paths(folder)
     ]
-    if any(photo.easting is not None for photo in photos):
-        return tuple(photos)
-    return add_utm_positions(add_exif_positions(photos))
+    # EXIF is read only if no name has a position: it takes long on a network disk
+    has_positions = any(photo.easting is not None for photo in photos)
+    return tuple(photos) if has_positions else locate_photos(photos)
 
 
 def _place(path: Path, folder: Path) -> str | None:
@@ -125,9 +130,8 @@ def _paths(folder: Path) -> list[Path]:
     listing = folder.with_name(f"{folder.name}_images_paths.txt")
     if not listing.is_file():
         return photos_below(folder)
-    lines = [line.strip() for line in listing.read_text(encoding="utf-8").splitlines()]
     roots = (folder.parent, folder, folder.parent.parent)
-    paths = [line for line in lines if line]
+    paths = read_lines(listing)
     for root in roots:
         if paths and (root / paths[0]).exists():
             return [root / line for line in paths]

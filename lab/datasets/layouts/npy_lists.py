@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.datasets.dataset import DatasetPhoto, Indices
+from lab.datasets.dataset import Indices
 from lab.datasets.ground_truth_files import read_ground_truth, read_names
-from lab.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet
-from lab.datasets.photo_lists import photo_from_filename
+from lab.datasets.layouts.base import DEFAULT_RULE, EvaluationLayout, ListedSet
+from lab.datasets.photo_lists import photos_of_names
 from shared.errors import InvalidRequest
 
 QUERY_LIST_SUFFIXES = {"_dbImages": "_qImages", "_ref_image_names": "_query_image_names"}
@@ -32,11 +32,10 @@ QUERY_INDEX_SUFFIX = "_qIdx"
 """Of MSLS in gsv-cities: indices of the queries that are used; the ground truth is for these"""
 
 
-class NpyLists:
+class NpyLists(EvaluationLayout):
     """Evaluation sets as `.npy` lists."""
 
     name = "npy lists"
-    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         return {
@@ -50,24 +49,20 @@ class NpyLists:
         suffix = next(suffix for suffix in QUERY_LIST_SUFFIXES if key.endswith(f"{suffix}.npy"))
         name = key.removesuffix(f"{suffix}.npy")
         database = read_names(base / key)
-        queries = _listed_queries(
-            base,
-            name,
-            read_names(_existing_file(base / f"{name}{QUERY_LIST_SUFFIXES[suffix]}.npy")),
-        )
+        query_list = base / f"{name}{QUERY_LIST_SUFFIXES[suffix]}.npy"
+        queries = _chosen_queries(base, name, read_names(query_list))
         folder = _folder_of(base, database)
         truth = _find_ground_truth(base, name)
-        positives: tuple[Indices, ...] | None = None
+        positives: list[Indices] | None = None
         rule = DEFAULT_RULE
         if truth is not None:
-            rows, stored_rule = read_ground_truth(truth, database=database, queries=queries)
-            positives, rule = tuple(rows), stored_rule or f"given by {truth.name}"
+            positives, rule = read_ground_truth(truth, database=database, queries=queries)
         return ListedSet(
-            _list_photos(folder, database), _list_photos(folder, queries), rule, positives
+            photos_of_names(folder, database), photos_of_names(folder, queries), rule, positives
         )
 
 
-def _listed_queries(base: Path, name: str, queries: list[str]) -> list[str]:
+def _chosen_queries(base: Path, name: str, queries: list[str]) -> list[str]:
     path = base / f"{name}{QUERY_INDEX_SUFFIX}.npy"
     if not path.is_file():
         return queries
@@ -85,20 +80,9 @@ def _find_ground_truth(base: Path, name: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _existing_file(path: Path) -> Path:
-    if not path.is_file():
-        raise InvalidRequest("bad_list", f"The list of queries {path} does not exist.")
-    return path
-
-
 def _folder_of(base: Path, names: Sequence[str]) -> Path:
     """Return the folder of a list's photos; if none has them, `base`, so they count as missing."""
     for folder in (base, base / "images", base.parent):
         if names and (folder / names[0]).is_file():
             return folder
     return base
-
-
-def _list_photos(folder: Path, names: Sequence[str]) -> tuple[DatasetPhoto, ...]:
-    # Names in lists may or may not begin with a slash.
-    return tuple(photo_from_filename(folder / name.lstrip("/"), name) for name in names)

@@ -11,17 +11,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lab.datasets.ground_truth_files import read_numbered_ground_truth
-from lab.datasets.layouts.base import PLACEWISE_PROTOCOL, ListedSet, photos_below
+from lab.datasets.layouts.base import EvaluationLayout, ListedSet, photos_below
 from lab.datasets.photo_lists import photo_from_filename
 
 GROUND_TRUTH = "ground_truth_new.npy"
 
 
-class VprBench:
+class VprBench(EvaluationLayout):
     """Evaluation sets as two folders of numbered photos and a ground truth."""
 
     name = "VPR-Bench"
-    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         parts = (base / "ref", base / "query", base / GROUND_TRUTH)
@@ -40,7 +39,7 @@ class VprBench:
             database=[photo.name for photo in database],
             queries=[photo.name for photo in queries],
         )
-        return ListedSet(database, queries, f"given by {GROUND_TRUTH}", tuple(positives))
+        return ListedSet(database, queries, f"given by {GROUND_TRUTH}", positives)
 
 
 def _numeric_order(path: Path) -> list[tuple[int, str]]:

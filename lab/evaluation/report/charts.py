@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from lab.datasets.open_dataset import DatasetPhoto
+from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.results import EvaluationResult
 from lab.evaluation.retrieval_metrics import distance_error
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from lab.datasets.open_dataset import EvaluationSet
+from lab.datasets.dataset import EvaluationSet
 from lab.evaluation.report.charts import GREY, percent_chart, render_chart
 from lab.evaluation.report.page import render_page
 from lab.evaluation.retrieval_metrics import RetrievalMetrics

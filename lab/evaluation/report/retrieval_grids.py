@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.datasets.open_dataset import DatasetPhoto
+from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.results import EvaluationResult
 from shared.errors import Unprocessable
 from shared.imaging.decode import decode_photo

@@ -19,8 +19,9 @@ from typer.testing import CliRunner
 from lab.city.plan import CityOptions, make_plan
 from lab.city.write import write_city
 from lab.cli.evaluation.describers import ExtractorDescriber
+from lab.datasets.dataset import EvaluationSet
 from lab.datasets.ground_truth_files import write_integer_lists
-from lab.datasets.open_dataset import EvaluationSet, open_evaluation_set
+from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.recall import rank_by_similarity, recall_at_k
 from lab.training.model_describer import ModelDescriber
 from services.cli.main import build_app

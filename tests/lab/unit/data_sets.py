@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lab.datasets.open_dataset import EvaluationSet
+from lab.datasets.dataset import EvaluationSet
 from shared.errors import PlacewiseError
 from shared.utm_filenames import UtmFileName
 

@@ -180,7 +180,10 @@ def test_ground_truth_of_other_lists_is_refused(
 def test_published_ground_truth_is_refused_where_it_can_not_belong(tmp_path: Path) -> None:
     path = written(tmp_path)
     path.with_suffix(".json").unlink()
-    assert read_ground_truth(path, database=["b", "a", "c"], queries=["y", "x"])[1] is None
+    assert (
+        read_ground_truth(path, database=["b", "a", "c"], queries=["y", "x"])[1]
+        == "given by gt.npy"
+    )
     for database, queries in ((["a", "b"], ["x", "y"]), (["a", "b", "c"], ["x", "y", "z"])):
         with pytest.raises(InvalidRequest) as caught:
             read_ground_truth(path, database=database, queries=queries)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lab.datasets.open_dataset import TrainingSet, open_training_set
+from lab.datasets.dataset import TrainingSet
+from lab.datasets.open_dataset import open_training_set
 from shared.errors import InvalidRequest, NotFound, PlacewiseError
 from tests.lab.unit.data_sets import utm_name, write_csv, write_photo, write_photos
 

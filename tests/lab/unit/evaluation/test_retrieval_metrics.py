@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.datasets.open_dataset import DatasetPhoto
+from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import compute_recalls
 from lab.evaluation.recall import compute_hits
