@@ -20,8 +20,8 @@ from torch import nn
 
 from lab.training.arguments import TrainingArguments
 from lab.training.run_control import Display
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
-from shared.descriptors.vpr_models.aggregators.base import Aggregator
+from shared.descriptors.aggregators import AGGREGATORS
+from shared.descriptors.aggregators.base import Aggregator
 from shared.descriptors.vpr_models.backbones import register_backbone
 from shared.descriptors.vpr_models.checkpoint import is_checkpoint, load_checkpoint
 from shared.descriptors.vpr_models.config import VprModelConfig, is_own_module
@@ -147,8 +147,7 @@ def register_own_modules(arguments: TrainingArguments) -> None:
             raise _unusable_error(
                 "agg_arch",
                 arguments.agg_arch,
-                "it is not a subclass of Aggregator "
-                "(shared.descriptors.vpr_models.aggregators.base)",
+                "it is not a subclass of Aggregator (shared.descriptors.aggregators.base)",
             )
         AGGREGATORS[arguments.agg_arch] = aggregator
 

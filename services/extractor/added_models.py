@@ -142,7 +142,7 @@ class AddedModelLoader:
         assert row.object_key is not None
         assert row.sha256 is not None
         try:
-            checkpoint = read_model_file(self._cache.local_path(row.object_key, row.sha256))
+            model = read_model_file(self._cache.local_path(row.object_key, row.sha256))
         except NotFound as error:
             raise Unavailable(
                 "model_lost",
@@ -152,7 +152,7 @@ class AddedModelLoader:
                 model=name,
             ) from error
         return TrainedBackbone(
-            row.name, checkpoint.model, row.fingerprint, device, licence=row.licence, card=row.card
+            row.name, model, row.fingerprint, device, licence=row.licence, card=row.card
         )
 
 

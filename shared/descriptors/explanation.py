@@ -6,7 +6,7 @@ The similarity of a query's row r and a candidate's row d is <r, d>, and r is a 
            n_k = | sum over q of w_qk (x_q - c_k) |,   n = | [v_0 ... v_{K-1}] |
     mean:  r   = sum over q of x_q / (Q |mean|)
 
-(the symbols of `shared.descriptors.aggregation`; Q patches). So the share of patch q is
+(the symbols of `shared.descriptors.aggregators.clustering`; Q patches). So the share of patch q is
 
     VLAD:  sum over k of w_qk <x_q - c_k, d_k> / (n_k n)   cluster k: sum over q of the same
     mean:  <x_q, d> / (Q |mean|)
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.descriptors.aggregation import hard_assignment, soft_assignment
+from shared.descriptors.aggregators.clustering import hard_assignment, soft_assignment
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.extractor_config.configs import ExtractorConfig
 

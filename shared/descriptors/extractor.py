@@ -16,13 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.aggregation import average_pooling, gem_pooling, soft_vlad, vlad
-from shared.descriptors.backbones import Backbone
-from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
-from shared.descriptors.backbones.efficientnet_lite0 import EfficientNetLite0
-from shared.descriptors.backbones.synthetic import SlowBackbone, TinyBackbone
-from shared.descriptors.backbones.torchhub import TorchHubBackbone
-from shared.descriptors.backbones.trained import TrainedBackbone
+from shared.descriptors.aggregators import POOLINGS
+from shared.descriptors.backbones import Backbone, backbone_class
 from shared.descriptors.inference import (
     BatchSizeLimit,
     PhotoTooLargeForGpu,
@@ -33,55 +28,11 @@ from shared.descriptors.inference import (
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
 from shared.errors import Misconfigured, Unprocessable
-from shared.extractor_config.configs import (
-    SLOW_TEST_BACKBONE,
-    TORCHHUB_BACKBONE,
-    TRAINED_BACKBONE,
-    ExtractorConfig,
-)
+from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.decode import DECODER
-from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
+from shared.imaging.preprocessing import Pixels, get_preprocessing
 
 SHIPPED_VOCABULARIES = Path(__file__).parent / "vocabularies"
-
-
-def _load_dinov2(config: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
-    assert config.layer is not None
-    assert config.facet is not None
-    size = config.backbone.removeprefix("dinov2-")
-    return Dinov2(size, config.layer, config.facet, device, weights)
-
-
-def _load_slow_backbone(
-    config: ExtractorConfig, device: torch.device, _weights: Path | None
-) -> Backbone:
-    assert config.width is not None
-    return SlowBackbone(config.width, config.milliseconds / 1000, device)
-
-
-def _load_torchhub_entry(
-    config: ExtractorConfig, device: torch.device, _weights: Path | None
-) -> Backbone:
-    assert config.hub is not None
-    return TorchHubBackbone(config.hub, device)
-
-
-def _load_trained_backbone(
-    config: ExtractorConfig, device: torch.device, _weights: Path | None
-) -> Backbone:
-    assert config.trained is not None
-    assert config.trained.file is not None, "a registered model is loaded through the catalog"
-    return TrainedBackbone.from_checkpoint(config.name, Path(config.trained.file), device)
-
-
-BACKBONES: dict[str, Callable[[ExtractorConfig, torch.device, Path | None], Backbone]] = {
-    "efficientnet-lite0": lambda _config, device, _weights: EfficientNetLite0(device),
-    SLOW_TEST_BACKBONE: _load_slow_backbone,
-    "test-tiny": lambda _config, device, _weights: TinyBackbone(device),
-    TORCHHUB_BACKBONE: _load_torchhub_entry,
-    TRAINED_BACKBONE: _load_trained_backbone,
-    **{f"dinov2-{size}": _load_dinov2 for size in SHAPES},
-}
 
 
 def choose_device(device: str) -> torch.device:
@@ -124,13 +75,17 @@ class Extractor:
 
         Raises:
             Misconfigured: `weights_missing`, `weights_unusable`, `torchhub_unusable`.
-            PlacewiseError: For a checkpoint, as `TrainedBackbone.from_checkpoint` raises.
+            PlacewiseError: For a checkpoint, as `TrainedBackbone.load` raises.
         """
         self.config = config
         self.precision: Precision = precision
         self.limit = limit or BatchSizeLimit(device)
-        self.backbone = backbone or BACKBONES[config.backbone](config, device, dino_weights)
-        self.preprocessing: Preprocessing = _preprocessing(config, self.backbone)
+        self.backbone = backbone or backbone_class(config).load(config, device, dino_weights)
+        if config.preprocessing is None:
+            assert self.backbone.preprocessing is not None
+            self.preprocessing = self.backbone.preprocessing
+        else:
+            self.preprocessing = get_preprocessing(config.preprocessing)
         assert config.width in (None, self.backbone.width), "config.width must match the backbone"
 
     def with_precision(self, precision: Precision) -> Extractor:
@@ -189,11 +144,7 @@ class Extractor:
             }
         if self.config.aggregator == "soft-vlad":
             spec["temperature"] = self.config.temperature
-        if isinstance(self.backbone, TorchHubBackbone):
-            spec["code_fingerprint"] = self.backbone.code_fingerprint
-        if isinstance(self.backbone, TrainedBackbone):
-            spec |= self.backbone.as_spec()
-        return spec
+        return spec | self.backbone.own_spec()
 
     def dimension(
         self, centres: ClusterCentres | None, projection: PcaProjection | None = None
@@ -295,31 +246,11 @@ class Extractor:
 
     def _aggregate(self, features: torch.Tensor, centres: torch.Tensor | None) -> torch.Tensor:
         """(B, patches, width), (K, width) -> (B, dimension)."""
-        match self.config.aggregator:
-            case "avg":
-                rows = average_pooling(features)
-            case "gem":
-                rows = gem_pooling(features)
-            case "vlad":
-                assert centres is not None
-                rows = vlad(features, centres)
-            case "soft-vlad":
-                assert centres is not None
-                rows = soft_vlad(features, centres, self.config.temperature)
-            case "none":
-                rows = features[:, 0]
-            case other:
-                raise ValueError(f"unknown aggregator {other!r}")
+        centres = features.new_empty(0) if centres is None else centres
+        rows = POOLINGS[self.config.aggregator](features, centres, self.config.temperature)
         # Set explicitly: a comparison or a clamp in the aggregator may hide a NaN.
         finite = torch.isfinite(features).flatten(1).all(dim=1, keepdim=True)
         return torch.where(finite, rows, torch.nan)
-
-
-def _preprocessing(config: ExtractorConfig, backbone: Backbone) -> Preprocessing:
-    if config.preprocessing is not None:
-        return get_preprocessing(config.preprocessing)
-    assert isinstance(backbone, TrainedBackbone), "preprocessing is missing"
-    return backbone.preprocessing
 
 
 def not_finite_error() -> Unprocessable:

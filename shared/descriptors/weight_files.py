@@ -17,14 +17,15 @@ import hashlib
 import pickle
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx2
 import torch
 from filelock import FileLock
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 
 from shared.errors import Misconfigured
 
@@ -37,13 +38,17 @@ OnProgress = Callable[[int, int | None], object]
 """Called with the bytes received and the total, which is None if the server does not declare it."""
 
 
+def ignore_progress(_done: int, _total: int | None) -> None:
+    """An `OnProgress` that does nothing."""
+
+
 def download_file(
     url: str,
     target: Path,
     *,
     sha256: str | None = None,
     headers: dict[str, str] | None = None,
-    on_progress: OnProgress = lambda _done, _total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> None:
     """Download a file, resuming an earlier attempt.
 
@@ -86,6 +91,12 @@ def file_sha256(path: Path) -> str:
     """Return the hexadecimal sha256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def file_state(path: Path) -> str:
+    """Return a key of a file that changes with its content: path, size and time of change."""
+    stat = path.stat()
+    return f"{path} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
@@ -223,6 +234,58 @@ def load_tensors(path: Path) -> Any:
         _check_entries(path)
     # Files of older releases are not archives: uncompressed, and they can't be mapped.
     return torch.load(path, map_location="cpu", weights_only=True, mmap=is_archive)
+
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TensorFile:
+    """The tensors of a file by name; each is read on demand."""
+
+    path: Path
+    shapes: dict[str, Shape]
+    read: Callable[[str], torch.Tensor]
+    """Returns the tensor of a name, on the CPU, with its stored dtype."""
+
+
+def open_tensor_file(path: Path) -> TensorFile:
+    """Open a `.safetensors` or PyTorch file; only its index is read, and no code is executed.
+
+    Raises:
+        One of TENSOR_READ_ERRORS, also for a file without tensors.
+    """
+    with path.open("rb") as file:
+        begin = file.read(9)
+    if begin[8:] == b"{":  # by content: blobs in a Hugging Face cache have no suffix
+        stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
+        shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in stored.keys()}  # noqa: SIM118
+        return TensorFile(path, shapes, stored.get_tensor)
+    state = load_tensors(path)
+    if not isinstance(state, dict):
+        raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
+    tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}
+    if not tensors:
+        raise ValueError(f"it holds no tensors, only {', '.join(map(str, list(state)[:3]))}")
+    return TensorFile(path, {n: tuple(t.shape) for n, t in tensors.items()}, tensors.__getitem__)
+
+
+def shape_differences(
+    stored: Mapping[str, Shape], expected: Mapping[str, Shape], *, may_have_more: bool = False
+) -> str:
+    """Return how stored tensors differ from the expected ones, the first three differences."""
+    differences = [
+        f"it has no tensor {n} {shape}" for n, shape in expected.items() if n not in stored
+    ]
+    differences += [
+        f"{n} is {stored[n]}, expected {shape}"
+        for n, shape in expected.items()
+        if stored.get(n, shape) != shape
+    ]
+    if not may_have_more:
+        differences += [f"{n} is not in the network" for n in stored if n not in expected]
+    more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+    return "; ".join(differences[:3]) + more
 
 
 def check_declared_size(tensors: Iterable[torch.Tensor], path: Path) -> None:

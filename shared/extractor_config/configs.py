@@ -44,8 +44,6 @@ MIN_PHOTOS_TO_FIT = 50  # a vocabulary that was fitted on fewer photos of a map 
 # Photos of the map that a vocabulary is fitted on. 1,000 gave no better recall on real photos.
 DEFAULT_SAMPLE_PHOTOS = 500
 MAX_PCA_DIMENSION = 1024  # dimensions after PCA, whose time and memory grow quadratically
-TORCHHUB_BACKBONE = "torchhub"  # the backbone that is a torch.hub entry
-TRAINED_BACKBONE = "gsv"  # the backbone that is a model of `placewise train`
 SLOW_TEST_BACKBONE = "test-slow"  # the backbone whose width and time are options
 MAX_WIDTH = 131_072
 MAX_MILLISECONDS = 60_000
@@ -59,7 +57,9 @@ class ExtractorConfig:
     name: str
     """Canonical name, with the options that differ from the extractor's defaults."""
     backbone: str
-    """One of `shared.descriptors.extractor.BACKBONES`."""
+    """Name of the network."""
+    implementation: str
+    """Its `Backbone`, `module:class` of `shared.descriptors.backbones`."""
     width: int | None
     """Dimension of a local feature; None where only the loaded network determines it."""
     parameters: int | None
@@ -138,6 +138,7 @@ def _anyloc_config(
     return ExtractorConfig(
         name=f"anyloc-{size}",
         backbone=f"dinov2-{size}",
+        implementation="dinov2:Dinov2",
         width=width,
         parameters=parameters,
         preprocessing="square224",
@@ -154,6 +155,7 @@ EXTRACTOR_CONFIGS = {
         ExtractorConfig(
             name="efficientnet-lite0-vlad",
             backbone="efficientnet-lite0",
+            implementation="efficientnet_lite0:EfficientNetLite0",
             width=112,
             parameters=5_000_000,
             preprocessing="square224",
@@ -163,6 +165,7 @@ EXTRACTOR_CONFIGS = {
         ExtractorConfig(
             name="efficientnet-lite0-vlad128",
             backbone="efficientnet-lite0",
+            implementation="efficientnet_lite0:EfficientNetLite0",
             width=112,
             parameters=5_000_000,
             preprocessing=AREA_PREPROCESSING_NAME,
@@ -177,6 +180,7 @@ EXTRACTOR_CONFIGS = {
         ExtractorConfig(
             name="test-tiny-avg",
             backbone="test-tiny",
+            implementation="synthetic:TinyBackbone",
             width=16,
             parameters=1_000,
             preprocessing="square32",
@@ -186,6 +190,7 @@ EXTRACTOR_CONFIGS = {
         ExtractorConfig(
             name="test-tiny-vlad",
             backbone="test-tiny",
+            implementation="synthetic:TinyBackbone",
             width=16,
             parameters=1_000,
             preprocessing="square32",
@@ -196,6 +201,7 @@ EXTRACTOR_CONFIGS = {
         ExtractorConfig(
             name="test-slow-avg",
             backbone=SLOW_TEST_BACKBONE,
+            implementation="synthetic:SlowBackbone",
             width=7168,
             parameters=1_000,
             preprocessing="square224",  # decoding and resizing do their real work
@@ -263,7 +269,8 @@ def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
     is_default_size = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
     return ExtractorConfig(
         name=hub.name,
-        backbone=TORCHHUB_BACKBONE,
+        backbone="torchhub",
+        implementation="torchhub:TorchHubBackbone",
         width=None,
         parameters=None,
         preprocessing="square224" if is_default_size else f"resize{hub.height}x{hub.width}",
@@ -275,7 +282,8 @@ def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
 def _trained_config(trained: TrainedModelName) -> ExtractorConfig:
     return ExtractorConfig(
         name=trained.extractor,
-        backbone=TRAINED_BACKBONE,
+        backbone="gsv",
+        implementation="trained:TrainedBackbone",
         width=None,
         parameters=None,
         preprocessing=None,

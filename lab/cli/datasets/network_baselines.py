@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.descriptors.aggregation import vlad
+from shared.descriptors.aggregators.clustering import vlad
 from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.backbones.efficientnet_lite0 import MEAN, STD
 from shared.descriptors.extractor import Extractor, choose_device

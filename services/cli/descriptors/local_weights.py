@@ -17,7 +17,6 @@ from typing import Any
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig, get_extractor_config
-from shared.extractor_config.names import TorchHubEntry
 
 NEVER_LOADED = "its code is here, but its weights were never loaded: run `placewise models fetch`"
 
@@ -101,24 +100,44 @@ def inspect_weights(
     """Inspect the local weights of an extractor, without network access or loading the model.
 
     If the fingerprint of a file is not cached, `on_reading` is called with its path before it is
-    read to compute the fingerprint.
+    read to compute the fingerprint. Code of torch.hub counts as available once it was loaded.
     """
-    if config.hub is not None:
-        return _torchhub_weights(config.hub)
-    if config.depth is not None:
-        return _dinov2_weights(config, settings.dino_weights, on_reading)
-    return _packaged_weights(config, on_reading)
+    from shared.descriptors.backbones import backbone_class
+
+    backbone = backbone_class(config)
+    source = backbone.weights_source(config, settings.dino_weights)
+    try:
+        found = backbone.find_weights(config, settings.dino_weights)
+    except Misconfigured as error:
+        return LocalWeights(
+            config.name, source, False, error.detail, None, None, backbone.licence, None
+        )
+    known = _load_record(found.key)
+    if known is None and found.fingerprint is not None:
+        on_reading(found.path)
+        known = WeightsRecord(found.fingerprint(), found.path.stat().st_size)
+        save_record(found.key, known)
+    return LocalWeights(
+        config.name,
+        source,
+        known is not None,
+        None if known else NEVER_LOADED,
+        str(found.path),
+        known.size_bytes if known else None,
+        found.licence,
+        known.fingerprint if known else None,
+    )
 
 
 def _has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
-    """Whether the weights of a DINOv2 or torch.hub extractor are on this machine and fit it."""
-    if config.hub is not None:
-        return _torchhub_weights(config.hub).here
+    """Whether the weights of an extractor are on this machine and fit it."""
+    from shared.descriptors.backbones import backbone_class
+
     try:
-        find_dinov2_weights(config, settings.dino_weights)
+        found = backbone_class(config).find_weights(config, settings.dino_weights)
     except Misconfigured:
         return False
-    return True
+    return found.fingerprint is not None or _load_record(found.key) is not None
 
 
 def suggest_extractor(settings: Settings) -> str | None:
@@ -146,119 +165,4 @@ def suggest_extractor(settings: Settings) -> str | None:
     return (
         f"a GPU and the weights of {config.name} are here; it finds more than the default "
         f"extractor: EXTRACTOR={config.name} uses it for new maps"
-    )
-
-
-def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
-    """Cache key of the weights of a torch.hub entry."""
-    return f"{hub.module} {code_fingerprint}"
-
-
-def _packaged_weights(
-    config: ExtractorConfig, on_reading: Callable[[Path], object]
-) -> LocalWeights:
-    from shared.descriptors.backbones.efficientnet_lite0 import (
-        PACKAGE,
-        EfficientNetLite0,
-        weights_path,
-    )
-    from shared.descriptors.weight_files import file_sha256
-
-    facts = (config.name, f"the package {PACKAGE}", EfficientNetLite0.licence)
-    try:
-        path = weights_path()
-    except Misconfigured as error:
-        return _missing_weights(*facts, error)
-    return _weights_file(*facts, path, config.backbone, file_sha256, on_reading)
-
-
-def _dinov2_weights(
-    config: ExtractorConfig, weights_file: Path | None, on_reading: Callable[[Path], object]
-) -> LocalWeights:
-    from shared.descriptors.backbones.dinov2 import Dinov2, dinov2_fingerprint
-    from shared.descriptors.backbones.dinov2_weights import hub_repository, open_weights
-
-    layer, facet = config.layer, config.facet
-    assert layer is not None
-    assert facet is not None
-    size = config.backbone.removeprefix("dinov2-")
-    source = f"Hugging Face: {hub_repository(size)}" if weights_file is None else "DINO_WEIGHTS"
-    facts = (config.name, source, Dinov2.licence)
-    try:
-        path = find_dinov2_weights(config, weights_file)
-    except Misconfigured as error:
-        return _missing_weights(*facts, error)
-
-    def fingerprint(file: Path) -> str:
-        return dinov2_fingerprint(size, layer, facet, open_weights(file, size))
-
-    # The fingerprint covers only the tensors that this layer and facet use.
-    name = f"{config.backbone} {layer} {facet}"
-    return _weights_file(*facts, path, name, fingerprint, on_reading)
-
-
-def _missing_weights(
-    extractor: str, source: str, licence: str, error: Misconfigured
-) -> LocalWeights:
-    return LocalWeights(extractor, source, False, error.detail, None, None, licence, None)
-
-
-def _weights_file(
-    extractor: str,
-    source: str,
-    licence: str,
-    path: Path,
-    name: str,
-    fingerprint: Callable[[Path], str],
-    on_reading: Callable[[Path], object],
-) -> LocalWeights:
-    """Describe the weights in a file; their record is cached under `name`."""
-    stat = path.stat()
-    key = f"{name} {path} {stat.st_size} {stat.st_mtime_ns}"
-    known = _load_record(key)
-    if known is None:
-        on_reading(path)
-        known = WeightsRecord(fingerprint(path), stat.st_size)
-        save_record(key, known)
-    return LocalWeights(
-        extractor, source, True, None, str(path), known.size_bytes, licence, known.fingerprint
-    )
-
-
-def find_dinov2_weights(config: ExtractorConfig, weights_file: Path | None) -> Path:
-    """Return the local weights file; raises Misconfigured where it is missing or does not fit."""
-    from shared.descriptors.backbones.dinov2 import check_dinov2_weights
-    from shared.descriptors.backbones.dinov2_weights import find_local_weights, open_weights
-
-    assert config.layer is not None
-    assert config.facet is not None
-    size = config.backbone.removeprefix("dinov2-")
-    path = find_local_weights(size, weights_file)
-    check_dinov2_weights(size, config.layer, config.facet, open_weights(path, size))
-    return path
-
-
-def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
-    """Weights of a torch.hub entry count as available once this version of its code was loaded."""
-    from shared.descriptors.backbones.torchhub import (
-        code_fingerprint,
-        find_licence,
-        find_local_code,
-    )
-
-    source = f"the folder {hub.folder}" if hub.folder else f"github.com/{hub.source}"
-    try:
-        folder = find_local_code(hub)
-    except Misconfigured as error:
-        return _missing_weights(hub.name, source, "unknown", error)
-    known = _load_record(torchhub_key(hub, code_fingerprint(folder)))
-    return LocalWeights(
-        hub.name,
-        source,
-        known is not None,
-        None if known else NEVER_LOADED,
-        str(folder),
-        known.size_bytes if known else None,
-        find_licence(folder),
-        known.fingerprint if known else None,
     )

@@ -31,7 +31,6 @@ from services.cli.descriptors.local_weights import (
     inspect_weights,
     list_extractor_configs,
     save_record,
-    torchhub_key,
 )
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -47,10 +46,8 @@ from services.cli.output import (
     print_table,
     progress_bar,
 )
-from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import get_extractor_config
-from shared.extractor_config.names import TorchHubEntry
 
 if TYPE_CHECKING:
     from shared.descriptors.weight_files import OnProgress
@@ -207,12 +204,15 @@ def fetch(
             f"The weights of {config.name} are in the object store, from which extractors load "
             "them. There is nothing to fetch.",
         )
+    from shared.descriptors.backbones import backbone_class  # imports torch
+
+    dimension = config.dimension
     with _download_progress(config.name) as on_progress:
-        dimension = config.dimension
-        if config.hub is not None:
-            dimension = _fetch_torchhub(config.hub, on_progress)
-        elif config.depth is not None:
-            _fetch_dinov2(config.backbone, settings, on_progress)
+        loaded = backbone_class(config).fetch(config, settings.dino_weights, on_progress)
+    if loaded is not None:
+        dimension = loaded.width
+        found = loaded.find_weights(config, settings.dino_weights)
+        save_record(found.key, WeightsRecord(loaded.fingerprint, loaded.card["size_bytes"]))
     weights = inspect_weights(config, settings)
     if not weights.here:
         raise Misconfigured("weights_unusable", weights.note or "")
@@ -222,26 +222,6 @@ def fetch(
     _print_weights(weights, dimension)
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         print_message(f"To allow maps to use it, set TORCHHUB_ALLOWED={config.name}")
-
-
-def _fetch_dinov2(backbone: str, settings: Settings, on_progress: OnProgress) -> None:
-    from shared.descriptors.backbones.dinov2_weights import find_or_download_weights
-
-    find_or_download_weights(backbone.removeprefix("dinov2-"), settings.dino_weights, on_progress)
-
-
-def _fetch_torchhub(hub: TorchHubEntry, on_progress: OnProgress) -> int:
-    """Load a torch.hub entry, cache its fingerprint and return its descriptor dimension."""
-    import torch
-
-    from shared.descriptors.backbones.torchhub import TorchHubBackbone
-
-    backbone = TorchHubBackbone(hub, torch.device("cpu"), on_progress=on_progress)
-    save_record(
-        torchhub_key(hub, backbone.code_fingerprint),
-        WeightsRecord(backbone.fingerprint, backbone.card["size_bytes"]),
-    )
-    return backbone.width
 
 
 def _print_weights(weights: LocalWeights, dimension: int | None) -> None:

@@ -17,7 +17,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-from services.cli.descriptors.local_weights import find_dinov2_weights, suggest_extractor
+from services.cli.descriptors.local_weights import suggest_extractor
 from shared.catalog.database.schema import check_pages
 from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
@@ -133,12 +133,15 @@ def check_extractor(settings: Settings) -> str:
 
 
 def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
-    if config.depth is not None:
-        return _check_dinov2(config, settings.dino_weights)
-    if config.hub is not None:
-        from shared.descriptors.backbones.torchhub import find_local_code
+    from shared.descriptors.backbones import backbone_class
 
-        find_local_code(config.hub)
+    if not config.for_tests and config.trained is None:
+        path = backbone_class(config).find_weights(config, settings.dino_weights).path
+        if config.depth is not None:
+            return (
+                f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no "
+                "shipped vocabulary: photos are described once one is fitted or imported"
+            )
     from services.cli.descriptors.local_extractor import load_extractor
 
     extractor = load_extractor(config, settings)
@@ -147,14 +150,6 @@ def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
         f"shipped vocabulary of {shipped[0].clusters} centres"
         if shipped
         else "no shipped vocabulary"
-    )
-
-
-def _check_dinov2(config: ExtractorConfig, weights: Path | None) -> str:
-    path = find_dinov2_weights(config, weights)
-    return (
-        f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no shipped "
-        "vocabulary: photos are described once one is fitted or imported"
     )
 
 

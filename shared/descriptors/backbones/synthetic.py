@@ -12,26 +12,26 @@ from __future__ import annotations
 
 import hashlib
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from shared.descriptors.backbones import normalise_features
-from shared.extractor_config.configs import SLOW_TEST_BACKBONE
+from shared.descriptors.backbones import Backbone, normalise_features
+from shared.extractor_config.configs import SLOW_TEST_BACKBONE, ExtractorConfig
 
 TINY_SEED = 20_240
 TINY_PATCH_PIXELS = 4  # pixels
 
 
-class TinyBackbone:
+class TinyBackbone(Backbone):
     """Backbone that projects patches of 4 x 4 pixels by a fixed random matrix."""
 
     name = "test-tiny"
     licence = "MIT"
     width = 16
     layer = "projection"
-    facet: str | None = None
 
     def __init__(self, device: torch.device) -> None:
         projection = (
@@ -43,6 +43,12 @@ class TinyBackbone:
         self.card: dict[str, Any] = {"made": "a fixed random projection, no training"}
         self._projection = torch.from_numpy(projection).to(device)
         self.device = device
+
+    @classmethod
+    def load(
+        cls, config: ExtractorConfig, device: torch.device, weights: Path | None
+    ) -> TinyBackbone:
+        return cls(device)
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -59,13 +65,12 @@ class TinyBackbone:
 SLOW_SEED = 20_241
 
 
-class SlowBackbone:
+class SlowBackbone(Backbone):
     """Backbone that selects pixels and sleeps for a given time per photo."""
 
     name = SLOW_TEST_BACKBONE
     licence = "MIT"
     layer = "pixels"
-    facet: str | None = None
 
     def __init__(self, width: int, seconds: float, device: torch.device) -> None:
         """`width`: number of selected pixels; `seconds`: time to sleep for each photo."""
@@ -77,6 +82,13 @@ class SlowBackbone:
         self._seconds = seconds
         self._fractions = torch.from_numpy(fractions).to(device)
 
+    @classmethod
+    def load(
+        cls, config: ExtractorConfig, device: torch.device, weights: Path | None
+    ) -> SlowBackbone:
+        assert config.width is not None
+        return cls(config.width, config.milliseconds / 1000, device)
+
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         time.sleep(self._seconds * len(pixels))
@@ -86,6 +98,3 @@ class SlowBackbone:
         # No pixel has the value 127.5, so no feature is zero.
         values = flat[:, chosen].to(torch.float32) - 127.5
         return normalise_features(values).unsqueeze(1)
-
-    def grid(self, height: int, width: int) -> tuple[int, int]:
-        return 1, 1

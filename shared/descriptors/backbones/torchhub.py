@@ -26,22 +26,29 @@ from urllib.error import URLError
 
 import httpx2
 import torch
-from torch.nn.functional import normalize
 
-from shared.descriptors.backbones import normalise_features, normalise_pixels
-from shared.descriptors.weight_files import OnProgress, download_file, first_error_line
+from shared.descriptors.backbones import (
+    Backbone,
+    StoredWeights,
+    find_descriptor_fault,
+    normalise_features,
+    normalise_pixels,
+    probe_photos,
+)
+from shared.descriptors.weight_files import (
+    OnProgress,
+    download_file,
+    first_error_line,
+    ignore_progress,
+)
 from shared.errors import Misconfigured, PlacewiseError
-from shared.extractor_config.configs import MAX_WIDTH
+from shared.extractor_config.configs import ExtractorConfig
 from shared.extractor_config.names import TORCHHUB_PREFIX, TorchHubEntry
 
 GITHUB = "https://github.com"
 HUBCONF = "hubconf.py"
 LICENCE_FILES = re.compile(r"(licen[cs]e|copying)([.-].*)?", re.IGNORECASE)
 NETWORK_ERRORS = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
-
-
-def _ignore_progress(_done: int, _total: int | None) -> None:
-    """Progress callback that does nothing."""
 
 
 def _cached_code_folder(hub: TorchHubEntry) -> Path:
@@ -52,7 +59,7 @@ def _cached_code_folder(hub: TorchHubEntry) -> Path:
     return Path(torch.hub.get_dir(), f"{hub.repository.replace('/', '_')}_{hub.commit}")
 
 
-def _find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = _ignore_progress) -> Path:
+def _find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_progress) -> Path:
     """Return the folder of the code; a repository is downloaded from GitHub if it is missing.
 
     Raises Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
@@ -65,10 +72,10 @@ def _find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = _ignore
             raise _code_missing_error(
                 hub, f"its code can't be downloaded: {first_error_line(error)}"
             ) from error
-    return find_local_code(hub)
+    return _find_local_code(hub)
 
 
-def find_local_code(hub: TorchHubEntry) -> Path:
+def _find_local_code(hub: TorchHubEntry) -> Path:
     """As `_find_or_download_code`, without downloading: raises `weights_missing` instead."""
     folder = _cached_code_folder(hub)
     if not (folder / HUBCONF).is_file():
@@ -78,7 +85,7 @@ def find_local_code(hub: TorchHubEntry) -> Path:
 
 
 def _load_module(
-    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = _ignore_progress
+    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = ignore_progress
 ) -> torch.nn.Module:
     """Execute the entry of the folder's `hubconf.py` with its arguments.
 
@@ -125,7 +132,7 @@ def code_fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def find_licence(folder: Path) -> str:
+def _find_licence(folder: Path) -> str:
     """Return the title and the name of the folder's licence file, or `none found`."""
     for path in sorted(folder.iterdir()):
         if not LICENCE_FILES.fullmatch(path.name) or not path.is_file():
@@ -258,21 +265,17 @@ def _exception_chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-PROBE_SEED = 20_242
-MIN_REPEAT_COSINE = 0.999  # of a photo alone and in a batch; kernels differ slightly
-
-
-class TorchHubBackbone:
+class TorchHubBackbone(Backbone):
     """Backbone that runs a torch.hub entry; one feature per photo."""
 
-    facet: str | None = None
+    licence = "unknown"
 
     def __init__(
         self,
         hub: TorchHubEntry,
         device: torch.device,
         *,
-        on_progress: OnProgress = _ignore_progress,
+        on_progress: OnProgress = ignore_progress,
     ) -> None:
         """Load the entry, which executes its code, and check it on two images of noise.
 
@@ -284,7 +287,7 @@ class TorchHubBackbone:
         self.code_fingerprint = code_fingerprint(folder)
         self.name = hub.module
         self.layer = hub.entry
-        self.licence = find_licence(folder)
+        self.licence = _find_licence(folder)
         self.device = device
         module = _load_module(hub, folder, on_progress)
         self._module = module.eval().requires_grad_(False).to(device)
@@ -297,12 +300,40 @@ class TorchHubBackbone:
         }
         self.width = self._probe()
 
+    def own_spec(self) -> dict[str, Any]:
+        return {"code_fingerprint": self.code_fingerprint}
+
+    @classmethod
+    def load(
+        cls, config: ExtractorConfig, device: torch.device, weights: Path | None
+    ) -> TorchHubBackbone:
+        assert config.hub is not None
+        return cls(config.hub, device)
+
+    @classmethod
+    def weights_source(cls, config: ExtractorConfig, weights: Path | None) -> str:
+        hub = config.hub
+        assert hub is not None
+        return f"the folder {hub.folder}" if hub.folder else f"github.com/{hub.source}"
+
+    @classmethod
+    def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
+        """Find the code; which weights it downloads is known once this version was loaded."""
+        assert config.hub is not None
+        folder = _find_local_code(config.hub)
+        key = f"{config.hub.module} {code_fingerprint(folder)}"
+        return StoredWeights(folder, _find_licence(folder), key, None)
+
+    @classmethod
+    def fetch(
+        cls, config: ExtractorConfig, weights: Path | None, on_progress: OnProgress
+    ) -> TorchHubBackbone:
+        assert config.hub is not None
+        return cls(config.hub, torch.device("cpu"), on_progress=on_progress)
+
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         return normalise_features(self._forward(pixels)).unsqueeze(1)
-
-    def grid(self, height: int, width: int) -> tuple[int, int]:
-        return 1, 1
 
     def _forward(self, pixels: torch.Tensor) -> Any:
         batch = normalise_pixels(pixels.to(self.device), self._hub.mean, self._hub.std)
@@ -313,9 +344,7 @@ class TorchHubBackbone:
     def _probe(self) -> int:
         """Return the descriptor's dimension; raise `torchhub_unusable` for invalid descriptors."""
         hub = self._hub
-        noise = torch.Generator().manual_seed(PROBE_SEED)
-        shape = (2, hub.height, hub.width, 3)
-        photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
+        photos = probe_photos(hub.height, hub.width)
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
         except Exception as error:  # third-party networks may raise anything
@@ -324,31 +353,9 @@ class TorchHubBackbone:
                 f"with 2 photos of {hub.height} x {hub.width} pixels it fails with "
                 f"{type(error).__name__}: {first_error_line(error)}",
             ) from error
-        if not isinstance(both, torch.Tensor) or not both.is_floating_point():
-            raise _torchhub_unusable_error(
-                hub, f"it returns a {_describe_value(both)}, not a tensor of floats"
-            )
-        if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
-            raise _torchhub_unusable_error(
-                hub,
-                f"for 2 photos it returns the shape {tuple(both.shape)}, for one "
-                f"{tuple(alone.shape)}; expected one descriptor per photo: (2, D) and (1, D)",
-            )
-        if both.shape[1] > MAX_WIDTH:
-            raise _torchhub_unusable_error(
-                hub, f"{both.shape[1]} dimensions exceed the maximum of {MAX_WIDTH}"
-            )
-        if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise _torchhub_unusable_error(hub, "its descriptors hold NaN or infinite numbers")
-        if bool((both.norm(dim=-1) == 0).any()):
-            raise _torchhub_unusable_error(hub, "its descriptors are zero")
-        cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
-        if cosine < MIN_REPEAT_COSINE:
-            raise _torchhub_unusable_error(
-                hub,
-                "the descriptor of a photo depends on the other photos of its batch (cosine "
-                f"{cosine:.3f}), and the composition of batches varies",
-            )
+        fault = find_descriptor_fault(both, alone)
+        if fault is not None:
+            raise _torchhub_unusable_error(hub, fault)
         return int(both.shape[1])
 
 
@@ -368,7 +375,3 @@ def module_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
         digest.update(flat.view(torch.uint8).numpy().data)
         size_bytes += tensor.nbytes
     return digest.hexdigest(), size_bytes
-
-
-def _describe_value(value: object) -> str:
-    return f"tensor of {value.dtype}" if isinstance(value, torch.Tensor) else type(value).__name__

@@ -24,7 +24,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import httpx2
 import torch
-from safetensors.torch import load_file
 from torch import nn
 
 from shared.descriptors.backbones.dinov2 import MEAN as IMAGENET_MEAN
@@ -44,7 +43,8 @@ from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     download_file,
     first_error_line,
-    load_tensors,
+    open_tensor_file,
+    shape_differences,
 )
 from shared.errors import Misconfigured
 
@@ -194,7 +194,7 @@ def _load_torchvision_network(name: str, pretrained: bool, weights: Path | None)
     if pretrained:
         url = models.get_model_weights(name)["IMAGENET1K_V1"].url
         path = _find_or_download_torchvision_weights(name, url, weights)
-        _load_state(network, _read_tensors(path, name), path, name)
+        _load_weights(network, path, name)
     return network
 
 
@@ -226,41 +226,23 @@ def _check_weights_file(path: Path, name: str) -> Path:
     return path
 
 
-def _read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
-    """Load the tensors of a `.safetensors` or PyTorch file by name; no code is executed.
-
-    Raises Misconfigured (`weights_unusable`) for other files.
-    """
+def _load_weights(network: Any, path: Path, name: str) -> None:
+    """Load a file's tensors; raise Misconfigured (`weights_unusable`) if they don't fit."""
     try:
-        with path.open("rb") as file:
-            begin = file.read(9)
-        if begin[8:] == b"{":
-            return load_file(path)
-        state = load_tensors(path)
+        file = open_tensor_file(path)
     except TENSOR_READ_ERRORS as error:
         reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
         raise _pretrained_unusable_error(path, name, reason) from error
-    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise _pretrained_unusable_error(path, name, "it contains other objects than named tensors")
-    return state
-
-
-def _load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
-    """Load tensors into a network; raise Misconfigured (`weights_unusable`) if they don't fit."""
-    expected: dict[str, torch.Tensor] = network.state_dict()
     # Files of old releases lack num_batches_tracked, which is not used.
-    state = {n: t for n, t in expected.items() if n.endswith("num_batches_tracked")} | state
-    problems = [f"no tensor {n}" for n in expected if n not in state]
-    problems += [f"an unexpected tensor {n}" for n in state if n not in expected]
-    problems += [
-        f"{n} of shape {tuple(t.shape)}, expected {tuple(expected[n].shape)}"
-        for n, t in state.items()
-        if n in expected and expected[n].shape != t.shape
-    ]
-    if problems:
-        more = f" and {len(problems) - 1} more problems" if len(problems) > 1 else ""
-        raise _pretrained_unusable_error(path, name, f"it has {problems[0]}{more}")
-    network.load_state_dict(state)
+    expected = {
+        n: tuple(tensor.shape)
+        for n, tensor in network.state_dict().items()
+        if n in file.shapes or not n.endswith("num_batches_tracked")
+    }
+    differences = shape_differences(file.shapes, expected)
+    if differences:
+        raise _pretrained_unusable_error(path, name, differences)
+    network.load_state_dict({n: file.read(n) for n in expected}, strict=False)
 
 
 def _pretrained_unusable_error(path: Path, name: str, reason: str) -> Misconfigured:
@@ -325,13 +307,12 @@ def _build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None)
     import timm  # imported here because it takes seconds
 
     network: Any
-    if not pretrained:
-        network = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-    elif weights is None:
+    if pretrained and weights is None:
         network = published_network()
     else:
         network = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-        _load_state(network, _read_tensors(_check_weights_file(weights, name), name), weights, name)
+        if pretrained and weights is not None:
+            _load_weights(network, _check_weights_file(weights, name), name)
     stem = nn.Sequential(_Renormalise(), network.conv_stem, network.bn1)
     return StagedBackbone(stem, [*network.blocks, nn.Sequential(network.conv_head, network.bn2)])
 
@@ -356,19 +337,14 @@ class _Renormalise(nn.Module):
 BackboneBuilder = Callable[[str, bool, Path | None], StagedBackbone]
 
 _BUILDERS: dict[str, BackboneBuilder] = {
-    "resnet18": _build_resnet,
-    "resnet34": _build_resnet,
-    "resnet50": _build_resnet,
-    "resnet101": _build_resnet,
-    "resnet152": _build_resnet,
-    "resnext50_32x4d": _build_resnet,
+    **dict.fromkeys(
+        ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152", "resnext50_32x4d"),
+        _build_resnet,
+    ),
     "efficientnet_b0": _build_efficientnet_b0,
     "efficientnet_lite0": _build_efficientnet_lite0,
     "swin_t": _build_swin,
-    "dinov2_vits14": build_dinov2,
-    "dinov2_vitb14": build_dinov2,
-    "dinov2_vitl14": build_dinov2,
-    "dinov2_vitg14": build_dinov2,
+    **{f"dinov2_{size}": build_dinov2 for size in SHAPES},
 }
 
 

@@ -46,6 +46,7 @@ from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     check_declared_size,
     load_tensors,
+    shape_differences,
 )
 from shared.errors import NotFound, PlacewiseError, Unavailable, Unprocessable
 
@@ -161,19 +162,18 @@ def _known_reason(error: Exception) -> str:
 def _load_tensors_into(model: VprModel, tensors: dict[str, Any], path: Path) -> None:
     """Load exactly the model's tensors, after checking names, types and shapes."""
     expected = model.state_dict()
-    problems = [f"{name} is missing" for name in expected if name not in tensors]
-    problems += [f"{name} is not in the model" for name in tensors if name not in expected]
-    for name in expected.keys() & tensors.keys():
-        tensor, shape = tensors[name], tuple(expected[name].shape)
-        if not isinstance(tensor, torch.Tensor):
-            problems.append(f"{name} is not a tensor")
-        elif tensor.is_meta or tensor.layout != torch.strided:
-            problems.append(f"{name} is not a dense tensor with data")
-        elif tensor.shape != shape:
-            problems.append(f"{name} is {tuple(tensor.shape)}, expected {shape}")
-    if problems:
-        more = f" and {len(problems) - 3} more" if len(problems) > 3 else ""
-        raise _checkpoint_unusable_error(path, "; ".join(problems[:3]) + more)
+    unusable = [
+        name
+        for name, tensor in tensors.items()
+        if not isinstance(tensor, torch.Tensor) or tensor.is_meta or tensor.layout != torch.strided
+    ]
+    if unusable:
+        raise _checkpoint_unusable_error(path, f"{unusable[0]} is not a dense tensor with data")
+    stored, shapes = (
+        {name: tuple(tensor.shape) for name, tensor in each.items()} for each in (tensors, expected)
+    )
+    if differences := shape_differences(stored, shapes):
+        raise _checkpoint_unusable_error(path, differences)
     try:
         check_declared_size((tensors[name] for name in expected), path)
     except ValueError as error:
@@ -198,15 +198,6 @@ METADATA_KEY = "placewise_model"
 MODEL_FILE_FORMAT = 1
 
 
-@dataclass(frozen=True, slots=True)
-class ModelFile:
-    """A loaded model file."""
-
-    model: VprModel
-    """On the CPU, in evaluation mode, without gradients."""
-    fingerprint: str
-
-
 def encode_model_file(checkpoint: Checkpoint) -> bytes:
     """Encode a model file; deterministic for the same configuration and weights."""
     about = {
@@ -222,8 +213,8 @@ def encode_model_file(checkpoint: Checkpoint) -> bytes:
     return save(tensors, {METADATA_KEY: json.dumps(about, sort_keys=True)})
 
 
-def read_model_file(path: Path) -> ModelFile:
-    """Load a model file; the caller has verified its hash.
+def read_model_file(path: Path) -> VprModel:
+    """Load a model file on the CPU, in evaluation mode; the caller has verified its hash.
 
     Raises Unavailable (`model_unreadable`) if this release does not know the format, or can no
     longer build the network.
@@ -244,7 +235,7 @@ def read_model_file(path: Path) -> ModelFile:
         if isinstance(error, Unavailable):
             raise
         raise _unreadable(path, error.detail) from error
-    return ModelFile(model.eval().requires_grad_(False), about["fingerprint"])
+    return model.eval().requires_grad_(False)
 
 
 def _unreadable(path: Path, reason: str) -> Unavailable:

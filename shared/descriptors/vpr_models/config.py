@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
+from shared.descriptors.aggregators import AGGREGATORS
 from shared.errors import Unprocessable
 
 STAGES = {

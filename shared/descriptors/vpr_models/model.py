@@ -11,8 +11,8 @@ import torch
 from pydantic import ConfigDict, ValidationError, create_model
 from torch import nn
 
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
-from shared.descriptors.vpr_models.aggregators.base import Aggregator, FeatureMapShape
+from shared.descriptors.aggregators import AGGREGATORS
+from shared.descriptors.aggregators.base import Aggregator, FeatureMapShape
 from shared.descriptors.vpr_models.backbones import StagedBackbone, build_backbone
 from shared.descriptors.vpr_models.config import VprModelConfig
 from shared.errors import Unprocessable

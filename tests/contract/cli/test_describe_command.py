@@ -16,7 +16,7 @@ import torch
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
-from shared.descriptors.aggregation import soft_vlad
+from shared.descriptors.aggregators.clustering import soft_vlad
 from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
 from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor

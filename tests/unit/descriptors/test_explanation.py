@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.descriptors.aggregation import average_pooling, soft_vlad, vlad
+from shared.descriptors.aggregators.clustering import soft_vlad, vlad
+from shared.descriptors.aggregators.pooling import average_pooling
 from shared.descriptors.explanation import (
     NEGATIVE_COLOUR,
     POSITIVE_COLOUR,

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from shared.descriptors.aggregation import average_pooling, gem_pooling, soft_vlad, vlad
+from shared.descriptors.aggregators.clustering import soft_vlad, vlad
+from shared.descriptors.aggregators.pooling import average_pooling, gem_pooling
 from shared.descriptors.extractor import (
     SHIPPED_VOCABULARIES,
     Extractor,

@@ -26,29 +26,19 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
     return load_checkpoint(write_checkpoint(tmp_path_factory.mktemp("run") / "best.ckpt"))
 
 
-def test_what_is_read_describes_as_what_was_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
-    data = encode_model_file(checkpoint)
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(data)
-    found = read_model_file(path)
-    assert found.fingerprint == checkpoint.fingerprint
-    assert found.model.config == checkpoint.config
-    assert not found.model.training
-    assert not any(parameter.requires_grad for parameter in found.model.parameters())
-    photos = torch.rand(2, 3, *SIDES, generator=torch.Generator().manual_seed(1))
-    with torch.inference_mode():
-        assert torch.equal(found.model(photos), checkpoint.model(photos))
-
-
-def test_the_same_model_makes_the_same_bytes(checkpoint: Checkpoint) -> None:
-    assert encode_model_file(checkpoint) == encode_model_file(checkpoint)
-
-
-def test_the_file_holds_the_models_tensors_and_says_which_network_they_are_of(
+def test_model_file_describes_as_the_checkpoint_and_names_its_network(
     checkpoint: Checkpoint, tmp_path: Path
 ) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(encode_model_file(checkpoint))
+    assert encode_model_file(checkpoint) == path.read_bytes()
+    model = read_model_file(path)
+    assert model.config == checkpoint.config
+    assert not model.training
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+    photos = torch.rand(2, 3, *SIDES, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        assert torch.equal(model(photos), checkpoint.model(photos))
     with safe_open(path, framework="pt") as file:
         assert set(file.keys()) == checkpoint.model.state_dict().keys()
         about = json.loads(file.metadata()[METADATA_KEY])

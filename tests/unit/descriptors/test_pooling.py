@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.aggregation import average_pooling, gem_pooling
+from shared.descriptors.aggregators.pooling import average_pooling, gem_pooling
 
 Matrix = NDArray[np.float64]
 Aggregate = Callable[[torch.Tensor], torch.Tensor]

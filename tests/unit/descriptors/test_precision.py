@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.aggregation import vlad
+from shared.descriptors.aggregators.clustering import vlad
 from shared.descriptors.backbones import normalise_features
 from shared.descriptors.backbones.dinov2 import Dinov2, VitShape
 from shared.descriptors.extractor import Extractor, spec_fingerprint

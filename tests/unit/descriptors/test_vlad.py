@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from shared.descriptors.aggregation import assign_clusters, soft_vlad, vlad
+from shared.descriptors.aggregators.clustering import assign_clusters, soft_vlad, vlad
 from shared.descriptors.vocabulary_file import read_vocabulary
 
 pytestmark = pytest.mark.numerics

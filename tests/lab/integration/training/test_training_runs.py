@@ -16,8 +16,8 @@ from lab.training import run
 from lab.training.arguments import build_arguments, load_yaml
 from lab.training.run_control import NullDisplay, RunStopped, StopRequest
 from services.cli.main import build_app
-from shared.descriptors.backbones.trained import TrainedBackbone
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
+from shared.descriptors.aggregators import AGGREGATORS
+from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
 from shared.errors import (
@@ -25,6 +25,7 @@ from shared.errors import (
     PlacewiseError,
     Unprocessable,
 )
+from shared.extractor_config.configs import get_extractor_config
 from tests.lab.training_runs import (
     CITY,
     StopAfter,
@@ -40,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 OWN_CODE = """
 import torch
-from shared.descriptors.vpr_models.aggregators.base import Aggregator, normalise_rows
+from shared.descriptors.aggregators.base import Aggregator, normalise_rows
 
 def network(pretrained):
     return torch.nn.Conv2d(3, 8, kernel_size=8, stride=8)
@@ -167,7 +168,9 @@ def test_the_trained_model_keeps_the_size_and_the_interpolation_of_its_validatio
     best = Path(train(fields)["best"]["path"])
     config = load_checkpoint(best).config
     assert (config.image_size, config.interpolation) == ((48, 64), "bicubic")
-    served = TrainedBackbone.from_checkpoint("gsv:walks", best, torch.device("cpu"))
+    served = Extractor(
+        get_extractor_config(f"gsv:{best}", allow_test_extractors=False), torch.device("cpu")
+    )
     assert served.preprocessing.name == "resize48x64-bicubic"
 
 

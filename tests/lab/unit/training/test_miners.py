@@ -12,7 +12,7 @@ from pytorch_metric_learning import miners
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from lab.training.losses import MINERS, AngularMiner, batch_accuracy, make_loss, make_miner
-from shared.descriptors.vpr_models.aggregators.base import normalise_rows
+from shared.descriptors.aggregators.base import normalise_rows
 from shared.errors import Unprocessable
 from tests.lab.unit.training.test_losses import (
     LABELS,

@@ -14,7 +14,7 @@ from lab.training.arguments import TrainingArguments, build_arguments
 from lab.training.losses import make_loss, make_miner
 from lab.training.model_factory import make_model, register_own_modules
 from lab.training.run_control import NullDisplay
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
+from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state, load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
 from shared.descriptors.vpr_models.model import VprModel
@@ -23,7 +23,7 @@ from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 CODE = """
 import torch
 from pytorch_metric_learning import losses, miners
-from shared.descriptors.vpr_models.aggregators.base import Aggregator, normalise_rows
+from shared.descriptors.aggregators.base import Aggregator, normalise_rows
 
 
 def small_network(pretrained):

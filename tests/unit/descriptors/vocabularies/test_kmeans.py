@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.descriptors.aggregation import assign_clusters
+from shared.descriptors.aggregators.clustering import assign_clusters
 from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 from tests.unit.descriptors.vocabularies.points import unit_points
 

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from shared.descriptors import vocabulary_fit
-from shared.descriptors.aggregation import assign_clusters
+from shared.descriptors.aggregators.clustering import assign_clusters
 from shared.descriptors.vocabulary_fit import (
     PATCHES_PER_CLUSTER,
     PointBatches,

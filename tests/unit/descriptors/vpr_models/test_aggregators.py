@@ -11,10 +11,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.descriptors.vpr_models.aggregators.base import Aggregator
-from shared.descriptors.vpr_models.aggregators.clustering import SALAD, NetVLAD, optimal_transport
-from shared.descriptors.vpr_models.aggregators.mixing import BoQ, MixVPR
-from shared.descriptors.vpr_models.aggregators.pooling import AveragePooling, ConvAP, CosPlace, GeM
+from shared.descriptors.aggregators.base import Aggregator
+from shared.descriptors.aggregators.clustering import SALAD, NetVLAD, optimal_transport
+from shared.descriptors.aggregators.mixing import BoQ, MixVPR
+from shared.descriptors.aggregators.pooling import AveragePooling, ConvAP, CosPlace, GeM
 
 pytestmark = pytest.mark.numerics
 

@@ -12,10 +12,10 @@ import torch
 import torchvision
 from safetensors.torch import save_file
 
+from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.backbones import normalise_features, normalise_pixels
 from shared.descriptors.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.descriptors.vpr_models import backbones as backbones_module
-from shared.descriptors.vpr_models.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.backbones import StagedBackbone, build_backbone, build_dinov2
 from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model

@@ -133,10 +133,10 @@ def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_pat
     state = checkpoint_state(model)
     tensors = state["state_dict"]
     faults: dict[str, dict[str, Any]] = {
-        "stem.0.weight is missing": {n: t for n, t in tensors.items() if n != stem},
-        "extra is not in the model": tensors | {"model.extra": torch.zeros(1)},
+        "it has no tensor backbone.stem.0.weight": {n: t for n, t in tensors.items() if n != stem},
+        "extra is not in the network": tensors | {"model.extra": torch.zeros(1)},
         "expected (64, 3, 7, 7)": tensors | {stem: torch.zeros(64, 1, 7, 7)},
-        "is not a tensor": tensors | {stem: "a word"},
+        "is not a dense tensor": tensors | {stem: "a word"},
     }
     for reported, changed in faults.items():
         error = refusal(saved(tmp_path / "other.ckpt", state | {"state_dict": changed}))

@@ -32,7 +32,7 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from shared.descriptors.vpr_models.aggregators.base import (
+from shared.descriptors.aggregators.base import (
     Aggregator,
     Layers,
     Positive,

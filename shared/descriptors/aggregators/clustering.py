@@ -1,4 +1,21 @@
-"""Aggregators by clusters: NetVLAD and SALAD.
+"""Aggregators by clusters: VLAD (hard, soft), NetVLAD and SALAD.
+
+VLAD (Jegou et al. 2010), as AnyLoc (RA-L 2023) defines it. For patches x (L2-normalised), centres
+c_k and weights w of the patches in the clusters:
+
+    hard:  w_qk = 1 for k = argmax_k <x_q, c_k / |c_k|>, the first of equals wins; else 0
+    soft:  w_qk = softmax over k of temperature * <x_q, c_k / |c_k|>
+    v_k      = sum over q of w_qk (x_q - c_k)             the centre is NOT normalised here
+    v_k     <- v_k / |v_k|                                unused clusters stay 0
+    row      = [v_0 ... v_{K-1}] / | . |                  cluster-major
+
+Soft blocks hold the residuals to their own centre. AnyLoc's published code adds the residuals to
+every centre to every block, which differs from its formula; this module follows the formula.
+
+The sums are computed as sum(w x) - sum(w) c, so memory is O(batch x (patches x K + K x D)), never
+patches x K x D. A patch whose feature is zero has no direction: its weight is 0 in every cluster. A
+photo with only such patches has a zero row, which is similar to nothing. A photo with a non-finite
+number in any feature has a row of NaN.
 
 NetVLAD (Arandjelovic et al. 2016, "NetVLAD: CNN Architecture for Weakly Supervised Place
 Recognition", eq. 1 to 4):
@@ -39,14 +56,76 @@ from typing import Annotated, ClassVar
 import torch
 from pydantic import Field
 from torch import nn
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, one_hot
 
-from shared.descriptors.vpr_models.aggregators.base import (
+from shared.descriptors.aggregators.base import (
     Aggregator,
     Positive,
     Size,
     normalise_rows,
 )
+
+
+def assign_clusters(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """Return the int64 label (...) of the centre (K, D) most similar to each feature (..., D)."""
+    return _cosines(features, centres).argmax(dim=-1)
+
+
+@torch.inference_mode()
+def vlad(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """Aggregate features by VLAD with hard assignment.
+
+    Args:
+        features: (B, patches, D) L2-normalised float32.
+        centres: (K, D) cluster centres.
+
+    Returns:
+        (B, K * D) unit rows.
+    """
+    return _sum_residuals(features, centres, hard_assignment(features, centres))
+
+
+@torch.inference_mode()
+def soft_vlad(features: torch.Tensor, centres: torch.Tensor, temperature: float) -> torch.Tensor:
+    """Aggregate features by VLAD with soft assignment: each patch counts in every cluster.
+
+    Shapes as in `vlad`. As `temperature` grows, the assignment approaches the hard one; at 0, a
+    patch counts equally in all clusters.
+    """
+    return _sum_residuals(features, centres, soft_assignment(features, centres, temperature))
+
+
+def hard_assignment(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """Return weights (..., K): 1 for the cluster of a feature (..., D), else 0."""
+    weights = one_hot(assign_clusters(features, centres), len(centres)).to(features.dtype)
+    return weights * _is_nonzero(features)
+
+
+def soft_assignment(
+    features: torch.Tensor, centres: torch.Tensor, temperature: float
+) -> torch.Tensor:
+    """Return weights (..., K): the softmax over the centres (K, D) for each feature (..., D)."""
+    weights = (temperature * _cosines(features, centres)).softmax(dim=-1)
+    return weights * _is_nonzero(features)
+
+
+def _is_nonzero(features: torch.Tensor) -> torch.Tensor:
+    """(..., D) -> (..., 1) bool; False for patches whose feature is zero."""
+    return (features != 0).any(dim=-1, keepdim=True)
+
+
+def _cosines(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    return features @ normalize(centres, dim=-1).T
+
+
+def _sum_residuals(
+    features: torch.Tensor, centres: torch.Tensor, weights: torch.Tensor
+) -> torch.Tensor:
+    """(B, patches, D), (K, D), (B, patches, K) -> (B, K * D)."""
+    sums = weights.transpose(1, 2) @ features  # (B, K, D)
+    shares = weights.sum(dim=1).unsqueeze(-1)  # (B, K, 1)
+    blocks = normalize(sums - shares * centres, dim=-1)
+    return normalize(blocks.flatten(1), dim=-1)
 
 
 class NetVLAD(Aggregator):
@@ -64,10 +143,7 @@ class NetVLAD(Aggregator):
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         features = normalize(maps.flatten(2).transpose(1, 2).float(), dim=-1)  # (B, hw, C)
         shares = (features @ self.weight.T + self.bias).softmax(dim=-1)  # (B, hw, K)
-        # Separate sums avoid a tensor of (B, hw, K, C).
-        sums = shares.transpose(1, 2) @ features
-        residuals = sums - shares.sum(dim=1).unsqueeze(-1) * self.centres
-        return normalise_rows(normalize(residuals, dim=-1))
+        return _sum_residuals(features, self.centres, shares)
 
 
 HIDDEN_WIDTH = 512  # channels between the two layers of each MLP
