@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from shared.descriptors.extractor import SHIPPED_VOCABULARIES, Extractor, choose_device
-from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
+from shared.descriptors.kmeans import KMeansPass, choose_seeds
 from shared.descriptors.vocabulary import encode_centres, parse_centres
 from shared.descriptors.vocabulary_fit import TOLERANCE
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig
@@ -115,10 +115,7 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
     Returns:
         (clusters, D) centres and the number of iterations.
     """
-    seeding = KMeansPlusPlus(points, SEED)
-    while len(seeding.chosen) < clusters:
-        seeding.next()
-    centres = seeding.centres()
+    centres = choose_seeds(points, clusters, SEED)
     passes, movement = 0, float("inf")
     while passes < MAX_KMEANS_PASSES and movement > TOLERANCE:
         kmeans_pass = KMeansPass.begin(centres)

@@ -12,41 +12,41 @@ with three changes: k-means++ seeding, reseeding of empty clusters, and points r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch.nn.functional import normalize
 
 
-class KMeansPlusPlus:
-    """k-means++ seeding (Arthur and Vassilvitskii 2007) of (n, D) points, one seed per step."""
+def choose_seeds(
+    points: torch.Tensor,
+    count: int,
+    seed: int,
+    on_seed: Callable[[int], object] = lambda done: None,
+) -> torch.Tensor:
+    """Choose (count, D) initial centres among (n, D) points by k-means++.
 
-    def __init__(self, points: torch.Tensor, seed: int) -> None:
-        self.points = points
-        self.generator = torch.Generator().manual_seed(seed)
-        first = int(torch.randint(len(points), (1,), generator=self.generator))
-        self.chosen = [first]
-        """Indices of the points chosen as seeds."""
-        self.distances = _squared_distances(points, points[first])
-        """(n,) squared distance of each point to its nearest seed."""
-
-    def next(self) -> None:
-        """Choose one more seed, with probability proportional to the squared distance."""
-        total = float(self.distances.sum(dtype=torch.float64))
+    Each has a probability proportional to its squared distance to the nearest one before it (Arthur
+    and Vassilvitskii 2007). `on_seed` is called with the number of centres chosen.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    chosen = [int(torch.randint(len(points), (1,), generator=generator))]
+    distances = _squared_distances(points, points[chosen[0]])
+    on_seed(1)
+    while len(chosen) < count:
+        total = float(distances.sum(dtype=torch.float64))
         if total > 0:
-            target = float(torch.rand(1, generator=self.generator, dtype=torch.float64)) * total
-            cumulative = self.distances.cumsum(0, dtype=torch.float64)
+            target = float(torch.rand(1, generator=generator, dtype=torch.float64)) * total
+            cumulative = distances.cumsum(0, dtype=torch.float64)
             position = torch.searchsorted(cumulative, torch.tensor([target], dtype=torch.float64))
-            index = min(int(position), len(self.points) - 1)
+            index = min(int(position), len(points) - 1)
         else:  # fewer distinct points than seeds
-            index = int(torch.randint(len(self.points), (1,), generator=self.generator))
-        self.chosen.append(index)
-        new = _squared_distances(self.points, self.points[index])
-        self.distances = torch.minimum(self.distances, new)
-
-    def centres(self) -> torch.Tensor:
-        """Return the (seeds, D) initial centres."""
-        return self.points[self.chosen].clone()
+            index = int(torch.randint(len(points), (1,), generator=generator))
+        chosen.append(index)
+        distances = torch.minimum(distances, _squared_distances(points, points[index]))
+        on_seed(len(chosen))
+    return points[chosen].clone()
 
 
 @dataclass(slots=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary_file import VocabularyFile, fit_provenance
-from shared.descriptors.vocabulary_fit import VocabularyFit
+from shared.descriptors.vocabulary_fit import fit_centres
 from shared.imaging.preprocessing import Pixels
 
 PATCHES_BYTES = 256_000_000  # of all photos together, in the file
@@ -123,12 +123,10 @@ def fit_vocabulary(
             patches.add(extractor.local_features(batch), described, photos, seed)
             described += len(batch)
             on_progress("describing", described, photos)
-        fit = VocabularyFit(patches, clusters, seed)
-        while not fit.done:
-            fit.step()
-            on_progress("clustering", *fit.progress)
-    centres = fit.centres()
+        fit = fit_centres(
+            patches, clusters, seed, lambda done, total: on_progress("clustering", done, total)
+        )
     provenance = fit_provenance(
-        extractor, centres, fit, requested_clusters=clusters, photos=described, seed=seed
+        extractor, fit, requested_clusters=clusters, photos=described, seed=seed
     )
-    return VocabularyFile(centres, provenance)
+    return VocabularyFile(fit.centres, provenance)

@@ -30,7 +30,7 @@ from shared.descriptors.vocabulary import (
     encode_centres,
     parse_centres,
 )
-from shared.descriptors.vocabulary_fit import VocabularyFit
+from shared.descriptors.vocabulary_fit import FittedCentres
 from shared.errors import Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.storage.vocabulary_npz import CENTRES, PROVENANCE, encode_vocabulary_npz, has_provenance
@@ -56,8 +56,7 @@ def feature_provenance(extractor: Extractor) -> Provenance:
 
 def fit_provenance(
     extractor: Extractor,
-    centres: ClusterCentres,
-    fit: VocabularyFit,
+    fit: FittedCentres,
     *,
     requested_clusters: int,
     photos: int,
@@ -69,14 +68,14 @@ def fit_provenance(
     """
     return {
         **feature_provenance(extractor),
-        "clusters": centres.clusters,
+        "clusters": fit.centres.clusters,
         "clusters_asked": requested_clusters,
         "photos": photos,
         "patches": fit.patches,
         "seed": seed,
         "passes": fit.passes,
         "mean_cosine": fit.similarity,
-        "sha256": centres.sha256,
+        "sha256": fit.centres.sha256,
     }
 
 

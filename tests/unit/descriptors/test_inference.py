@@ -20,7 +20,7 @@ from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
+from shared.extractor_config.configs import get_extractor_config
 from shared.storage import FolderStore
 from tests.support.checkpoints import none_added
 
@@ -175,10 +175,3 @@ def test_threads_share_a_gpu_one_pass_at_a_time(device: torch.device, most: int)
     for thread in threads:
         thread.join()
     assert seen == [most]
-
-
-def test_tiny_extractor_is_what_the_small_gpu_pretends_to_be() -> None:
-    """The stand-in describes as the extractor does that it replaces."""
-    made = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
-    few = photos(2, 32)
-    assert np.array_equal(made.describe(few, None), on(SmallGpu(10**9)).describe(few, None))

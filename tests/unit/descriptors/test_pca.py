@@ -19,7 +19,6 @@ from shared.descriptors.pca_fit import (
     fit_pca_stream,
     sample_rows,
     sample_size,
-    usable_rows,
 )
 from shared.descriptors.pca_whitening import (
     PcaProjection,
@@ -85,21 +84,6 @@ def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, compon
     assert (ours.components, ours.dimension, ours.rows) == (components, dimension, count)
 
 
-def test_whitened_rows_vary_equally_in_all_directions() -> None:
-    rows = unit_rows(500, 80)
-    by = fit_pca(rows, 16)
-    flat = (rows - by.mean) @ by.directions.T
-    np.testing.assert_allclose(np.cov(flat.T), np.eye(16), atol=1e-3)
-    np.testing.assert_allclose(np.linalg.norm(projected(rows, by), axis=1), 1, atol=1e-5)
-
-
-def test_blocks_make_no_difference() -> None:
-    rows = unit_rows(70, 300)
-    whole, pieces = fit_pca(rows, 10), fit_pca(rows, 10, block_bytes=1)
-    np.testing.assert_allclose(whole.directions, pieces.directions, atol=1e-4)
-    np.testing.assert_allclose(whole.mean, pieces.mean, atol=1e-7)
-
-
 def test_signs_do_not_depend_on_how_the_directions_were_found() -> None:
     by = fit_pca(unit_rows(70, 300), 10)
     strongest = np.abs(by.directions).argmax(axis=1)
@@ -129,23 +113,20 @@ def test_a_row_that_is_the_mean_or_nothing_becomes_zero_and_one_that_is_nan_stay
     assert np.isnan(found[2]).all()
 
 
-@pytest.mark.parametrize(("count", "dimension"), [(60, 200), (200, 60)])
-def test_progress_grows_by_a_step_to_its_end(count: int, dimension: int) -> None:
-    seen: list[tuple[int, int]] = []
-    rows = unit_rows(count, dimension)
-    fit_pca(rows, 12, block_bytes=40_000, on_progress=lambda *step: seen.append(step))
-    assert seen == [(done, len(seen)) for done in range(1, len(seen) + 1)]
-
-
 # --- the sample ------------------------------------------------------------------------------
 
 
 def test_batches_are_fitted_as_their_usable_rows_in_memory() -> None:
     rows = unit_rows(50, 200)
-    rows[3] = 0
+    rows[3], rows[9, 2] = 0, np.nan
     batches = [rows[begin : begin + 7] for begin in range(0, 50, 7)]
-    fitted = fit_pca_stream(batches, 50, 200, 5)
-    assert fitted.sha256 == fit_pca(np.delete(rows, 3, axis=0), 5).sha256
+    steps: list[tuple[str, int, int]] = []
+    fitted = fit_pca_stream(batches, 50, 200, 5, lambda *step: steps.append(step))
+    assert steps[7] == ("gathering", 50, 50)
+    reducing = steps[8:]
+    total = len(reducing)
+    assert reducing == [("reducing", done, total) for done in range(1, total + 1)]
+    assert fitted.sha256 == fit_pca(np.delete(rows, [3, 9], axis=0), 5).sha256
 
 
 def test_the_sample_is_large_enough_for_the_directions_and_small_enough_for_the_disk() -> None:
@@ -165,24 +146,15 @@ def test_a_sample_is_the_same_for_its_seed_and_ascends() -> None:
     assert list(sample_rows(4, 10, 0)) == [0, 1, 2, 3]
 
 
-def test_rows_that_say_nothing_are_not_learnt_from() -> None:
-    rows = unit_rows(4, 8)
-    rows[1], rows[2, 3] = 0, np.nan
-    assert list(usable_rows(rows)) == [True, False, False, True]
-
-
 # --- what is refused -------------------------------------------------------------------------
 
 
-def test_more_rows_than_dimensions_are_needed() -> None:
+def test_more_rows_and_no_fewer_dimensions_than_components_are_needed() -> None:
+    refusal("pca_too_many_dimensions", unit_rows(100, 16), 17)
     assert "needs more than 20 described photos" in refusal(
         "pca_too_few_rows", unit_rows(20, 64), 20
     )
     assert fit_pca(unit_rows(21, 64), 20).components == 20
-
-
-def test_descriptors_do_not_become_longer() -> None:
-    refusal("pca_too_many_dimensions", unit_rows(100, 16), 17)
 
 
 @pytest.mark.parametrize("count", [30, 500])
@@ -231,11 +203,6 @@ def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhi
     for either in (known, PcaWhiteningFile(fitted, None)):
         with pytest.raises(Unprocessable, match="of 30 dimensions, but these have 31"):
             either.check_compatible({**spec, "dimension": 31})
-
-
-def test_fingerprint_is_that_of_the_projection(fitted: PcaWhitening) -> None:
-    assert fit_pca(unit_rows(70, 30), 6).sha256 == fitted.sha256
-    assert fit_pca(unit_rows(70, 30, seed=1), 6).sha256 != fitted.sha256
 
 
 @pytest.mark.parametrize(

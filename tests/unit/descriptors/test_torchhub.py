@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.torchhub import TorchHubBackbone
 from shared.descriptors.extractor import Extractor, spec_fingerprint
-from shared.descriptors.pca_fit import fit_pca
-from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import get_extractor_config
-from shared.imaging.preprocessing import get_preprocessing
 from tests.support.hub import COMMIT, MIT, NETWORKS, write_hub
 from tests.support.photos import photo_image
 
@@ -83,29 +80,10 @@ def test_dimension_is_found_by_describing_and_stands_in_the_spec(folder: Path) -
     assert made.shipped_vocabulary() is None
 
 
-def test_descriptors_are_shortened_by_pca_as_those_of_other_extractors(folder: Path) -> None:
-    made = extractor(folder, "colours")
-    pixels = pixels_of(made, *range(8))
-    whole = made.describe(pixels, None)
-    projection = PcaProjection(fit_pca(whole, 3), CPU)
-    rows = made.describe(pixels, None, projection)
-    np.testing.assert_allclose(rows, projection.project(whole), atol=1e-5)
-    spec = made.spec(None, projection)
-    assert (rows.shape, spec["dimension"]) == ((8, 3), 3)
-    assert spec["whitening"] == {"sha256": projection.sha256, "from_dimension": 24}
-    assert {k: v for k, v in spec.items() if k not in ("dimension", "whitening")}.items() <= (
-        made.spec(None).items()
-    )
-
-
 def test_of_several_answers_the_first_is_the_descriptor(folder: Path) -> None:
     one, both = extractor(folder, "colours"), extractor(folder, "with_attention")
     pixels = pixels_of(one, 3)
     np.testing.assert_array_equal(both.describe(pixels, None), one.describe(pixels, None))
-
-
-def test_usual_size_is_the_preprocessing_of_the_other_extractors(folder: Path) -> None:
-    assert extractor(folder, "colours").preprocessing == get_preprocessing("square224")
 
 
 # --- what pins it ----------------------------------------------------------------------------
@@ -215,10 +193,6 @@ def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
     folder: Path, entry: str, message: str
 ) -> None:
     assert message in refusal(folder, entry)
-
-
-def test_the_size_that_a_network_wants_can_be_given(folder: Path) -> None:
-    assert extractor(folder, "one_size:input.size=320x320").dimension(None) == 24
 
 
 def test_missing_packages_are_named(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
-from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
+from shared.descriptors.kmeans import KMeansPass, choose_seeds
 
 
 class InMemoryPoints:
@@ -43,10 +43,7 @@ def clustered_points(seed: int, count: int, width: int, clusters: int) -> torch.
 
 def full_kmeans(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
     """(clusters, width) centres by k-means++ and up to 100 of Lloyd's passes over all points."""
-    seeding = KMeansPlusPlus(points, seed)
-    while len(seeding.chosen) < clusters:
-        seeding.next()
-    centres = seeding.centres()
+    centres = choose_seeds(points, clusters, seed)
     for _ in range(100):
         one = KMeansPass.begin(centres)
         one.accumulate(points, centres)

@@ -8,17 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.descriptors.aggregators.clustering import assign_clusters
-from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
+from shared.descriptors.kmeans import KMeansPass, choose_seeds
 from tests.unit.descriptors.vocabularies.points import unit_points
 
 pytestmark = pytest.mark.numerics
-
-
-def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
-    seeding = KMeansPlusPlus(points, seed)
-    while len(seeding.chosen) < clusters:
-        seeding.next()
-    return seeding.centres()
 
 
 def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> KMeansPass:
@@ -31,16 +24,16 @@ def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> KMeansPass:
 
 def test_seeds_are_points_and_all_different() -> None:
     points = unit_points(3, 50, 4)
-    seeds = seeds_of(points, 20, seed=1)
+    seeds = choose_seeds(points, 20, seed=1)
     rows = {tuple(point.tolist()) for point in points}
     assert {tuple(seed.tolist()) for seed in seeds} <= rows
     assert len({tuple(seed.tolist()) for seed in seeds}) == 20
-    assert not torch.equal(seeds, seeds_of(points, 20, seed=2))
+    assert not torch.equal(seeds, choose_seeds(points, 20, seed=2))
 
 
 def test_more_seeds_than_distinct_points_repeat_them() -> None:
     points = unit_points(9, 3, 4)
-    assert seeds_of(points, 6, seed=0).shape == (6, 4)
+    assert choose_seeds(points, 6, seed=0).shape == (6, 4)
 
 
 def test_a_pass_ends_with_plain_means_that_are_not_normalised_again() -> None:
@@ -64,19 +57,6 @@ def test_a_pass_is_the_same_in_batches_of_any_size(batch: int) -> None:
         [points[assign_clusters(points, centres) == k].mean(dim=0) for k in range(len(centres) - 1)]
     )
     torch.testing.assert_close(cut.end(centres)[:-1], expected)
-
-
-def test_after_each_mini_batch_a_centre_is_the_mean_of_what_it_was_given() -> None:
-    points = unit_points(6, 400, 4)
-    centres = seeds_of(points, 5, seed=0)
-    one = KMeansPass.begin(centres)
-    given_to: list[list[torch.Tensor]] = [[] for _ in range(5)]
-    for part in torch.split(points, 50):
-        for point, label in zip(part, assign_clusters(part, centres).tolist(), strict=True):
-            given_to[label].append(point)
-        one.accumulate(part, centres)
-        centres = one.means(centres)
-    torch.testing.assert_close(centres, torch.stack([torch.stack(g).mean(dim=0) for g in given_to]))
 
 
 def test_an_empty_cluster_takes_the_point_that_its_own_centre_describes_worst() -> None:

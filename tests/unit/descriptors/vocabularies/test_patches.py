@@ -87,13 +87,6 @@ def test_patches_that_no_centre_can_describe_are_left_out(
     assert bool(torch.isfinite(found.read(0, len(found))).all())
 
 
-def test_photos_of_different_sizes_are_kept_together(
-    stored_patches: Callable[..., PatchFile],
-) -> None:
-    found = stored_patches([unit_points(1, 3, WIDTH), unit_points(2, 5, WIDTH)], batch=2)
-    assert len(found) == 8
-
-
 def test_photos_are_chosen_by_seed_in_a_random_order_each_once() -> None:
     chosen = sample_photos(100, 40, WIDTH, seed=3)
     assert len(set(chosen)) == 40

@@ -80,12 +80,6 @@ def test_a_vocabulary_of_unknown_origin_only_has_to_be_as_wide(tiny: Extractor) 
     assert "16" in detail
 
 
-def test_centres_of_another_width_are_refused_whatever_their_provenance_says(
-    tiny: Extractor,
-) -> None:
-    assert "12 dimensions" in refusal(feature_provenance(tiny), tiny, width=12).detail
-
-
 def test_an_extractor_without_clusters_takes_no_vocabulary() -> None:
     average = load("test-tiny-avg")
     assert "uses no vocabulary" in refusal(feature_provenance(average), average).detail

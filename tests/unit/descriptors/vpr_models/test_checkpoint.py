@@ -116,12 +116,6 @@ def test_what_is_no_checkpoint_is_refused(damage: bytes, tmp_path: Path) -> None
     assert refusal(file).code == "checkpoint_unreadable"
 
 
-def test_a_torn_checkpoint_is_refused(model: VprModel, tmp_path: Path) -> None:
-    file = saved(tmp_path / "torn.ckpt", checkpoint_state(model))
-    file.write_bytes(file.read_bytes()[:-1000])
-    assert refusal(file).code == "checkpoint_unreadable"
-
-
 def test_a_missing_checkpoint_is_not_found(tmp_path: Path) -> None:
     with pytest.raises(NotFound) as refused:
         load_checkpoint(tmp_path / "none.ckpt")
@@ -221,100 +215,6 @@ def test_a_hostile_checkpoint_is_refused_before_it_swells(
     before = memory_bytes("VmHWM")
     assert why in refusal(file).detail
     assert memory_bytes("VmHWM") - before < SWOLLEN_BYTES / 4
-
-
-def test_an_unknown_network_in_a_checkpoint_is_named(model: VprModel, tmp_path: Path) -> None:
-    state = checkpoint_state(model)
-    state["hyper_parameters"]["model"] |= {"backbone_arch": "vgg16"}
-    assert refusal(saved(tmp_path / "other.ckpt", state)).code == "unknown_backbone"
-
-
-def predecessors_names(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Ours under the names of its modules: torchvision's ResNet, and its aggregators' own."""
-    pairs = [
-        ("backbone.stem.0.", "backbone.model.conv1."),
-        ("backbone.stem.1.", "backbone.model.bn1."),
-        *((f"backbone.stages.{n}.", f"backbone.model.layer{n + 1}.") for n in range(4)),
-        ("aggregator.linear.", "aggregator.fc."),
-        ("aggregator.mixers.0.norm.", "aggregator.mix.0.mix.0."),
-        ("aggregator.mixers.0.widen.", "aggregator.mix.0.mix.1."),
-        ("aggregator.mixers.0.narrow.", "aggregator.mix.0.mix.3."),
-    ]
-    out = {}
-    for name, tensor in tensors.items():
-        for ours, theirs in pairs:
-            name = name.replace(ours, theirs)
-        out[name] = tensor
-    return out
-
-
-def both(ours: str, theirs: str) -> dict[str, str]:
-    """A layer's weight and bias under another name."""
-    return {f"{ours}.{part}": f"{theirs}.{part}" for part in ("weight", "bias")}
-
-
-@pytest.mark.parametrize(
-    ("aggregator", "arguments", "renamed", "size"),
-    [
-        ("AVG", {}, {}, (320, 320)),
-        ("GeM", {"p": 3}, {"aggregator.pool.p": "aggregator.p"}, (320, 320)),
-        (
-            "CosPlace",
-            {"in_dim": 256, "out_dim": 8},
-            {"aggregator.pool.p": "aggregator.gem.p"},
-            (320, 320),
-        ),
-        (
-            "ConvAP",
-            {"in_channels": 256, "out_channels": 8},
-            both("aggregator.channels", "aggregator.channel_pool"),
-            (320, 320),
-        ),
-        (
-            "MixVPR",
-            {"in_channels": 256, "in_h": 4, "in_w": 6, "out_channels": 8, "mix_depth": 1},
-            both("aggregator.channels", "aggregator.channel_proj")
-            | both("aggregator.rows", "aggregator.row_proj"),
-            (64, 96),
-        ),
-    ],
-)
-def test_the_predecessors_checkpoints_are_read_under_our_names(
-    aggregator: str,
-    arguments: dict[str, Any],
-    renamed: dict[str, str],
-    size: tuple[int, int],
-    tmp_path: Path,
-) -> None:
-    original = some_model(
-        agg_arch=aggregator, agg_config=arguments, layers_to_crop=[4], image_size=size
-    )
-    tensors = predecessors_names(original.state_dict())
-    tensors = {renamed.get(name, name): tensor for name, tensor in tensors.items()}
-    parameters = {
-        "backbone_arch": "resnet18",
-        "pretrained": True,
-        "layers_to_freeze": 2,
-        "layers_to_crop": [4],
-        "agg_arch": aggregator,
-        "agg_config": arguments,
-        "lr": 2e-4,
-        "loss_name": "MultiSimilarityLoss",
-        "faiss_gpu": True,
-    }
-    state = {"state_dict": tensors, "hyper_parameters": parameters, "epoch": 29}
-    found = load_checkpoint(saved(tmp_path / "theirs.ckpt", state))
-    assert found.config.image_size == size
-    assert found.config.layers_to_freeze == -1  # its setting froze nothing
-    assert found.about == {
-        "lr": 2e-4,
-        "loss_name": "MultiSimilarityLoss",
-        "faiss_gpu": True,
-        "epoch": 29,
-    }
-    photos = torch.randn(1, 3, 64, 96)
-    with torch.inference_mode():
-        assert torch.equal(found.model(photos), original(photos))
 
 
 def test_a_refusal_names_what_is_refused_and_gives_no_unsafe_advice(tmp_path: Path) -> None:

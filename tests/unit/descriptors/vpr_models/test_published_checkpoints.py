@@ -216,6 +216,39 @@ def test_the_backbone_is_recognised_by_its_tensors(backbone: str) -> None:
     assert tensors.keys() == model.state_dict().keys()
 
 
+@pytest.mark.parametrize(
+    ("aggregator", "arguments", "names", "size"),
+    [
+        ("AVG", {}, {}, 320),
+        ("GeM", {"p": 3}, {"aggregator.pool.p": "aggregator.p"}, 320),
+        ("CosPlace", {"in_dim": 512, "out_dim": 8},
+         {"aggregator.pool.p": "aggregator.gem.p", "aggregator.linear.": "aggregator.fc."}, 320),
+        ("ConvAP", {"in_channels": 256, "out_channels": 8}, CONVAP, 320),
+        ("MixVPR", {"in_channels": 256, "in_h": 4, "in_w": 4, "mix_depth": 2}, MIXVPR, 64),
+    ],
+)  # fmt: skip
+def test_lightning_checkpoints_of_gsv_xs_are_loaded_with_their_hyperparameters(
+    aggregator: str, arguments: dict[str, Any], names: dict[str, str], size: int, tmp_path: Path
+) -> None:
+    model = make_model("resnet18", aggregator, arguments, 64)
+    training = {"lr": 2e-4, "loss_name": "MultiSimilarityLoss", "faiss_gpu": True}
+    parameters = {
+        "backbone_arch": "resnet18",
+        "pretrained": True,
+        "layers_to_freeze": 2,
+        "layers_to_crop": list(model.config.layers_to_crop),
+        "agg_arch": aggregator,
+        "agg_config": arguments,
+        **training,
+    }
+    tensors = rename(model, RESNET_OF_GSV | names)
+    state = {"state_dict": tensors, "hyper_parameters": parameters, "epoch": 29}
+    assert_loads_as(tmp_path / "theirs.ckpt", state, model, size)
+    loaded = load_checkpoint(tmp_path / "theirs.ckpt")
+    assert loaded.config.layers_to_freeze == -1  # its setting froze nothing
+    assert loaded.about == {**training, "epoch": 29}
+
+
 def test_a_training_checkpoint_of_cosplace_is_loaded(tmp_path: Path) -> None:
     model = make_model("resnet18", "CosPlace", {"out_dim": 8}, 64)
     state = {"model_state_dict": rename(model, RESNET_OF_COSPLACE), "epoch_num": 3}
