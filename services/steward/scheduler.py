@@ -190,7 +190,7 @@ class Scheduler:
             PeriodicTask(
                 "forget old jobs",
                 10.0,
-                lambda: delete_old_jobs(catalog, settings.job_retention_days),
+                lambda: delete_old_jobs(catalog),
             ),
             PeriodicTask(
                 "forget old searches",
@@ -205,7 +205,7 @@ class Scheduler:
             PeriodicTask(
                 "forget old deliveries",
                 10.0,
-                lambda: delete_old_deliveries(catalog, settings.job_retention_days),
+                lambda: delete_old_deliveries(catalog),
             ),
             PeriodicTask("forget old keys", 10.0, lambda: delete_expired_idempotency_keys(catalog)),
             PeriodicTask(

@@ -43,7 +43,7 @@ def open_catalog(
         Misconfigured: `bad_setting`, if DATABASE_URL is malformed.
     """
     try:
-        return Catalog(settings.catalog_url(), PoolConfig.from_settings(settings, service), limits)
+        return Catalog(settings.catalog_url(), PoolConfig(f"placewise-{service}"), limits)
     except (ArgumentError, ValueError):  # its text may contain a part of the password
         raise Misconfigured(
             "bad_setting",

@@ -97,11 +97,6 @@ class JobSettings(BaseSettings):
     query_ttl_seconds: float = Field(
         3600.0, gt=0, description="retention of a query photo that is not stored, seconds"
     )
-    job_retention_days: float = Field(
-        30.0,
-        gt=0,
-        description="retention of a finished job, days; photos that were not described keep theirs",
-    )
     search_history_days: float = Field(
         90.0, gt=0, description="retention of a search in the history, days"
     )

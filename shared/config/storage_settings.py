@@ -33,11 +33,6 @@ class StorageSettings(BaseSettings):
         "SQLite under PLACEWISE_HOME",
     )
 
-    # Connections to PostgreSQL; the embedded SQLite ignores these settings.
-    database_pool_size: int = Field(
-        10, ge=1, le=1000, description="size of a process's connection pool"
-    )
-
     # Object store in a bucket of an S3 server instead of PLACEWISE_HOME.
     s3_endpoint: str | None = Field(
         None,

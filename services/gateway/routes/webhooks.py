@@ -127,7 +127,7 @@ class DeliveriesParams(PageParams):
 def read_deliveries(
     gateway: GatewayDep, webhook_id: WebhookId, query: Annotated[DeliveriesParams, Query()]
 ) -> DeliveriesResponse:
-    """List the deliveries of a webhook, newest first, kept for JOB_RETENTION_DAYS."""
+    """List the deliveries of a webhook, newest first, kept for 30 days."""
     before = query.before
     with gateway.catalog.read() as session:
         webhook = get_webhook(session, webhook_id)

@@ -66,9 +66,10 @@ def resend_wakeups(catalog: Catalog, wakeups: Wakeups) -> int:
 RETENTION_ROWS_PER_TRANSACTION = 1000  # rows deleted in one transaction
 TRACKS_PER_TRANSACTION = 10  # each has up to MAX_TRACK_FRAMES rows
 DAY_SECONDS = 86_400.0
+JOB_RETENTION_DAYS = 30.0  # also of webhook deliveries
 
 
-def delete_old_jobs(catalog: Catalog, retention_days: float) -> None:
+def delete_old_jobs(catalog: Catalog, retention_days: float = JOB_RETENTION_DAYS) -> None:
     """Delete jobs that ended more than `retention_days` ago.
 
     An unsuccessful job that is its photo's current job stays: it has the reason why the photo is
@@ -96,7 +97,7 @@ def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
         delete_tracks(session, Track.id.in_(session.scalars(old).all()))
 
 
-def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:
+def delete_old_deliveries(catalog: Catalog, retention_days: float = JOB_RETENTION_DAYS) -> None:
     """Delete webhook deliveries older than `retention_days`: retries end long before that."""
     _delete_rows(catalog, Delivery.id, Delivery.created_at < _days_ago(retention_days))
 

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from sqlalchemy import create_engine, event
 from sqlalchemy.engine import make_url
@@ -23,7 +23,6 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from shared.catalog.database.base import SQLITE_DISTANCE_FUNCTION
 from shared.catalog.database.errors import ROLLBACK_SQLSTATES, get_sqlstate
-from shared.config.settings import Settings
 from shared.geodesy import distance_m
 
 log = logging.getLogger(__name__)
@@ -70,10 +69,6 @@ class PoolConfig:
     wait_seconds: float = 3.0
     """Wait for a free connection, then sqlalchemy.exc.TimeoutError."""
     connect_seconds: float = 3.0
-
-    @classmethod
-    def from_settings(cls, settings: Settings, service: str) -> Self:
-        return cls(name=f"placewise-{service}", size=settings.database_pool_size)
 
 
 # A longer wait for SQLite's single write lock is caused by a bug, not by load.
