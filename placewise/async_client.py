@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
 import time
-import warnings
 from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -101,17 +99,14 @@ class AsyncClient(AsyncTransport):
                 files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return await self._start_batch(files=files)
 
-    async def import_objects(self, manifest: Sequence[Json]) -> answers.BatchStarted:
+    async def import_objects(self, manifest: Sequence[Json] | bytes) -> answers.BatchStarted:
         """Start a batch import of objects in the server's store.
 
-        Each manifest entry contains an object `key` and fields of `upload`.
+        Each manifest entry contains an object `key` and fields of `upload`; bytes are JSONL.
         """
-        return await self.import_manifest(to_jsonl(manifest))
-
-    async def import_manifest(self, manifest: bytes) -> answers.BatchStarted:
-        """Start a batch import like `import_objects`, with the manifest as JSONL."""
+        body = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
         headers = {"Content-Type": "application/x-ndjson"}
-        return await self._start_batch(content=manifest, headers=headers)
+        return await self._start_batch(content=body, headers=headers)
 
     async def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
@@ -120,11 +115,10 @@ class AsyncClient(AsyncTransport):
     async def _start_batch(self, **body: Any) -> answers.BatchStarted:
         return answers.BatchStarted(**await self._call("POST", "/upload/batch", **body))
 
-    async def batch_items(self, work: Work, *states: str) -> AsyncIterator[answers.BatchItem]:
+    def batch_items(self, work: Work, *states: str) -> AsyncIterator[answers.BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
         path = f"/jobs/{_job_id(work)}/items"
-        async for item in self._iterate(path, "items", state=list(states) or None):
-            yield answers.BatchItem(**item)
+        return self._iterate(answers.BatchItem, path, "items", state=list(states) or None)
 
     async def similar(
         self,
@@ -274,10 +268,9 @@ class AsyncClient(AsyncTransport):
         params = drop_none(smoothed=smoothed or None)
         return answers.OneTrack(**await self._call("GET", f"/tracks/{track_id}", params=params))
 
-    async def tracks(self) -> AsyncIterator[answers.Track]:
+    def tracks(self) -> AsyncIterator[answers.Track]:
         """Iterate over the tracks of the map, newest first."""
-        async for track in self._iterate("/tracks", "tracks"):
-            yield answers.Track(**track)
+        return self._iterate(answers.Track, "/tracks", "tracks")
 
     async def delete_track(self, track_id: Id) -> answers.DeletedTrack:
         """Delete a track with its frames."""
@@ -288,10 +281,9 @@ class AsyncClient(AsyncTransport):
         path = f"/jobs/{_job_id(work)}"
         return answers.Job(**await self._call("GET", path, params={"wait": wait_seconds}))
 
-    async def jobs(self, **filters: Any) -> AsyncIterator[answers.Job]:
+    def jobs(self, **filters: Any) -> AsyncIterator[answers.Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
-        async for job in self._iterate("/jobs", "jobs", **filters):
-            yield answers.Job(**job)
+        return self._iterate(answers.Job, "/jobs", "jobs", **filters)
 
     async def watch(
         self,
@@ -367,10 +359,9 @@ class AsyncClient(AsyncTransport):
         """Download the original bytes of a photo."""
         return await self._get_bytes(f"/uploads/{file_id}/image")
 
-    async def photos(self, **filters: Any) -> AsyncIterator[answers.Photo]:
+    def photos(self, **filters: Any) -> AsyncIterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        async for photo in self._iterate("/search", "images", **filters):
-            yield answers.Photo(**photo)
+        return self._iterate(answers.Photo, "/search", "images", **filters)
 
     async def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
@@ -457,15 +448,13 @@ class AsyncClient(AsyncTransport):
         """Start an evaluation of the map; options are `sample` and `seed`."""
         return answers.Started(**await self._call("POST", "/evaluations", json=options))
 
-    async def evaluations(self) -> AsyncIterator[answers.Evaluation]:
+    def evaluations(self) -> AsyncIterator[answers.Evaluation]:
         """Iterate over the map's evaluations, newest first."""
-        async for evaluation in self._iterate("/evaluations", "evaluations"):
-            yield answers.Evaluation(**evaluation)
+        return self._iterate(answers.Evaluation, "/evaluations", "evaluations")
 
-    async def searches(self) -> AsyncIterator[answers.Search]:
+    def searches(self) -> AsyncIterator[answers.Search]:
         """Iterate over the search history, newest first."""
-        async for search in self._iterate("/searches", "searches"):
-            yield answers.Search(**search)
+        return self._iterate(answers.Search, "/searches", "searches")
 
     async def maps(self) -> list[answers.Map]:
         """List the maps of the server."""
@@ -577,39 +566,6 @@ class AsyncClient(AsyncTransport):
     async def revoke_key(self, key_id: Id) -> answers.Key:
         """Revoke an API key (admin only)."""
         return answers.Key(**await self._call("DELETE", f"/keys/{key_id}"))
-
-    @property
-    def raw(self) -> AsyncRawClient:
-        """Deprecated: the calls of this client with the API's JSON instead of typed responses."""
-        warnings.warn(
-            "`raw` will be removed in the next release: use `as_json()` of the typed responses.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return AsyncRawClient(self)
-
-
-class AsyncRawClient:
-    """Calls the methods of a client and returns dictionaries, and lists instead of iterators."""
-
-    def __init__(self, client: AsyncClient) -> None:
-        self._client = client
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        method = getattr(self._client, name)
-
-        async def call(*args: Any, **kwargs: Any) -> Any:
-            if inspect.isasyncgenfunction(method):
-                return [_to_json(answer) async for answer in method(*args, **kwargs)]
-            return _to_json(await method(*args, **kwargs))
-
-        return call
-
-
-def _to_json(answer: Any) -> Any:
-    if isinstance(answer, list):
-        return [_to_json(item) for item in answer]
-    return answer.as_json() if isinstance(answer, answers.Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, Self, TypeVar
 
 import httpx2
 
+from placewise import answers
 from placewise.protocol import (
     API,
     CHUNK_BYTES,
@@ -35,6 +36,7 @@ from shared.ids import new_id
 PAGE_SIZE = 1000  # the server's maximum
 
 Answer = TypeVar("Answer")
+Record = TypeVar("Record", bound=answers.Answer)
 
 
 class AsyncTransport:
@@ -50,20 +52,10 @@ class AsyncTransport:
         on_wait: OnWait = lambda error, seconds: None,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Create a client. No request is sent yet.
+        """Create a client; `placewise.connect` explains the arguments.
 
         Args:
-            url: URL of the server.
-            map_name: Name of the map; None for the server's default.
-            key: API key; a server on a loopback address may not require one.
-            patience_seconds: How long calls are retried, with exponential backoff, while the
-                server is unreachable or unavailable (503, 507). A busy server (429) is retried as
-                its Retry-After says, without a limit. 0 disables retries.
-            on_wait: Called before each wait with the error and the number of seconds.
-            timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
-
-        Raises:
-            InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
+            on_wait: Called before each retry with the error and the seconds until then.
         """
         self.url = validate_url(url, key)
         self._patience = RetryPolicy(patience_seconds, on_wait)
@@ -130,14 +122,16 @@ class AsyncTransport:
 
         return await self._retry(attempt)
 
-    async def _iterate(self, path: str, field: str, **params: Any) -> AsyncIterator[Json]:
+    async def _iterate(
+        self, model: type[Record], path: str, field: str, /, **params: Any
+    ) -> AsyncIterator[Record]:
         """Iterate over all records of a paginated list; pages are fetched on demand."""
         cursor: str | None = None
         while True:
             page_params = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
             page = await self._call("GET", path, params=page_params)
             for record in page[field]:
-                yield record
+                yield model(**record)
             cursor = page["next_cursor"]
             if cursor is None:
                 return

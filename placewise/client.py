@@ -6,9 +6,7 @@ Generated from `async_client.py` by `make client`. Edit that file.
 from __future__ import annotations
 
 import contextlib
-import inspect
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -100,17 +98,14 @@ class Client(Transport):
                 files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return self._start_batch(files=files)
 
-    def import_objects(self, manifest: Sequence[Json]) -> answers.BatchStarted:
+    def import_objects(self, manifest: Sequence[Json] | bytes) -> answers.BatchStarted:
         """Start a batch import of objects in the server's store.
 
-        Each manifest entry contains an object `key` and fields of `upload`.
+        Each manifest entry contains an object `key` and fields of `upload`; bytes are JSONL.
         """
-        return self.import_manifest(to_jsonl(manifest))
-
-    def import_manifest(self, manifest: bytes) -> answers.BatchStarted:
-        """Start a batch import like `import_objects`, with the manifest as JSONL."""
+        body = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
         headers = {"Content-Type": "application/x-ndjson"}
-        return self._start_batch(content=manifest, headers=headers)
+        return self._start_batch(content=body, headers=headers)
 
     def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
@@ -122,8 +117,7 @@ class Client(Transport):
     def batch_items(self, work: Work, *states: str) -> Iterator[answers.BatchItem]:
         """Iterate over the items of a batch, optionally only those in the given states."""
         path = f"/jobs/{_job_id(work)}/items"
-        for item in self._iterate(path, "items", state=list(states) or None):
-            yield answers.BatchItem(**item)
+        return self._iterate(answers.BatchItem, path, "items", state=list(states) or None)
 
     def similar(
         self,
@@ -275,8 +269,7 @@ class Client(Transport):
 
     def tracks(self) -> Iterator[answers.Track]:
         """Iterate over the tracks of the map, newest first."""
-        for track in self._iterate("/tracks", "tracks"):
-            yield answers.Track(**track)
+        return self._iterate(answers.Track, "/tracks", "tracks")
 
     def delete_track(self, track_id: Id) -> answers.DeletedTrack:
         """Delete a track with its frames."""
@@ -289,8 +282,7 @@ class Client(Transport):
 
     def jobs(self, **filters: Any) -> Iterator[answers.Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
-        for job in self._iterate("/jobs", "jobs", **filters):
-            yield answers.Job(**job)
+        return self._iterate(answers.Job, "/jobs", "jobs", **filters)
 
     def watch(
         self,
@@ -368,8 +360,7 @@ class Client(Transport):
 
     def photos(self, **filters: Any) -> Iterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        for photo in self._iterate("/search", "images", **filters):
-            yield answers.Photo(**photo)
+        return self._iterate(answers.Photo, "/search", "images", **filters)
 
     def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
@@ -458,13 +449,11 @@ class Client(Transport):
 
     def evaluations(self) -> Iterator[answers.Evaluation]:
         """Iterate over the map's evaluations, newest first."""
-        for evaluation in self._iterate("/evaluations", "evaluations"):
-            yield answers.Evaluation(**evaluation)
+        return self._iterate(answers.Evaluation, "/evaluations", "evaluations")
 
     def searches(self) -> Iterator[answers.Search]:
         """Iterate over the search history, newest first."""
-        for search in self._iterate("/searches", "searches"):
-            yield answers.Search(**search)
+        return self._iterate(answers.Search, "/searches", "searches")
 
     def maps(self) -> list[answers.Map]:
         """List the maps of the server."""
@@ -574,39 +563,6 @@ class Client(Transport):
     def revoke_key(self, key_id: Id) -> answers.Key:
         """Revoke an API key (admin only)."""
         return answers.Key(**self._call("DELETE", f"/keys/{key_id}"))
-
-    @property
-    def raw(self) -> RawClient:
-        """Deprecated: the calls of this client with the API's JSON instead of typed responses."""
-        warnings.warn(
-            "`raw` will be removed in the next release: use `as_json()` of the typed responses.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return RawClient(self)
-
-
-class RawClient:
-    """Calls the methods of a client and returns dictionaries, and lists instead of iterators."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        method = getattr(self._client, name)
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            if inspect.isgeneratorfunction(method):
-                return [_to_json(answer) for answer in method(*args, **kwargs)]
-            return _to_json(method(*args, **kwargs))
-
-        return call
-
-
-def _to_json(answer: Any) -> Any:
-    if isinstance(answer, list):
-        return [_to_json(item) for item in answer]
-    return answer.as_json() if isinstance(answer, answers.Answer) else answer
 
 
 def _job_id(work: Work) -> Id:

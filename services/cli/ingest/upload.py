@@ -284,7 +284,7 @@ def manifest_has_keys(manifest: bytes) -> bool:
 
 def import_keys(client: Client, manifest: bytes, progress: Progress) -> Json:
     """Import the objects listed by `key` in a JSONL manifest; see `import_prefix`."""
-    return _wait_and_report(client, client.import_manifest(manifest), progress)
+    return _wait_and_report(client, client.import_objects(manifest), progress)
 
 
 def _wait_and_report(client: Client, started: BatchStarted, progress: Progress) -> Json:

@@ -110,25 +110,6 @@ def test_answers_are_typed_and_keep_what_a_newer_server_adds(server: FakeServer)
     assert photo.model_extra == {"storeys": 5}
 
 
-def test_raw_is_deprecated_and_returns_the_json_of_the_api(server: FakeServer) -> None:
-    for _ in range(2):
-        server.will_answer(202, STARTED)
-        server.will_answer(200, {"images": [PHOTO], "next_cursor": "more"})
-        server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
-
-    async def call_async() -> list[Any]:
-        async with placewise.connect_async(server.url) as places:
-            with pytest.deprecated_call():
-                raw = places.raw
-            return [await raw.evaluate(sample=5), await raw.photos(place="atrium")]
-
-    with placewise.connect(server.url) as places:
-        with pytest.deprecated_call():
-            raw = places.raw
-        assert [raw.evaluate(sample=5), raw.photos(place="atrium")] == [STARTED, [PHOTO, PHOTO]]
-    assert asyncio.run(call_async()) == [STARTED, [PHOTO, PHOTO]]
-
-
 def test_every_post_has_a_key_without_an_argument(server: FakeServer) -> None:
     for _ in range(2):
         server.will_answer(202, STARTED)
