@@ -22,7 +22,6 @@ from typer.core import TyperGroup
 PANELS = {
     "Photos and maps": {
         "index": ("ingest.index", "index"),
-        "import-anyloc": ("ingest.import_anyloc", "import_anyloc"),
         "query": ("query", "query"),
         "track": ("track.command", "track"),
         "locate": ("locate.command", "locate"),

@@ -5,17 +5,20 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from operator import methodcaller
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from placewise.answers import BatchStarted
 from placewise.client import Client
 from placewise.protocol import open_file
 from services.cli.client import client_command, connect, describe_target
 from services.cli.environment import read_settings
+from services.cli.ingest.anyloc import read_anyloc_photos
 from services.cli.ingest.geotags import (
     LocalPhoto,
     count_other_files,
@@ -25,14 +28,14 @@ from services.cli.ingest.geotags import (
     open_local_source,
     read_photo_manifest,
 )
+from services.cli.ingest.photo_archive import PhotoArchive
 from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
-    import_keys,
-    import_prefix,
     manifest_has_keys,
     switch_off_fits,
     upload_photos,
+    wait_for_batch,
 )
 from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
@@ -72,6 +75,16 @@ def index(
             help="CSV table with the columns filename, latitude, longitude, heading, captured_at, "
             "place and tags. filename is relative to the folder or archive; the other columns are "
             "optional.",
+        ),
+    ] = None,
+    anyloc: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="similarity.db",
+            exists=True,
+            dir_okay=False,
+            help="Database of an AnyLoc similarity service, with the names, tags and metadata of "
+            "the photos in its folder of uploads, which is SOURCE.",
         ),
     ] = None,
     utm_zone: Annotated[
@@ -122,100 +135,90 @@ def index(
         "--places-by-folder": places,
         "--role": role != PhotoRole.DATABASE,
     }
-    local_file_options = {**folder_options, "--update": update, "--journal": journal}
+    local_file_options = {
+        **folder_options,
+        "--anyloc": anyloc,
+        "--update": update,
+        "--journal": journal,
+    }
     if failures is not None:
         check_output_path(failures, ".jsonl", "a list of failures")
     source, path = sources[0], Path(sources[0])
-    local = find_local_sources(sources)
-    if local is not None:
-        if len(local) > 1 or path.suffix.lower() in PHOTO_SUFFIXES:
-            _reject_options("photos and several folders", {"--csv": table})
-        with contextlib.ExitStack() as stack:
+    photos: list[LocalPhoto] = []
+    batch: Callable[[Client], BatchStarted] | None = None  # of objects that the server has
+    with contextlib.ExitStack() as stack:
+        opened: list[Path | PhotoArchive] = []
+        about_sources: Json = {}
+        local = find_local_sources(sources)
+        if anyloc is not None:
+            _reject_options("photos of an AnyLoc service", folder_options)
+            if len(sources) > 1 or not path.is_dir():
+                _reject_options("anything but one folder", {"--anyloc": anyloc})
+            found = read_anyloc_photos(anyloc, path)
+            photos = found.photos
+            about_sources = {k: v for k, v in asdict(found).items() if k != "photos"}
+        elif local is not None:
+            if len(local) > 1 or path.suffix.lower() in PHOTO_SUFFIXES:
+                _reject_options("photos and several folders", {"--csv": table})
             opened = [open_local_source(each, stack) for each in local]
-            photos = [
-                photo
-                for each in opened
-                for photo in find_photos(each, table, utm_zone, places_by_folder=places)
-            ]
+            for each in opened:
+                photos += find_photos(each, table, utm_zone, places_by_folder=places)
             if role != PhotoRole.DATABASE:
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-            report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
-            suffixes = sum(map(count_other_files, opened), Counter[str]())
-            report["other_files"] = suffixes.total()
-            report["other_suffixes"] = dict(suffixes.most_common())
-            report["without_coordinates"] = sum(not has_coordinates(p) for p in photos)
-    elif len(sources) > 1:
-        raise InvalidRequest(
-            "several_sources",
-            f"{source} and {len(sources) - 1} more: index manifests and bucket prefixes one at a "
-            "time. Only existing folders, photos, archives and patterns can be combined.",
-        )
-    elif source.startswith("s3://"):
-        _reject_options("a bucket prefix", local_file_options)
-        with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
-            report = import_prefix(client, source, progress)
-    elif path.suffix == ".jsonl":
-        _reject_options("a manifest", folder_options)
-        data = _read_manifest(path)
-        if manifest_has_keys(data):
-            _reject_options("a manifest of object keys", local_file_options)
-            with _connect(server, map_name, key, no_fit) as client, progress_bar() as progress:
-                report = import_keys(client, data, progress)
-        else:
-            photos = read_photo_manifest(path, data)
-            report = _upload_photos(photos, no_fit, update, journal, server, map_name, key)
-    else:
-        with open_file(path):  # says why a file can't be read
+        elif len(sources) > 1:
             raise InvalidRequest(
-                "unsupported_source",
-                f"{path} is not a folder or a photo, and not a complete zip or tar. If it is an "
-                "archive, download or create it again. Photos end with "
-                f"{', '.join(sorted(PHOTO_SUFFIXES))}.",
+                "several_sources",
+                f"{source} and {len(sources) - 1} more: index manifests and bucket prefixes one at "
+                "a time. Only existing folders, photos, archives and patterns can be combined.",
             )
-    if failures is not None:
-        _write_failures(failures, report)
-    _finish_command(report, server, map_name, role, as_json)
-
-
-@contextlib.contextmanager
-def _connect(
-    server: str | None, map_name: str | None, key: str | None, no_fit: bool
-) -> Iterator[Client]:
-    with connect(server, map_name, key) as client:
-        target = describe_target(client, server, map_name)
-        print_note(f"Indexing into {target}")
+        elif source.startswith("s3://"):
+            _reject_options("a bucket prefix", local_file_options)
+            batch = methodcaller("import_prefix", source)
+        elif path.suffix == ".jsonl":
+            _reject_options("a manifest", folder_options)
+            with open_file(path) as file:
+                data = file.read()
+            if manifest_has_keys(data):
+                _reject_options("a manifest of object keys", local_file_options)
+                batch = methodcaller("import_objects", data)
+            else:
+                photos = read_photo_manifest(path, data)
+        else:
+            with open_file(path):  # says why a file can't be read
+                raise InvalidRequest(
+                    "unsupported_source",
+                    f"{path} is not a folder or a photo, and not a complete zip or tar. If it is "
+                    "an archive, download or create it again. Photos end with "
+                    f"{', '.join(sorted(PHOTO_SUFFIXES))}.",
+                )
+        client = stack.enter_context(connect(server, map_name, key))
+        progress = stack.enter_context(progress_bar())
+        print_note(f"Indexing into {describe_target(client, server, map_name)}")
         if no_fit:
             switch_off_fits(client)
-        yield client
-
-
-def _upload_photos(
-    photos: list[LocalPhoto],
-    no_fit: bool,
-    update: bool,
-    journal: Path | None,
-    server: str | None,
-    map_name: str | None,
-    key: str | None,
-) -> Json:
-    with (
-        _connect(server, map_name, key, no_fit) as client,
-        progress_bar() as progress,
-        contextlib.ExitStack() as stack,
-    ):
-        # An embedded server has another port each time: PLACEWISE_HOME identifies it instead.
-        url = server or str(read_settings().placewise_home.resolve())
-        opened = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
-        return upload_photos(client, photos, progress, update=update, journal=opened)
-
-
-def _read_manifest(manifest: Path) -> bytes:
-    try:
-        return manifest.read_bytes()
-    except OSError as error:
-        raise InvalidRequest(
-            "unreadable_file", f"Can't read {manifest}: {error.strerror}"
-        ) from error
+        if batch is not None:
+            report = wait_for_batch(client, batch(client), progress)
+        else:
+            # An embedded server has another port each time: PLACEWISE_HOME identifies it instead.
+            url = server or str(read_settings().placewise_home.resolve())
+            used = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
+            report = upload_photos(client, photos, progress, update=update, journal=used)
+        if opened:
+            suffixes = sum(map(count_other_files, opened), Counter[str]())
+            about_sources = {
+                "other_files": suffixes.total(),
+                "other_suffixes": dict(suffixes.most_common()),
+                "without_coordinates": sum(not has_coordinates(p) for p in photos),
+            }
+    report |= about_sources
+    if failures is not None:
+        _write_failures(failures, report)
+    if as_json:
+        print_json(report)
+    else:
+        _print_report(report, server, map_name, role)
+    if report["refused"] or report["failed"] or report.get("missing"):
+        raise typer.Exit(1)
 
 
 def _reject_options(source: str, options: Mapping[str, object]) -> None:
@@ -236,17 +239,6 @@ def _write_failures(out: Path, report: Json) -> None:
                 file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
-def _finish_command(
-    report: Json, server: str | None, map_name: str | None, role: PhotoRole, as_json: bool
-) -> None:
-    if as_json:
-        print_json(report)
-    else:
-        _print_report(report, server, map_name, role)
-    if report["refused"] or report["failed"]:
-        raise typer.Exit(1)
-
-
 def _list_suffixes(report: Json) -> str:
     """Name the most frequent kinds of skipped files: ` (12 .mov, 3 .dng)`."""
     kinds = [
@@ -263,6 +255,9 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
         f"The map now has {report['searchable']} searchable photos "
         f"(vocabulary: {report['vocabulary']})."
     )
+    if "rows" in report:
+        print_note(f"{report['rows']} database rows, {report['unlisted']} photos without one.")
+        print_failures(report, "missing", "duplicates")
     if report.get("other_files") or report.get("without_coordinates"):
         print_note(
             f"{_count(report['other_files'], 'other file')} skipped{_list_suffixes(report)}, "

@@ -24,7 +24,7 @@ from placewise.client import Client
 from placewise.protocol import printable_name
 from services.cli.client import wait_for_job
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
+from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import Json, print_note, utf8_path
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.ingest.photo_metadata import KEY_FIELD
@@ -51,7 +51,7 @@ UpdateOption = Annotated[
     bool,
     typer.Option("--update", help="Update the metadata of photos that are already stored."),
 ]
-PendingJobs = list[tuple[LocalPhoto, str]]
+PendingJobs = list[tuple[LocalPhoto, UUID | str]]
 """Photos with the IDs of the jobs that describe them."""
 
 
@@ -92,23 +92,25 @@ def upload_photos(
 
     reported_codes: set[str] = set()
     retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, show_wait)
-    remaining = photos
-    if journal is not None:
-        remaining, recorded_jobs = _split_by_journal(photos, journal)
-        pending += recorded_jobs
-        counts["already_there"] += len(photos) - len(remaining)
-        progress.update(uploading, completed=len(photos) - len(remaining))
+    remaining = []
+    for photo in photos:
+        line = None if journal is None else journal.done(photo)
+        if line is None:
+            remaining.append(photo)
+        elif line["job_id"] is not None:
+            pending.append((photo, line["job_id"]))
+    counts["already_there"] = len(photos) - len(remaining)
+    progress.update(uploading, completed=counts["already_there"])
     for photo, outcome in _upload_concurrently(retrying_client, remaining, update):
         progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
             refused.append(_photo_failure(photo, outcome.detail))
             continue
         counts["already_there" if outcome.already_there else "uploaded"] += 1
-        job_id = None if outcome.job_id is None else str(outcome.job_id)
         if journal is not None:
-            journal.add(photo, JournalEntry(str(outcome.file_id), job_id))
-        if job_id is not None and outcome.status not in FINISHED:
-            pending.append((photo, job_id))
+            journal.add(photo, outcome)
+        if outcome.job_id is not None and outcome.status not in FINISHED:
+            pending.append((photo, outcome.job_id))
     describing = progress.add_task("describing", total=len(pending))
     pending = _wait_for_jobs(client, pending, failed, progress, describing)
 
@@ -125,21 +127,6 @@ def upload_photos(
         "vocabulary": stats.vocabulary,
         "fitted": fit,
     }
-
-
-def _split_by_journal(
-    photos: list[LocalPhoto], journal: UploadJournal
-) -> tuple[list[LocalPhoto], PendingJobs]:
-    """The photos that the journal does not contain, and the jobs of those that it contains."""
-    remaining: list[LocalPhoto] = []
-    recorded_jobs: PendingJobs = []
-    for photo in photos:
-        done = journal.done(photo)
-        if done is None:
-            remaining.append(photo)
-        elif done.job_id is not None:
-            recorded_jobs.append((photo, done.job_id))
-    return remaining, recorded_jobs
 
 
 def switch_off_fits(client: Client) -> None:
@@ -261,18 +248,6 @@ def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
     return {"path": utf8_path(photo.path), **filename, "reason": reason}
 
 
-def import_prefix(client: Client, prefix: str, progress: Progress) -> Json:
-    """Import every photo of the server's store below a prefix, and wait as `upload_photos` does.
-
-    Returns:
-        The same report as `upload_photos`, with `ignored`: the number of other objects.
-
-    Raises:
-        Unprocessable: The batch as a whole failed or was cancelled.
-    """
-    return _wait_and_report(client, client.import_prefix(prefix), progress)
-
-
 def manifest_has_keys(manifest: bytes) -> bool:
     """Whether the first line of a JSONL manifest refers to an object key instead of a file."""
     first = next((line for line in manifest.splitlines() if line.strip()), b"")
@@ -282,12 +257,15 @@ def manifest_has_keys(manifest: bytes) -> bool:
         return False  # the parser of the whole manifest reports the error
 
 
-def import_keys(client: Client, manifest: bytes, progress: Progress) -> Json:
-    """Import the objects listed by `key` in a JSONL manifest; see `import_prefix`."""
-    return _wait_and_report(client, client.import_objects(manifest), progress)
+def wait_for_batch(client: Client, started: BatchStarted, progress: Progress) -> Json:
+    """Wait for a batch as `upload_photos` does for its photos.
 
+    Returns:
+        The same report as `upload_photos`, with `ignored`: the number of objects that are none.
 
-def _wait_and_report(client: Client, started: BatchStarted, progress: Progress) -> Json:
+    Raises:
+        Unprocessable: The batch as a whole failed or was cancelled.
+    """
     describing = progress.add_task("describing", total=None)
     job = _wait_until_finished(client, started, progress, describing)
     fit = wait_for_automatic_fit(client, progress)

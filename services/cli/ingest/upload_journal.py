@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from placewise.answers import Uploaded
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.output import printable_path, utf8_path
+from services.cli.output import Json, printable_path, utf8_path
 from shared.errors import InvalidRequest, Misconfigured
 
 JOURNAL_FORMAT = 1
-
-
-@dataclass(frozen=True, slots=True)
-class JournalEntry:
-    """A photo whose upload the server has acknowledged."""
-
-    file_id: str
-    job_id: str | None
 
 
 class UploadJournal:
@@ -35,12 +27,17 @@ class UploadJournal:
     """
 
     def __init__(self, path: Path, url: str, map_name: str | None) -> None:
-        self._path = path
-        self._done: dict[str, dict[str, Any]] = {}
         header = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
         try:
             text = path.read_text() if path.exists() else ""
-            self._read(text, header)
+            lines = _parse_lines(text)
+            if text and (not lines or lines[0] != header):
+                raise InvalidRequest(
+                    "bad_journal",
+                    f"{printable_path(path)} is not a journal of this server and map. Use another "
+                    "file.",
+                )
+            self._done = {line["path"]: line for line in lines[1:]}
             self._file = path.open("a")
             if not text:
                 self._write(header)
@@ -57,44 +54,31 @@ class UploadJournal:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def done(self, photo: LocalPhoto) -> JournalEntry | None:
-        """The recorded upload of the photo, or None if it is new or has changed."""
+    def done(self, photo: LocalPhoto) -> Json | None:
+        """Return `file_id` and `job_id` of the recorded upload; None for a new or changed photo."""
         line = self._done.get(utf8_path(photo.path))
         if line is None or line["state"] != _file_state(photo):
             return None  # a missing file is reported by the upload itself
-        return JournalEntry(line["file_id"], line["job_id"])
+        return line
 
-    def add(self, photo: LocalPhoto, entry: JournalEntry) -> None:
+    def add(self, photo: LocalPhoto, uploaded: Uploaded) -> None:
         """Record an acknowledged upload."""
-        self._write(
-            {
-                "path": utf8_path(photo.path),
-                "state": _file_state(photo),
-                "file_id": entry.file_id,
-                "job_id": entry.job_id,
-            }
-        )
+        ids = uploaded.model_dump(mode="json", include={"file_id", "job_id"})
+        self._write({"path": utf8_path(photo.path), "state": _file_state(photo), **ids})
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: Json) -> None:
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
-    def _read(self, text: str, header: dict[str, Any]) -> None:
-        lines = []
-        for line in text.splitlines():
-            try:
-                lines.append(json.loads(line))
-            except ValueError:
-                continue  # incomplete: the process was killed while writing it
-        if not text:
-            return
-        if not lines or lines[0] != header:
-            raise InvalidRequest(
-                "bad_journal",
-                f"{printable_path(self._path)} is not a journal of this server and map. Use "
-                "another file.",
-            )
-        self._done = {line["path"]: line for line in lines[1:]}
+
+def _parse_lines(text: str) -> list[Json]:
+    lines = []
+    for line in text.splitlines():
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            continue  # incomplete: the process was killed while writing it
+    return lines
 
 
 def _file_state(photo: LocalPhoto) -> list[Any]:

@@ -13,7 +13,6 @@ from services.cli.main import build_app
 HEAVY = ("celery", "fastapi", "minio", "sqlalchemy", "starlette", "torch")
 CLIENT_COMMANDS = (
     "export",
-    "import-anyloc",
     "index",
     "keys",
     "locate",

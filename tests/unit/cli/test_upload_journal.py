@@ -10,15 +10,16 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
+from placewise.answers import Uploaded
 from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto, read_photo_manifest
 from services.cli.ingest.upload import upload_photos
-from services.cli.ingest.upload_journal import JournalEntry, UploadJournal
+from services.cli.ingest.upload_journal import UploadJournal
 from shared.errors import InvalidRequest, NotFound
-from tests.support.api_responses import JOB, PHOTO_ID, STATS, UPLOADED
+from tests.support.api_responses import JOB, JOB_ID, PHOTO_ID, STATS, UPLOADED
 from tests.unit.client.test_client import FakeServer, running_server
 
-TAKEN = JournalEntry("file", "job")
+TAKEN = Uploaded(**UPLOADED)
 NO_JOBS: dict[str, Any] = {"jobs": [], "next_cursor": None}
 
 
@@ -45,7 +46,9 @@ def test_a_photo_that_was_taken_is_known_to_the_next_run(path: Path, photo: Loca
         assert journal.done(photo) is None
         journal.add(photo, TAKEN)
     with UploadJournal(path, "http://a", None) as journal:
-        assert journal.done(photo) == TAKEN
+        done = journal.done(photo)
+    assert done is not None
+    assert (done["file_id"], done["job_id"]) == (PHOTO_ID, JOB_ID)
 
 
 def test_a_photo_is_sent_again_when_its_bytes_or_its_metadata_have_changed(
@@ -70,7 +73,7 @@ def test_a_line_that_a_kill_has_cut_off_is_passed_over(path: Path, photo: LocalP
         assert journal.done(photo) is None
         journal.add(photo, TAKEN)
     with UploadJournal(path, "http://a", None) as journal:
-        assert journal.done(photo) == TAKEN
+        assert journal.done(photo) is not None
 
 
 @pytest.mark.parametrize("other", [("http://b", None), ("http://a", "lab")])
@@ -112,7 +115,7 @@ def test_a_run_that_was_broken_off_sends_only_the_rest(
     assert (report["uploaded"], report["already_there"]) == (1, 1)
     assert report["refused"] == report["failed"] == []
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line.get("file_id") for line in lines] == [None, "file", PHOTO_ID]
+    assert [line.get("file_id") for line in lines] == [None, PHOTO_ID, PHOTO_ID]
 
 
 def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(
