@@ -32,7 +32,7 @@ from lab.training.data import (
 )
 from lab.training.losses import make_loss, make_miner
 from lab.training.model_factory import make_model
-from lab.training.resolve import Device, resolve_device
+from lab.training.resolve import make_fabric
 from lab.training.run_control import NullDisplay
 from lab.training.training_loop import make_optimizer
 from services.cli.output import JsonOption
@@ -57,8 +57,8 @@ def bench(
     as_json: JsonOption = False,
 ) -> None:
     """Measure training throughput and how long the network waits for photos."""
-    chosen = resolve_device(build_arguments({"accelerator": device}))
-    title = f"training on {chosen.torch_device.type}"
+    chosen = make_fabric(build_arguments({"accelerator": device})).device
+    title = f"training on {chosen.type}"
     with (
         printed_report(title, as_json) as (report, progress),
         tempfile.TemporaryDirectory(prefix="placewise-bench-") as folder,
@@ -96,7 +96,7 @@ def bench(
         report.add(
             "share of the time waiting for photos",
             waiting,
-            at_most=MAX_WAIT_SHARE if chosen.accelerator == "gpu" else None,
+            at_most=MAX_WAIT_SHARE if chosen.type == "cuda" else None,
         )
         report.add("reading, as a multiple of the network's pace", reading / network, at_least=1.0)
         report.details = {"torch": torch.__version__}
@@ -128,26 +128,26 @@ def _decode_draft(path: Path) -> None:
     to_tensor(TRANSFORM.load(path, 0))
 
 
-def _batches(places: list[TrainingPlace], workers: int, device: Device) -> Iterator[Batch]:
+def _batches(places: list[TrainingPlace], workers: int, device: torch.device) -> Iterator[Batch]:
     sampler = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
     dataset = PlaceDataset(sampler, TRANSFORM, fail_on_undecodable=True)
-    pin_memory = device.accelerator == "gpu"
+    pin_memory = device.type == "cuda"
     return load_batches(sampler, dataset, num_workers=workers, pin_memory=pin_memory)
 
 
-def _make_training_step(device: Device) -> Callable[[Batch], None]:
+def _make_training_step(device: torch.device) -> Callable[[Batch], None]:
     arguments = build_arguments(
         {"pretrained": False, "layers_to_freeze": -1, "agg_arch": "gem", "image_size": IMAGE_PIXELS}
     )
     torch.manual_seed(0)
-    model = make_model(arguments, NullDisplay(), resuming=False).to(device.torch_device).train()
+    model = make_model(arguments, NullDisplay(), resuming=False).to(device).train()
     loss, miner = make_loss("MultiSimilarityLoss"), make_miner("MultiSimilarityMiner")
     assert miner is not None
     optimizer = make_optimizer(model.parameters(), arguments)
 
     def step(batch: Batch) -> None:
-        rows = model(batch.photos.to(device.torch_device, non_blocking=True))
-        labels = batch.labels.to(device.torch_device, non_blocking=True)
+        rows = model(batch.photos.to(device, non_blocking=True))
+        labels = batch.labels.to(device, non_blocking=True)
         value = loss(rows, labels, miner(rows, labels))
         optimizer.zero_grad(set_to_none=True)
         value.backward()
@@ -157,7 +157,7 @@ def _make_training_step(device: Device) -> Callable[[Batch], None]:
 
 
 def _time_batches(
-    batches: Iterable[Batch], step: Callable[[Batch], None], device: Device
+    batches: Iterable[Batch], step: Callable[[Batch], None], device: torch.device
 ) -> tuple[float, float]:
     """Return photos per second, and the share of the time spent waiting for batches."""
     iterator = iter(batches)
@@ -177,6 +177,6 @@ def _time_batches(
     return count / seconds, waited / seconds
 
 
-def _synchronise(device: Device) -> None:
-    if device.accelerator == "gpu":
+def _synchronise(device: torch.device) -> None:
+    if device.type == "cuda":
         torch.cuda.synchronize()

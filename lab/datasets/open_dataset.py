@@ -14,11 +14,22 @@ from pathlib import Path
 
 from lab.datasets.dataset import PHOTO_TABLE_HEADER, EvaluationSet, TrainingSet
 from lab.datasets.ground_truth import find_positives, parse_rule
-from lab.datasets.layouts import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
 from lab.datasets.layouts.base import EvaluationLayout, TrainingLayout
-from lab.datasets.layouts.folder_pairs import RIDES, SEASONS
+from lab.datasets.layouts.csv_tables import CsvTables, CsvTrainingTable
+from lab.datasets.layouts.dbstruct import DbStruct
+from lab.datasets.layouts.folder_pairs import RIDES, SEASONS, FolderPairs
+from lab.datasets.layouts.gsv_cities import GsvCities, GsvXs
+from lab.datasets.layouts.msls import Msls
+from lab.datasets.layouts.npy_lists import NpyLists
+from lab.datasets.layouts.vpr_bench import VprBench
 from shared.errors import InvalidRequest, NotFound
 
+# In the order in which they are tried. Lists come before folders: if a dataset has both, the lists
+# have the ground truth.
+TRAINING_LAYOUTS: tuple[TrainingLayout, ...] = (GsvXs(), GsvCities(), CsvTrainingTable())
+EVALUATION_LAYOUTS: tuple[EvaluationLayout, ...] = (
+    NpyLists(), DbStruct(), Msls(), CsvTables(), FolderPairs(), VprBench(),
+)  # fmt: skip
 PART_FOLDERS = frozenset(
     {
         *("database", "queries", "queries_v1", "queries_v2"),

@@ -6,6 +6,7 @@ the files exceed the size limit, the least recently used file is deleted first.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import sqlite3
@@ -63,12 +64,12 @@ class CachedDescriber:
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
         """Yield (n, D) float32 descriptors, batch by batch, in the order of the photos."""
-        connection = self._open()
-        try:
+        with contextlib.closing(self._open()) as connection:
             keys, missing = [], []
             for photo in photos:
                 keys.append(_photo_sha256(photo))
-                missing.append(not _has_row(connection, keys[-1]))
+                found = connection.execute("SELECT 1 FROM rows WHERE photo = ?", keys[-1:])
+                missing.append(found.fetchone() is None)
                 self.on_lookup(len(keys), len(photos))
             computed = self._compute([p for p, m in zip(photos, missing, strict=True) if m])
             for start in range(0, len(photos), BATCH):
@@ -82,21 +83,15 @@ class CachedDescriber:
                 yield np.stack(rows)
                 # Stored after the yield: the consumer raises on invalid rows, such as NaN.
                 self._store(connection, new_rows)
-        finally:
-            connection.close()
 
     def milliseconds_a_photo(self) -> float | None:
         """Return the mean network time per photo over all photos described for this cache.
 
         None if no time has been recorded.
         """
-        connection = self._open()
-        try:
-            seconds, photos = connection.execute(
-                "SELECT sum(seconds), sum(photos) FROM times"
-            ).fetchone()
-        finally:
-            connection.close()
+        with contextlib.closing(self._open()) as connection:
+            times = connection.execute("SELECT sum(seconds), sum(photos) FROM times")
+            seconds, photos = times.fetchone()
         return 1000 * seconds / photos if photos else None
 
     def _compute(self, photos: Sequence[Path]) -> Iterator[Any]:
@@ -154,10 +149,6 @@ def _photo_sha256(photo: Path) -> bytes:
             "photo_unreadable", f"Can't read {photo}: {error.strerror}."
         ) from error
     return digest.digest()
-
-
-def _has_row(connection: sqlite3.Connection, key: bytes) -> bool:
-    return connection.execute("SELECT 1 FROM rows WHERE photo = ?", (key,)).fetchone() is not None
 
 
 def _load_row(connection: sqlite3.Connection, key: bytes) -> Any:

@@ -64,6 +64,8 @@ def measure_places(
     ranked: Rankings,
     scheme: LevelScheme,
     position_radius_m: float,
+    *,
+    sampled_photos: int = SAMPLED_PHOTOS,
 ) -> dict[str, Any] | None:
     """Fit the place model on the database photos and measure its answers to the queries.
 
@@ -73,6 +75,7 @@ def measure_places(
         ranked: Database photos by query, best first, `EVIDENCE_DEPTH` of them if there are as many.
         scheme: The levels.
         position_radius_m: Radius of a place in metres.
+        sampled_photos: Maximum number of database photos that the model is fitted on.
 
     Returns:
         `source` of the model, number of `own_photos` and of queries (`samples`), `answers` at each
@@ -82,7 +85,7 @@ def measure_places(
     """
     locations = [_photo_location(photo) for photo in evaluation_set.database]
     known = np.flatnonzero([location.is_known for location in locations])
-    size = min(SAMPLED_PHOTOS, len(known))
+    size = min(sampled_photos, len(known))
     sample = np.sort(np.random.default_rng(SEED).choice(known, size, replace=False)).tolist()
     captured_at = [photo.captured_at for photo in evaluation_set.database]
     best = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +42,8 @@ def cluster_queries(queries: Sequence[DatasetPhoto]) -> QueryClusters:
         (f"squares of {GRID_CELL_M:g} m", [_grid_cell(photo) for photo in queries]),
     ):
         if None not in keys and len(set(keys)) >= MIN_CLUSTERS:
-            return QueryClusters(_number_labels(keys), kind)
+            numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+            return QueryClusters(np.array([numbers[key] for key in keys], np.int64), kind)
     return singleton_clusters(len(queries))
 
 
@@ -61,8 +62,3 @@ def _grid_cell(photo: DatasetPhoto) -> tuple[str | None, int, int] | None:
     # One factor for the whole row, so that its cells line up.
     scale = math.cos(math.radians(row * GRID_CELL_M / metres_per_degree))
     return "degrees", row, int(photo.longitude * metres_per_degree * scale // GRID_CELL_M)
-
-
-def _number_labels(keys: Sequence[Hashable]) -> NDArray[np.int64]:
-    numbers: dict[Hashable, int] = {}
-    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.int64)

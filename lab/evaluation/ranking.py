@@ -9,6 +9,7 @@ import contextlib
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.datasets.dataset import EvaluationSet
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, exact_knn
 from lab.evaluation.recall import recall_at_k
 from shared.errors import PlacewiseError, Unprocessable
@@ -43,12 +44,12 @@ def describe_to_matrix(
     describe: DescribeFunction,
     photos: Sequence[Path],
     *,
-    on_progress: Callable[[int], None] = lambda count: None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[Rows]:
     """Describe photos into a matrix that is valid inside the `with` block.
 
     Args:
-        on_progress: called with the number of new rows after each batch.
+        on_progress: called after each batch with the numbers of described and of all photos.
 
     Yields:
         (photos, D) float32 descriptors.
@@ -65,7 +66,7 @@ def describe_to_matrix(
             _check_finite(batch, photos[done : done + len(batch)])
             rows[done : done + len(batch)] = batch
             done += len(batch)
-            on_progress(len(batch))
+            on_progress(done, len(photos))
         if done != len(photos):
             raise ValueError(f"{done} rows for {len(photos)} photos")
         yield rows
@@ -158,10 +159,8 @@ def evaluate_recall(
     Raises:
         Misconfigured: `faiss_gpu_missing`; also raises what `describe` raises.
     """
-    with describe_evaluation_set(describe, evaluation_set, on_progress=on_progress) as (
-        database,
-        queries,
-    ):
+    described = describe_evaluation_set(describe, evaluation_set, on_progress=on_progress)
+    with described as (database, queries):
         ranked = exact_knn(
             queries,
             database,
@@ -187,36 +186,19 @@ def describe_evaluation_set(
     Yields:
         (m, D) float32 descriptors of the database and (n, D) of the queries.
     """
-    with contextlib.ExitStack() as stack:
-        matrices = []
-        for stage, photos in (
-            ("database", evaluation_set.database),
-            ("queries", evaluation_set.queries),
-        ):
-            matrices.append(
-                stack.enter_context(
-                    describe_to_matrix(
-                        describe,
-                        [photo.path for photo in photos],
-                        on_progress=_accumulate_progress(stage, len(photos), on_progress),
-                    )
-                )
-            )
-        database, queries = matrices
+
+    def describe_photos(stage: str, photos: Sequence[DatasetPhoto]) -> AbstractContextManager[Rows]:
+        return describe_to_matrix(
+            describe,
+            [photo.path for photo in photos],
+            on_progress=lambda done, total: on_progress(stage, done, total),
+        )
+
+    with (
+        describe_photos("database", evaluation_set.database) as database,
+        describe_photos("queries", evaluation_set.queries) as queries,
+    ):
         yield database, queries
-
-
-def _accumulate_progress(
-    stage: str, total: int, on_progress: ProgressCallback
-) -> Callable[[int], None]:
-    done = 0
-
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
-        on_progress(stage, done, total)
-
-    return advance
 
 
 def compute_recalls(

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 POSITIVE_WITHIN_M = 25.0
-QUERIES_PER_BLOCK = 256
 
 Positions = NDArray[np.float64]
-Descriptors = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Hits = NDArray[np.bool_]
 
@@ -53,25 +51,6 @@ def positives_within(
         is_positive = offset[:, 0] ** 2 + offset[:, 1] ** 2 <= within_m**2
         positives.append(np.sort(order[start:stop][is_positive]))
     return positives
-
-
-def rank_by_similarity(queries: Descriptors, database: Descriptors, k: int) -> Indices:
-    """Rank the database by cosine similarity, with the whole database in memory.
-
-    Args:
-        queries: (n, D) L2-normalised descriptors.
-        database: (m, D) L2-normalised descriptors.
-
-    Returns:
-        (n, min(k, m)) int64 database indices, most similar first; ties are ordered by index.
-    """
-    ranked = []
-    for start in range(0, len(queries), QUERIES_PER_BLOCK):
-        scores = queries[start : start + QUERIES_PER_BLOCK] @ database.T
-        ranked.append(np.argsort(-scores, axis=1, kind="stable")[:, :k])
-    if not ranked:
-        return np.empty((0, min(k, len(database))), np.int64)
-    return np.concatenate(ranked)
 
 
 def compute_hits(ranked: Indices, positives: Sequence[Indices]) -> Hits:

@@ -22,12 +22,10 @@ import numpy as np
 from lab.datasets.check import SuspectLabel
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, Scores
-from lab.evaluation.recall import compute_hits
+from lab.evaluation.recall import Hits, compute_hits
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, hits_at_k
 from shared.errors import Conflict, InvalidRequest, NotFound
 from shared.evaluation.bootstrap import PairedDifference, paired_differences
-
-MAX_ENTRIES_SHOWN = 5  # invalid entries listed in an error message
 
 
 def read_predictions(path: Path) -> Indices:
@@ -99,17 +97,12 @@ def check_predictions(
         )
 
 
-def _out_of_range(
-    path: Path, ranked: Indices, invalid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], why: str
-) -> InvalidRequest:
-    positions = np.argwhere(invalid)
-    shown = ", ".join(
-        f"{ranked[q, k]} of query {q}" for q, k in positions[:MAX_ENTRIES_SHOWN].tolist()
-    )
-    hidden = len(positions) - MAX_ENTRIES_SHOWN
-    more = f" and {hidden} more" if hidden > 0 else ""
+def _out_of_range(path: Path, ranked: Indices, invalid: Hits, why: str) -> InvalidRequest:
+    query, rank = np.argwhere(invalid)[0]
     return InvalidRequest(
-        "bad_predictions", f"{path} has indices out of range: {shown}{more}; {why}."
+        "bad_predictions",
+        f"{path} has {invalid.sum()} indices out of range, first {ranked[query, rank]} of query "
+        f"{query}; {why}.",
     )
 
 
@@ -293,20 +286,13 @@ def write_run_files(out: Path, run: EvaluationRun, results: Sequence[EvaluationR
     partial.replace(out / "metrics.json")
 
 
-def write_pairs(file: Path, results: Sequence[EvaluationResult]) -> int:
-    """Write the retrieved pairs in hloc's format: a line `query database` per pair, by rank.
-
-    Returns:
-        The number of pairs.
-    """
-    count = 0
+def write_pairs(file: Path, results: Sequence[EvaluationResult]) -> None:
+    """Write the retrieved pairs in hloc's format: a line `query database` per pair, by rank."""
     with file.open("w", encoding="utf-8") as lines:
         for result in results:
-            for query, photo in enumerate(result.evaluation_set.queries):
-                for rank in range(result.measured.depth):
-                    lines.write(f"{photo.name} {result.match_name(query, rank)}\n")
-                    count += 1
-    return count
+            for query, rank in np.ndindex(result.measured.hits.shape):
+                name = result.evaluation_set.queries[query].name
+                lines.write(f"{name} {result.match_name(query, rank)}\n")
 
 
 def package_versions() -> dict[str, str]:
@@ -325,16 +311,15 @@ def _write_predictions_csv(file: Path, result: EvaluationResult) -> None:
     with file.open("w", encoding="utf-8", newline="") as opened:
         table = csv.writer(opened, lineterminator="\n")
         table.writerow(["query", "rank", "match", "score", "metres", "correct"])
-        for query, photo in enumerate(result.evaluation_set.queries):
-            for rank in range(result.measured.depth):
-                distance = None if metres is None else float(metres[query, rank])
-                table.writerow(
-                    [
-                        photo.name,
-                        rank + 1,
-                        result.match_name(query, rank),
-                        "" if scores is None else f"{scores[query, rank]:.6f}",
-                        "" if distance is None or np.isnan(distance) else f"{distance:.2f}",
-                        "true" if result.measured.hits[query, rank] else "false",
-                    ]
-                )
+        for query, rank in np.ndindex(result.measured.hits.shape):
+            known = metres is not None and np.isfinite(metres[query, rank])
+            table.writerow(
+                [
+                    result.evaluation_set.queries[query].name,
+                    rank + 1,
+                    result.match_name(query, rank),
+                    "" if scores is None else f"{scores[query, rank]:.6f}",
+                    f"{metres[query, rank]:.2f}" if metres is not None and known else "",
+                    "true" if result.measured.hits[query, rank] else "false",
+                ]
+            )

@@ -312,6 +312,10 @@ def compute_metrics(
     precisions = average_precisions(hits, positive_counts)[findable]
     findable_values = np.column_stack([within[findable], precisions])
     intervals = bootstrap_intervals(findable_values, clusters.labels[findable])
+    curve = calibration = None
+    if scores is not None:
+        first = scores[:, 0], hits[:, 0], int(findable.sum())
+        curve, calibration = precision_recall(*first), calibrate_scores(*first, clusters)
     return RetrievalMetrics(
         recalls=compute_recalls(ranked, positives, ks),
         hits=hits,
@@ -321,16 +325,8 @@ def compute_metrics(
         mean_average_precision=float(precisions.mean()) if len(precisions) else float("nan"),
         map_interval=intervals[-1] if intervals else None,
         clusters=clusters,
-        curve=(
-            None
-            if scores is None
-            else precision_recall(scores[:, 0], hits[:, 0], int(findable.sum()))
-        ),
-        calibration=(
-            None
-            if scores is None
-            else calibrate_scores(scores[:, 0], hits[:, 0], int(findable.sum()), clusters)
-        ),
+        curve=curve,
+        calibration=calibration,
         metres=metres,
     )
 
@@ -348,16 +344,11 @@ def _curve_json(curve: PrecisionRecall | None) -> dict[str, Any] | None:
         return None
     count = len(curve.thresholds)
     shown = np.unique(np.linspace(0, count - 1, min(count, MAX_CURVE_POINTS)).round().astype(int))
+    points = np.column_stack([curve.thresholds, curve.precision, curve.recall])[shown]
+    names = ("score", "precision", "recall")
     return {
         "area": curve.area,
-        "points": [
-            {
-                "score": float(curve.thresholds[index]),
-                "precision": float(curve.precision[index]),
-                "recall": float(curve.recall[index]),
-            }
-            for index in shown
-        ],
+        "points": [dict(zip(names, point, strict=True)) for point in points.tolist()],
     }
 
 

@@ -322,28 +322,12 @@ def argument_group(name: str) -> str:
 
 ALIASES = {"warmup_steps": "warmpup_steps"}
 """Correct spelling -> the name in the GSV-Cities code"""
-ARGUMENT_NAMES = tuple(TrainingArguments.model_fields)
 
 
 def normalise_name(name: str) -> str:
     """Replace hyphens by underscores, and an alias by the argument's name."""
     name = name.replace("-", "_")
     return ALIASES.get(name, name)
-
-
-def resolve_name(name: str) -> str:
-    """Return an argument's canonical name.
-
-    Raises:
-        InvalidRequest: `unknown_argument`.
-    """
-    canonical = normalise_name(name)
-    if canonical not in ARGUMENT_NAMES:
-        raise InvalidRequest(
-            "unknown_argument",
-            f"Unknown argument {name!r}.{suggest_name(canonical, ARGUMENT_NAMES)}",
-        )
-    return canonical
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
@@ -440,12 +424,13 @@ def resolve_keys(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     Raises:
         InvalidRequest: `unknown_argument`; the message begins with `source`.
     """
-    resolved: dict[str, Any] = {}
-    for key, value in values.items():
-        try:
-            resolved[resolve_name(key)] = value
-        except InvalidRequest as error:
-            raise InvalidRequest(error.code, f"{source}: {error.detail}") from error
+    resolved = {normalise_name(key): value for key, value in values.items()}
+    unknown = [name for name in resolved if name not in TrainingArguments.model_fields]
+    if unknown:
+        suggestion = suggest_name(unknown[0], TrainingArguments.model_fields)
+        raise InvalidRequest(
+            "unknown_argument", f"{source}: Unknown argument {unknown[0]!r}.{suggestion}"
+        )
     return resolved
 
 
@@ -463,9 +448,7 @@ def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     Raises:
         InvalidRequest: `bad_argument`; the message names each invalid argument and its value.
     """
-    merged: dict[str, Any] = {}
-    for layer in layers:
-        merged.update(layer)
+    merged = {name: value for layer in layers for name, value in layer.items()}
     try:
         return _apply_compatibility(TrainingArguments(**merged))
     except ValidationError as error:

@@ -218,7 +218,10 @@ class TopKCheckpoints:
         return path
 
 
-REQUIRED_STATE = {"state_dict", "optimizer_states", "global_step", "last_loss"}
+REQUIRED_STATE = {
+    "state_dict", "hyper_parameters", "optimizer_states", "MixedPrecision", "rng_state",
+    "global_step", "last_loss",
+}  # fmt: skip
 
 
 def load_training_state(path: Path) -> dict[str, Any]:

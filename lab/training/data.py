@@ -11,7 +11,7 @@ import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,14 +20,10 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torchvision import transforms as tv
+from torchvision.transforms import functional
 
-from lab.datasets.dataset import EvaluationSet, TrainingSet
-from lab.datasets.open_dataset import (
-    TrainingPlace,
-    evaluation_set_names,
-    open_evaluation_set,
-    open_training_set,
-)
+from lab.datasets.dataset import EvaluationSet, TrainingPlace, TrainingSet
+from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set, open_training_set
 from lab.training.arguments import TrainingArguments, data_root_error, suggest_name
 from shared.errors import NotFound, Unprocessable
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
@@ -123,30 +119,6 @@ def _resolve_set_names(
         or tuple(name for name in available if keyword in name)
         or tuple(available)
     )
-
-
-def summarise_training_set(training_set: TrainingSet) -> dict[str, Any]:
-    """Return the training set's entry in reports; a resumed run compares its fingerprint."""
-    return {
-        "name": training_set.name,
-        "layout": training_set.layout,
-        "cities": list(training_set.cities),
-        "places": len(training_set.places),
-        "photos": training_set.photo_count,
-        "fingerprint": training_set.fingerprint,
-    }
-
-
-def summarise_evaluation_set(evaluation_set: EvaluationSet) -> dict[str, Any]:
-    """Return the metadata that is reported with every metric of the set."""
-    return {
-        "database": len(evaluation_set.database),
-        "queries": len(evaluation_set.queries),
-        "without_positive": len(evaluation_set.without_positives),
-        "rule": evaluation_set.rule,
-        "protocol": evaluation_set.protocol,
-        "fingerprint": evaluation_set.fingerprint,
-    }
 
 
 def _require_data_root(arguments: TrainingArguments) -> Path:
@@ -264,14 +236,12 @@ class PhotoTransform:
 
 def to_tensor(image: Image.Image) -> Tensor:
     """Convert an RGB image to (3, H, W) float32, normalised with ImageNet's mean and std."""
-    pixels = torch.from_numpy(np.array(image, np.uint8)).permute(2, 0, 1)
-    mean = torch.tensor(IMAGENET_MEAN)[:, None, None]
-    std = torch.tensor(IMAGENET_STD)[:, None, None]
-    return (pixels.float() / 255 - mean) / std
+    pixels = functional.to_tensor(image)
+    tensor: Tensor = functional.normalize(pixels, list(IMAGENET_MEAN), list(IMAGENET_STD))
+    return tensor
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
+class Batch(NamedTuple):
     """Photos and place labels of one training step."""
 
     photos: Tensor
@@ -280,14 +250,6 @@ class Batch:
     """(n,) int64 place ids"""
     undecodable: tuple[tuple[str, str], ...] = ()
     """path and reason of each skipped photo"""
-
-    def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
-        photos = self.photos.to(device, non_blocking=non_blocking)
-        labels = self.labels.to(device, non_blocking=non_blocking)
-        return Batch(photos, labels, self.undecodable)
-
-    def pin_memory(self) -> Batch:
-        return Batch(self.photos.pin_memory(), self.labels.pin_memory(), self.undecodable)
 
 
 class PlaceDataset(Dataset[Batch]):

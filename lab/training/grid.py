@@ -33,7 +33,6 @@ from lab.training.arguments import (
     load_mapping,
     load_yaml,
     resolve_keys,
-    resolve_name,
     suggest_name,
     to_plain_dict,
 )
@@ -140,7 +139,7 @@ def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]
             str(each) for each in arguments.values() if not isinstance(each, (dict, list))
         )
         return label or axis, arguments
-    return str(value), {resolve_name(axis): value}
+    return str(value), resolve_keys({axis: value}, f"{path}, grid")
 
 
 def _listed_runs(path: Path, runs: Sequence[_ListedRun]) -> Iterator[RunSettings]:

@@ -78,40 +78,48 @@ class ModelDescriber:
         refused: list[tuple[Path, PlacewiseError]] = []
         was_training = self._model.training
         self._model.eval()
-        clock, on_cpu = inference_clock(self._device), self._device.type == "cpu"
-        threads = ThreadPoolExecutor(max(1, os.cpu_count() or 1))  # decoding releases the GIL
+        clock = inference_clock(self._device)
         try:
-            prefetched = [threads.submit(self._decode, p) for p in photos[: self._batch_photos]]
-            for start in range(0, len(photos), self._batch_photos):
-                decoded = [future.result() for future in prefetched]
-                end = start + self._batch_photos
-                next_batch = photos[end : end + self._batch_photos]
-                if not on_cpu:
-                    prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
-                batch = photos[start:end]
-                refused += [
-                    (photo, result)
-                    for photo, result in zip(batch, decoded, strict=True)
-                    if isinstance(result, PlacewiseError)
-                ]
-                if not refused:  # after the first error, only look for more unreadable photos
-                    pixels = [p for p in decoded if not isinstance(p, PlacewiseError)]
-                    started_at = clock()
-                    try:
-                        rows = self._describe(pixels)
-                    except PhotoTooLargeForGpu as error:
-                        refused.append((batch[error.place], error))
-                        continue
-                    self.seconds += clock() - started_at
-                    self.photos += len(rows)
-                    yield rows
-                if on_cpu:  # not before: its CPU time would count as that of the inference
-                    prefetched = [threads.submit(self._decode, photo) for photo in next_batch]
+            for batch, decoded in self._decode_batches(photos):
+                pixels = []
+                for photo, result in zip(batch, decoded, strict=True):
+                    if isinstance(result, PlacewiseError):
+                        refused.append((photo, result))
+                    else:
+                        pixels.append(result)
+                if refused:  # only look for more unreadable photos
+                    continue
+                started_at = clock()
+                try:
+                    rows = self._describe(pixels)
+                except PhotoTooLargeForGpu as error:
+                    refused.append((batch[error.place], error))
+                    continue
+                self.seconds += clock() - started_at
+                self.photos += len(rows)
+                yield rows
         finally:
-            threads.shutdown(cancel_futures=True)
             self._model.train(was_training)
         if refused:
             raise refused_photos_error(refused, len(photos))
+
+    def _decode_batches(
+        self, photos: Sequence[Path]
+    ) -> Iterator[tuple[Sequence[Path], list[Pixels | PlacewiseError]]]:
+        """Decode batch by batch; on a GPU, the next one is decoded meanwhile.
+
+        On a CPU, the time of decoding would count as that of the network.
+        """
+        step, decodes_ahead = self._batch_photos, self._device.type != "cpu"
+        with ThreadPoolExecutor(os.cpu_count()) as threads:  # decoding releases the GIL
+            ahead = None
+            for start in range(0, len(photos), step):
+                batch = photos[start : start + step]
+                decoded = list(ahead or threads.map(self._decode, batch))
+                if decodes_ahead:
+                    following = photos[start + step : start + 2 * step]
+                    ahead = threads.map(self._decode, following)
+                yield batch, decoded
 
     def _decode(self, photo: Path) -> Pixels | PlacewiseError:
         try:

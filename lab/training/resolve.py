@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import json
-import os
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
+from lightning.fabric import Fabric
 from lightning.pytorch.loggers import (
     CSVLogger,
     Logger,
@@ -40,23 +38,8 @@ PRECISION_ALIASES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Device:
-    """The device of a run, as Lightning and torch name it."""
-
-    accelerator: str
-    """gpu, mps or cpu"""
-    devices: Any
-    """Lightning's `devices` argument: [0] or 1"""
-    precision: Any
-    """Lightning's `precision` argument, such as `16-mixed`"""
-    torch_device: torch.device
-    faiss_gpu: bool
-    """whether evaluations search on the GPU"""
-
-
-def resolve_device(arguments: TrainingArguments) -> Device:
-    """Resolve the arguments to a single device.
+def make_fabric(arguments: TrainingArguments) -> Fabric:
+    """Create the Fabric of a run: one device and a precision.
 
     Raises:
         Misconfigured: `no_gpu`.
@@ -64,26 +47,25 @@ def resolve_device(arguments: TrainingArguments) -> Device:
     """
     accelerator = _resolve_accelerator(arguments.accelerator)
     index = _device_index(arguments.devices)
-    precision = PRECISION_ALIASES.get(str(arguments.precision))
+    precision: Any = PRECISION_ALIASES.get(str(arguments.precision))
     if precision is None:
         raise InvalidRequest(
             "unknown_precision",
             f"--precision {arguments.precision} is unknown; known: {', '.join(PRECISION_ALIASES)}.",
         )
-    if precision == "16-mixed" and accelerator != "gpu":
-        raise InvalidRequest(
-            "needs_gpu", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
-        )
-    faiss_gpu = arguments.faiss_gpu and has_faiss_gpu()
     if accelerator != "gpu":
-        return Device(accelerator, 1, precision, torch.device(accelerator), faiss_gpu)
+        if precision == "16-mixed":
+            raise InvalidRequest(
+                "needs_gpu", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
+            )
+        return Fabric(accelerator=accelerator, devices=1, precision=precision)
     if index >= torch.cuda.device_count():
         raise Misconfigured(
             "no_gpu",
             f"--devices [{index}] does not exist: this machine has {torch.cuda.device_count()} "
             "GPUs, numbered from 0.",
         )
-    return Device("gpu", [index], precision, torch.device("cuda", index), faiss_gpu)
+    return Fabric(accelerator="gpu", devices=[index], precision=precision)
 
 
 def _resolve_accelerator(requested: str) -> str:
@@ -137,21 +119,18 @@ def make_loggers(
 
 def _continue_csv(folder: Path, completed_steps: int) -> CSVLogger:
     """Create a CSV logger that begins with the rows that earlier parts of the run have logged."""
-    logger = CSVLogger(folder, name="csv")
-    earlier = sorted((folder / "csv").glob("version_*/metrics.csv"), key=os.path.getmtime)
-    rows: dict[str, dict[str, str]] = {}  # each once, also if a copy was interrupted
-    for file in earlier:
+    file = folder / "csv" / "version_0" / "metrics.csv"
+    rows: list[dict[str, Any]] = []
+    if file.is_file():
         with file.open(newline="") as opened:
-            for row in csv.DictReader(opened):
-                if int(row["step"]) <= completed_steps:
-                    logged = {name: value for name, value in row.items() if value != ""}
-                    rows[json.dumps(logged, sort_keys=True)] = logged
-    for logged in rows.values():
-        # Values are written as they were read, so that an interrupted copy is recognised.
-        logger.log_metrics(cast("dict[str, Any]", logged), int(logged["step"]))
+            rows = list(csv.DictReader(opened))
+        shutil.rmtree(file.parent)  # the logger would warn and delete it
+    logger = CSVLogger(folder, name="csv", version=0)
+    for row in rows:
+        if int(row["step"]) <= completed_steps:
+            logged = {name: value for name, value in row.items() if value != ""}
+            logger.log_metrics(logged, int(row["step"]))
     logger.save()
-    for file in earlier:
-        shutil.rmtree(file.parent)
     return logger
 
 
@@ -173,21 +152,19 @@ def check_loggers(names: tuple[str, ...]) -> None:
 Json = dict[str, Any]
 
 
-def check_environment(arguments: TrainingArguments, display: Display) -> Device:
-    """Check device and loggers, and return the device; warn if faiss can't use the GPU.
+def check_environment(arguments: TrainingArguments, display: Display) -> Fabric:
+    """Check device and loggers, and return the Fabric; warn if faiss can't use the GPU.
 
-    Raises:
-        Misconfigured: `no_gpu`, `logger_missing`.
-        InvalidRequest: as `resolve_device`.
+    Raises what `make_fabric` and `check_loggers` raise.
     """
-    device = resolve_device(arguments)
+    fabric = make_fabric(arguments)
     check_loggers(arguments.logger)
-    if arguments.faiss_gpu and not device.faiss_gpu:
+    if arguments.faiss_gpu and not has_faiss_gpu():
         display.warn(
             "Evaluations search on the CPU, with the same results: faiss can't use a GPU here "
             "(--faiss_gpu False omits this warning)."
         )
-    return device
+    return fabric
 
 
 def list_changed_meanings(arguments: TrainingArguments) -> list[str]:

@@ -20,7 +20,6 @@ from lab.training.data import (
     EvaluationSets,
     select_evaluation_sets,
     select_training_set,
-    summarise_training_set,
 )
 from lab.training.model_factory import make_model, register_own_modules
 from lab.training.resolve import (
@@ -28,15 +27,16 @@ from lab.training.resolve import (
     check_loggers,
     list_changed_meanings,
     make_checkpoints,
+    make_fabric,
     make_loggers,
     resolve_arguments,
-    resolve_device,
 )
 from lab.training.run_control import Display, NullDisplay, RunStopped, StopRequest
 from lab.training.run_folder import (
     CONFIG_FILE,
     METRICS_FILE,
     TrainingHistory,
+    TrainingSetSummary,
     create_run_folder,
     find_run,
     load_resumed_arguments,
@@ -59,7 +59,7 @@ def find_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
     weights are downloaded if possible.
     """
     checks: list[Callable[[], object]] = [
-        lambda: resolve_device(arguments),
+        lambda: make_fabric(arguments),
         lambda: check_loggers(arguments.logger),
         lambda: register_own_modules(arguments),
         lambda: select_evaluation_sets(arguments),
@@ -106,7 +106,7 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     if arguments.experiment_phase == "test":
         return _run_test_phase(arguments, display, stop)
     with _listing_all_obstacles(arguments):
-        device = check_environment(arguments, display)
+        fabric = check_environment(arguments, display)
         training_set, sets = select_training_set(arguments), select_evaluation_sets(arguments)
         arguments = resolve_arguments(arguments, training_set, sets)
         if arguments.show_data_stats:
@@ -118,11 +118,20 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     folder = Path() if arguments.fast_dev_run else create_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
     checkpoints = make_checkpoints(arguments, folder, sets, display)
-    history = TrainingHistory(summarise_training_set(training_set))
+    history = TrainingHistory(
+        training_set=TrainingSetSummary(
+            name=training_set.name,
+            layout=training_set.layout,
+            cities=list(training_set.cities),
+            places=len(training_set.places),
+            photos=training_set.photo_count,
+            fingerprint=training_set.fingerprint,
+        )
+    )
     if not arguments.fast_dev_run:
         save_yaml(arguments, folder / CONFIG_FILE)
     prepared = TrainingRun(
-        arguments, device, training_set, sets.validation, model, folder, history, checkpoints
+        arguments, fabric, training_set, sets.validation, model, folder, history, checkpoints
     )
     with contextlib.nullcontext() if arguments.fast_dev_run else lock_folder(folder):
         return _train(prepared, sets, display, stop)
@@ -159,9 +168,9 @@ def _resume(
             "--model_path CHECKPOINT.",
         )
     register_own_modules(arguments)
-    device = check_environment(arguments, display)
+    fabric = check_environment(arguments, display)
     training_set, history = select_training_set(arguments), TrainingHistory.load(folder)
-    if history.training_set["fingerprint"] != training_set.fingerprint:
+    if history.training_set.fingerprint != training_set.fingerprint:
         raise Conflict(
             "run_differs",
             f"The photos in {arguments.data_root} are not those that the run in {folder} was "
@@ -175,7 +184,7 @@ def _resume(
     ]
     model = make_model(arguments, display, resuming=True)
     prepared = TrainingRun(
-        arguments, device, training_set, sets.validation, model, folder, history, checkpoints
+        arguments, fabric, training_set, sets.validation, model, folder, history, checkpoints
     )
     return _train(prepared, sets, display, stop, resume_from=checkpoint)
 
@@ -187,8 +196,8 @@ def _train(
     stop: StopRequest,
     resume_from: Path | None = None,
 ) -> Json:
-    arguments, device, folder = prepared.arguments, prepared.device, prepared.folder
-    checkpoints = prepared.checkpoints
+    arguments, folder, checkpoints = prepared.arguments, prepared.folder, prepared.checkpoints
+    device = prepared.fabric.device
     validator = Validator(arguments, device, display.progress, stop)
     loop = TrainingLoop(prepared, validator, display, stop)
     try:
@@ -213,7 +222,7 @@ def _train(
         tests: dict[str, RecallEvaluation] = {}
         if arguments.experiment_phase == "all":
             best_path = checkpoints.best_path or checkpoints.last_path
-            best = load_checkpoint(best_path).model.to(device.torch_device)
+            best = load_checkpoint(best_path).model.to(device)
             tests = validator.measure(best, sets.test, for_tests=True)
             write_predictions(folder, tests)
     except RunStopped:
@@ -241,7 +250,7 @@ def _load_tested(arguments: TrainingArguments) -> Checkpoint:
 
 def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
     with _listing_all_obstacles(arguments):
-        device = check_environment(arguments, display)
+        fabric = check_environment(arguments, display)
         checkpoint = _load_tested(arguments)
         if "image_size" not in arguments.model_fields_set:
             trained = checkpoint.config.model_dump(include={"image_size", "interpolation"})
@@ -251,8 +260,8 @@ def _run_test_phase(arguments: TrainingArguments, display: Display, stop: StopRe
         print_data_sets(None, sets, display)
     for note in list_changed_meanings(arguments):
         display.info(note)
-    validator = Validator(arguments, device, display.progress, stop)
-    model = checkpoint.model.to(device.torch_device)
+    validator = Validator(arguments, fabric.device, display.progress, stop)
+    model = checkpoint.model.to(fabric.device)
     tests = validator.measure(model, sets.test, for_tests=True)
     folder = create_run_folder(arguments)
     write_predictions(folder, tests)

@@ -13,15 +13,14 @@ csv/  tensorboard/    output of the loggers
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from filelock import FileLock, Timeout
+from pydantic import BaseModel
 
 from lab.training.arguments import TrainingArguments, build_arguments, load_yaml, to_plain_dict
 from lab.training.checkpointing import format_folder, safe_filename
@@ -116,9 +115,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
             "run_in_use", f"Another process trains in {folder}. Wait for it, or stop it."
         ) from None
     except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't write to {folder}: {error.strerror}."
-        ) from error
+        raise _unwritable_error(folder, error.strerror) from error
     try:
         yield
     finally:
@@ -132,19 +129,15 @@ def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArg
         Conflict: `run_differs`, for a change of an argument not in `RESUMABLE_ARGUMENTS`.
     """
     stored = load_yaml(folder / CONFIG_FILE)
-    before, after = build_arguments(stored), build_arguments(stored, changes)
-    differing = [
-        f"{name} ({getattr(before, name)} -> {getattr(after, name)})"
-        for name in TrainingArguments.model_fields
-        if name not in RESUMABLE_ARGUMENTS and getattr(before, name) != getattr(after, name)
-    ]
+    arguments = build_arguments(stored, changes)
+    differing = _list_differences(to_plain_dict(build_arguments(stored)), arguments)
     if differing:
         raise Conflict(
             "run_differs",
-            f"--resume cannot change {', '.join(differing)}. Start a new run instead "
-            "(--model_path takes the weights of this one).",
+            f"--resume cannot change {differing}. Start a new run instead (--model_path takes the "
+            "weights of this one).",
         )
-    return after
+    return arguments
 
 
 def check_trained_arguments(
@@ -152,24 +145,28 @@ def check_trained_arguments(
 ) -> None:
     """Check that a checkpoint was trained with the arguments of the run that resumes from it.
 
-    `trained` are the arguments that the checkpoint stores. Older releases stored fewer.
+    `trained` are the arguments that the checkpoint stores.
 
     Raises:
         Conflict: `run_differs`, naming each argument that decides the training and differs.
     """
-    plain = to_plain_dict(arguments)
-    differing = [
-        f"{name} ({trained[name]} -> {plain[name]})"
-        for name in plain.keys() & trained.keys() - RESUMABLE_ARGUMENTS
-        if trained[name] != plain[name]
-    ]
+    differing = _list_differences(trained, arguments)
     if differing:
         raise Conflict(
             "run_differs",
-            f"{checkpoint} was trained with other arguments than {CONFIG_FILE} has: "
-            f"{', '.join(sorted(differing))}. Restore {CONFIG_FILE}, or start a new run "
-            "(--model_path takes the weights of the checkpoint).",
+            f"{checkpoint} was trained with other arguments than {CONFIG_FILE} has: {differing}. "
+            f"Restore {CONFIG_FILE}, or start a new run (--model_path takes the weights of the "
+            "checkpoint).",
         )
+
+
+def _list_differences(stored: Mapping[str, Any], arguments: TrainingArguments) -> str:
+    plain = to_plain_dict(arguments)
+    return ", ".join(
+        f"{name} ({value} -> {plain[name]})"
+        for name, value in stored.items()
+        if name not in RESUMABLE_ARGUMENTS and name in plain and value != plain[name]
+    )
 
 
 def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
@@ -178,19 +175,20 @@ def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
     except FileExistsError:
         raise
     except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"Can't create the run's folder {folder}: {error.strerror}."
-        ) from error
+        raise _unwritable_error(folder, error.strerror) from error
     if not os.access(folder, os.W_OK):
-        raise Misconfigured("out_unwritable", f"The run's folder {folder} is not writable.")
+        raise _unwritable_error(folder, "permission denied")
     return folder.resolve()
+
+
+def _unwritable_error(folder: Path, reason: str | None) -> Misconfigured:
+    return Misconfigured("out_unwritable", f"Can't write to {folder}: {reason}.")
 
 
 HISTORY_FILE = "history.json"
 
 
-@dataclass
-class EpochRecord:
+class EpochRecord(BaseModel):
     """Metrics of one validated epoch."""
 
     number: int
@@ -203,17 +201,26 @@ class EpochRecord:
     """metric (SET/R1 ...) -> value from 0 to 1"""
 
 
-@dataclass
-class TrainingHistory:
+class TrainingSetSummary(BaseModel):
+    """The training set of a run; a resumed run compares its fingerprint."""
+
+    name: str
+    layout: str
+    cities: list[str]
+    places: int
+    photos: int
+    fingerprint: str
+
+
+class TrainingHistory(BaseModel):
     """Metrics and counters of a run, saved as `history.json` with each checkpoint."""
 
-    training_set: dict[str, Any]
-    """as `summarise_training_set` returns it"""
-    epochs: list[EpochRecord] = field(default_factory=list)
+    training_set: TrainingSetSummary
+    epochs: list[EpochRecord] = []
     """the validated epochs"""
-    best: list[tuple[float, str]] = field(default_factory=list)
+    best: list[tuple[float, str]] = []
     """score and file name of the best checkpoints, best first"""
-    bad_photos: dict[str, str] = field(default_factory=dict)
+    bad_photos: dict[str, str] = {}
     """path -> why the photo cannot be decoded"""
     images: int = 0
     """number of photos trained on"""
@@ -225,24 +232,19 @@ class TrainingHistory:
     def save(self, folder: Path) -> None:
         """Write `history.json` atomically."""
         partial = folder / f"{HISTORY_FILE}.partial"
-        partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        partial.write_text(self.model_dump_json(indent=1) + "\n")
         partial.replace(folder / HISTORY_FILE)
 
     @classmethod
-    def load(cls, folder: Path) -> TrainingHistory:
+    def load(cls, folder: Path) -> Self:
         """Load `history.json` of a run's folder.
 
         Raises:
             Unprocessable: `run_unreadable`.
         """
         try:
-            stored = json.loads((folder / HISTORY_FILE).read_text())
-            stored["epochs"] = [EpochRecord(**epoch) for epoch in stored["epochs"]]
-            stored["best"] = [(score, name) for score, name in stored["best"]]
-            if "fingerprint" not in stored["training_set"]:
-                raise KeyError("training_set")
-            return cls(**stored)
-        except (OSError, ValueError, TypeError, KeyError) as error:
+            return cls.model_validate_json((folder / HISTORY_FILE).read_text())
+        except (OSError, ValueError) as error:
             raise Unprocessable(
                 "run_unreadable",
                 f"Can't read {folder / HISTORY_FILE}: {error}. Start a new run.",

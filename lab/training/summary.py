@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,12 @@ import lightning
 import pytorch_metric_learning
 import torch
 
-from lab.datasets.dataset import TrainingSet
+from lab.datasets.dataset import EvaluationSet, TrainingSet
 from lab.evaluation.ranking import RecallEvaluation
 from lab.evaluation.results import predictions_path
 from lab.training.arguments import TrainingArguments, to_plain_dict
 from lab.training.checkpointing import TopKCheckpoints
-from lab.training.data import EvaluationSets, summarise_evaluation_set
+from lab.training.data import EvaluationSets
 from lab.training.run_control import Display
 from lab.training.run_folder import CONFIG_FILE, TrainingHistory
 from shared.config.command_line import command_line
@@ -63,7 +62,7 @@ def build_summary(
         "config": str(folder / CONFIG_FILE),
         "arguments": to_plain_dict(arguments),
         "sets": {
-            each.name: summarise_evaluation_set(each) for each in (*sets.validation, *sets.test)
+            each.name: _summarise_evaluation_set(each) for each in (*sets.validation, *sets.test)
         },
         "test": {name: evaluation.recalls.as_json() for name, evaluation in tests.items()},
         "predictions": {name: str(predictions_path(folder, name)) for name in tests},
@@ -82,6 +81,17 @@ def build_summary(
     return report
 
 
+def _summarise_evaluation_set(evaluation_set: EvaluationSet) -> Json:
+    return {
+        "database": len(evaluation_set.database),
+        "queries": len(evaluation_set.queries),
+        "without_positive": len(evaluation_set.without_positives),
+        "rule": evaluation_set.rule,
+        "protocol": evaluation_set.protocol,
+        "fingerprint": evaluation_set.fingerprint,
+    }
+
+
 def _training_summary(
     arguments: TrainingArguments, history: TrainingHistory, checkpoints: TopKCheckpoints
 ) -> Json:
@@ -89,8 +99,8 @@ def _training_summary(
     speed = history.images / history.seconds if history.seconds else None
     waited = history.seconds_waited / history.seconds if history.seconds else None
     return {
-        "training_set": history.training_set,
-        "epochs": [asdict(epoch) for epoch in history.epochs],
+        "training_set": history.training_set.model_dump(),
+        "epochs": [epoch.model_dump() for epoch in history.epochs],
         "monitor": arguments.monitor,
         "best": _checkpoint_details(checkpoints.best_path or checkpoints.last_path, score),
         "checkpoints": [

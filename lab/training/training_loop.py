@@ -35,7 +35,7 @@ from lab.training.data import (
     load_batches,
 )
 from lab.training.losses import batch_accuracy, make_loss, make_miner
-from lab.training.resolve import Device, portable_arguments
+from lab.training.resolve import portable_arguments
 from lab.training.run_control import Display, StopRequest
 from lab.training.run_folder import (
     PREDICTIONS_FOLDER,
@@ -84,7 +84,7 @@ class TrainingRun:
     """Inputs of a training run; a resumed one continues the history and the checkpoints."""
 
     arguments: TrainingArguments
-    device: Device
+    fabric: Fabric
     training_set: TrainingSet
     validation_sets: Sequence[EvaluationSet]
     model: VprModel
@@ -130,11 +130,7 @@ class TrainingLoop:
         )
         self._loss = make_loss(arguments.loss_name)
         self._miner = make_miner(arguments.miner_name, arguments.miner_margin)
-        self._fabric = Fabric(
-            accelerator=run.device.accelerator,
-            devices=run.device.devices,
-            precision=run.device.precision,
-        )
+        self._fabric = run.fabric
         self._precision = self._fabric.strategy.precision
         network: Any = torch.compile(run.model) if arguments.compile else run.model
         optimizer = make_optimizer(run.model.parameters(), arguments)
@@ -153,9 +149,7 @@ class TrainingLoop:
                 run ends before it. Also raises what `load_training_state` raises.
         """
         stored = load_training_state(checkpoint)
-        check_trained_arguments(
-            self._arguments, stored.get("hyper_parameters", {}).get("training", {}), checkpoint
-        )
+        check_trained_arguments(self._arguments, stored["hyper_parameters"]["training"], checkpoint)
         if stored["global_step"] > self._last_step:
             raise Conflict(
                 "run_differs",
@@ -174,11 +168,10 @@ class TrainingLoop:
                 "run_differs", f"{checkpoint} is of another network than the run: {error}"
             ) from error
         self._optimizer.load_state_dict(stored["optimizer_states"][0])
-        self._precision.load_state_dict(stored.get("MixedPrecision", {}))
+        self._precision.load_state_dict(stored["MixedPrecision"])
         self.completed_steps = self._last_saved_step = stored["global_step"]
         self._last_loss = stored["last_loss"]
-        # Runs that Lightning's Trainer began have the state of a callback.
-        restore_rng_state(stored.get("rng_state") or stored["callbacks"]["TrainingCallback"])
+        restore_rng_state(stored["rng_state"])
         history = self._run.history
         history.epochs = [each for each in history.epochs if each.step <= self.completed_steps]
 
@@ -255,11 +248,11 @@ class TrainingLoop:
                 "None of a batch's photos can be decoded: "
                 + "; ".join(p for p, _ in batch.undecodable[:3]),
             )
-        batch = batch.to(self._fabric.device, non_blocking=True)
+        photos, labels = self._fabric.to_device((batch.photos, batch.labels))
         # Losses exponentiate similarities, which overflows in half precision.
-        rows = self._network(batch.photos).float()
-        mined = self._miner(rows, batch.labels) if self._miner is not None else None
-        loss = self._loss(rows, batch.labels, mined)
+        rows = self._network(photos).float()
+        mined = self._miner(rows, labels) if self._miner is not None else None
+        loss = self._loss(rows, labels, mined)
         self._last_loss = float(loss.detach())
         if not torch.isfinite(loss):
             raise Unprocessable(
@@ -300,7 +293,12 @@ class TrainingLoop:
         metrics = flatten_recalls(evaluations)
         self._log(loggers, metrics)
         history.epochs.append(
-            EpochRecord(self._epoch, self.completed_steps, self._last_loss, metrics)
+            EpochRecord(
+                number=self._epoch,
+                step=self.completed_steps,
+                loss=self._last_loss,
+                figures=metrics,
+            )
         )
         is_best = checkpoints.save_if_best(self._save, metrics, self._epoch, self.completed_steps)
         history.best = list(checkpoints.best)

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from lab.datasets.dataset import EvaluationSet
+from lab.evaluation.exact_knn import has_faiss_gpu
 from lab.evaluation.ranking import RecallEvaluation, evaluate_recall
 from lab.evaluation.results import predictions_path
 from lab.training.arguments import TrainingArguments
 from lab.training.model_describer import ModelDescriber
-from lab.training.resolve import Device
 from lab.training.run_control import StopRequest
 from lab.training.run_folder import VALIDATION_KS
 
@@ -31,7 +31,7 @@ class Validator:
     """
 
     arguments: TrainingArguments
-    device: Device
+    device: torch.device
     on_progress: ProgressCallback
     stop: StopRequest
 
@@ -52,7 +52,7 @@ class Validator:
         size = self._test_size() if for_tests else self.arguments.evaluation_size
         describe = ModelDescriber(
             model,
-            self.device.torch_device,
+            self.device,
             size,
             interpolation=self.arguments.interpolation,
             batch_photos=1 if size is None else BATCH_PHOTOS,
@@ -68,7 +68,7 @@ class Validator:
                 describe,
                 each,
                 ks=VALIDATION_KS,
-                faiss_gpu=self.device.faiss_gpu,
+                faiss_gpu=self.arguments.faiss_gpu and has_faiss_gpu(),
                 on_progress=on_progress,
             )
         return evaluations

@@ -19,7 +19,8 @@ from PIL import Image
 from rich.progress import Progress
 
 from lab.city.plan import CityPlan, positions_m
-from lab.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
+from lab.evaluation.exact_knn import exact_knn
+from lab.evaluation.recall import positives_within, recall_at_k
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.utm_filenames import upload_fields_of_file_name
 from shared.word_weights.training_pairs import sample_pairs
@@ -139,7 +140,7 @@ def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[di
     for name, query_rows, database_rows in _add_word_weighted(
         *described, [photo.name for photo in database]
     ):
-        ranked = rank_by_similarity(query_rows, database_rows, max(BASELINE_KS))
+        ranked = exact_knn(query_rows, database_rows, max(BASELINE_KS)).indices
         results.append(
             {
                 "rung": name,

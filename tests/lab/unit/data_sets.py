@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -72,5 +73,9 @@ def names(opened: EvaluationSet) -> tuple[list[str], list[str]]:
     return [s.name for s in opened.database], [s.name for s in opened.queries]
 
 
-def code_of(caught: pytest.ExceptionInfo[PlacewiseError]) -> str:
-    return caught.value.code
+@contextlib.contextmanager
+def refused(code: str, message: str | None = None) -> Iterator[None]:
+    """Expect an error with this code, whose detail matches the pattern `message`."""
+    with pytest.raises(PlacewiseError, match=message) as caught:
+        yield
+    assert caught.value.code == code

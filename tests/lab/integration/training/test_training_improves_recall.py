@@ -15,7 +15,7 @@ from lab.training.arguments import build_arguments
 from lab.training.checkpointing import seed_everything
 from lab.training.model_describer import ModelDescriber
 from lab.training.model_factory import make_model
-from lab.training.resolve import resolve_device
+from lab.training.resolve import make_fabric
 from lab.training.run_control import NullDisplay
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.evaluation.bootstrap import paired_differences
@@ -57,10 +57,10 @@ def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
     seed_everything(arguments.seed)
     untrained = make_model(arguments, NullDisplay(), resuming=False)
     trained = load_checkpoint(Path(report["best"]["path"])).model
-    device, evaluation_set = resolve_device(arguments), open_evaluation_set(places)
+    device, evaluation_set = make_fabric(arguments).device, open_evaluation_set(places)
     found_first = []
     for model in (untrained, trained):
-        describe = ModelDescriber(model.to(device.torch_device), device.torch_device, (SIDE, SIDE))
+        describe = ModelDescriber(model.to(device), device, (SIDE, SIDE))
         ranked = evaluate_recall(describe, evaluation_set, ks=(1,)).ranked.indices
         hits = compute_hits(ranked, evaluation_set.positives)[:, :1]
         found_first.append(hits.astype(np.float64))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -20,11 +21,7 @@ from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
-from shared.errors import (
-    InvalidRequest,
-    PlacewiseError,
-    Unprocessable,
-)
+from shared.errors import Unprocessable
 from shared.extractor_config.configs import get_extractor_config
 from tests.lab.training_runs import (
     CITY,
@@ -34,6 +31,7 @@ from tests.lab.training_runs import (
     train,
     weights,
 )
+from tests.lab.unit.data_sets import refused
 
 Json = dict[str, Any]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -74,35 +72,24 @@ def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Pat
     assert list((folder / "tensorboard").glob("events*"))
 
 
-def test_checkpoint_names_carry_the_figures_of_their_epoch(whole: tuple[Path, Json]) -> None:
+def test_the_best_checkpoints_are_named_by_their_figures_and_the_best_one_is_tested(
+    whole: tuple[Path, Json],
+) -> None:
     folder, report = whole
     monitor = report["monitor"]
     for epoch in report["epochs"]:
-        figure = f"R1[{epoch['figures'][monitor]:.4f}]"
         (found,) = (folder / "checkpoints").glob(f"*epoch({epoch['number']:02d})*.ckpt")
-        assert figure in found.name
-
-
-def test_the_best_checkpoint_is_what_was_tested(whole: tuple[Path, Json]) -> None:
-    _, report = whole
-    best = max(report["epochs"], key=lambda each: each["figures"][report["monitor"]])
+        assert f"R1[{epoch['figures'][monitor]:.4f}]" in found.name
+    best = max(report["epochs"], key=lambda each: each["figures"][monitor])
     assert f"epoch({best['number']:02d})" in report["best"]["path"]
     (name,) = report["test"]
     # Tested at the size of training, on the set that it was validated on: the same figures.
     for k, share in report["test"][name]["recall"].items():
         assert share == best["figures"][f"{name}/R{k}"]
-    assert (
-        load_checkpoint(Path(report["best"]["path"])).fingerprint == report["best"]["fingerprint"]
-    )
-
-
-def test_best_checkpoints_hold_weights_and_the_last_one_everything(
-    whole: tuple[Path, Json],
-) -> None:
-    folder, report = whole
-    best = torch.load(report["best"]["path"], weights_only=True)
+    path = Path(report["best"]["path"])
+    assert load_checkpoint(path).fingerprint == report["best"]["fingerprint"]
+    assert "optimizer_states" not in torch.load(path, weights_only=True)
     last = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
-    assert "optimizer_states" not in best
     assert last["optimizer_states"]
 
 
@@ -230,27 +217,23 @@ def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_pat
     assert list(report["bad_photos"]) == [str(broken)]
     assert report["images"] == 17
     assert any(broken.name in line for line in display.messages)
-    with pytest.raises(Unprocessable, match=broken.name[:20]) as caught:
+    with refused("undecodable_photo", broken.name[:20]):
         train({**fields, "on_bad_image": "error", "run_name": "strict"})
-    assert caught.value.code == "undecodable_photo"
 
 
 def test_a_checkpoint_alone_is_tested(
     whole: tuple[Path, Json], places: Path, tmp_path: Path
 ) -> None:
     _, trained = whole
-    fields = {
-        **run_arguments(
-            places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]
-        ),
-    }
+    best = trained["best"]["path"]
+    fields = run_arguments(places, tmp_path, experiment_phase="test", model_path=best)
     del fields["image_size"]  # the checkpoint knows it
     report = train(fields)
     assert report["test"] == trained["test"]
     assert all(Path(file).is_file() for file in report["predictions"].values())
     native = train({**fields, "test_image_size": "native", "run_name": "native"})
     assert native["test"].keys() == trained["test"].keys()
-    with pytest.raises(InvalidRequest, match="--model_path"):
+    with refused("model_path_missing", "--model_path"):
         train({**fields, "model_path": "", "run_name": "none"})
 
 
@@ -262,13 +245,10 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("others", "code", "expected"),
     [
-        ({"data_root": None}, "data_root_missing", "--data-root DIR"),
         ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
         ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
         ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),
         ({"agg_arch": "mean"}, "unknown_aggregator", "CosPlace"),
-        ({"loss_name": "TripleLoss"}, "unknown_loss", "TripletMarginLoss"),
-        ({"miner_name": "BestMiner"}, "unknown_miner", "BatchHardMiner"),
         ({"monitor": "other/R1"}, "unknown_metric", "known: "),
         ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
         ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "(--weights)"),
@@ -277,10 +257,8 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 def test_what_is_not_there_is_named_with_what_is_known(
     others: Json, code: str, expected: str, places: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(PlacewiseError) as caught:
+    with refused(code, re.escape(expected)):
         train(run_arguments(places, tmp_path, **others))
-    assert caught.value.code == code
-    assert expected in caught.value.detail
 
 
 def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Sets to measure on, in each layout that is known."""
+"""Evaluation sets in each known layout."""
 
 from __future__ import annotations
 
@@ -12,42 +12,55 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD
 from scipy.io import savemat
 
+from lab.datasets.ground_truth_files import write_ground_truth
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
-from shared.errors import InvalidRequest, NotFound
 from tests.lab.unit.data_sets import (
-    code_of,
     names,
     pair,
+    refused,
     rows,
+    save_lists,
+    save_names,
     utm_name,
     write_csv,
     write_photo,
     write_photos,
 )
 
+HEADER = "path,latitude,longitude,heading,place,frame,sequence"
 
-def test_pair_of_folders_is_a_set_named_after_its_folder(tmp_path: Path) -> None:
-    pair(tmp_path / "My-City", [0, 25, 100], [0, 50, 500])
-    opened = open_evaluation_set(tmp_path / "My-City")
-    assert (opened.name, opened.rule, opened.protocol) == ("mycity", "radius 25 m", "placewise")
+
+def test_pair_of_folders_is_a_set_named_after_its_folder_in_the_order_of_names(
+    tmp_path: Path,
+) -> None:
+    base = tmp_path / "My@City-2024@x"
+    pair(base, [100, 25, 0], [500, 0, 50])
+    opened = open_evaluation_set(base)
+    assert (opened.name, opened.rule, opened.protocol) == (
+        "mycity2024x", "radius 25 m", "placewise",
+    )  # fmt: skip
     assert rows(opened) == [[0, 1], [1], []]
     assert opened.without_positives.tolist() == [2]
-    assert opened.database[1].name == f"database/{utm_name(480_025, 4_880_000)}"
+    assert names(opened)[0] == [
+        f"database/{utm_name(480_000 + m, 4_880_000)}" for m in (0, 25, 100)
+    ]
+    assert rows(open_evaluation_set(base, rule="radius 100"))[0] == [0, 1, 2]
+    with refused("unknown_rule"):
+        open_evaluation_set(base, rule="closeness")
 
 
-def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Path) -> None:
-    pair(tmp_path / "SF_XS" / "val", [0], [0])
-    pair(tmp_path / "SF_XS" / "test", [0], [0])
-    pair(tmp_path / "tokyo_xs" / "images" / "test", [0], [10])
-    assert evaluation_set_names(tmp_path) == ("sfxs_test", "sfxs_val", "tokyoxs_test")
+def test_splits_and_several_data_sets_have_names_of_their_own(tmp_path: Path) -> None:
+    for folder in ("SF_XS/val", "SF_XS/test", "sf-xs/val", "tokyo_xs/images/test"):
+        pair(tmp_path / folder, [0], [10])
+    assert evaluation_set_names(tmp_path) == (
+        "sfxs_test", "sfxs_val", "sfxs_val_2", "tokyoxs_test",
+    )  # fmt: skip
     assert evaluation_set_names(tmp_path / "SF_XS") == ("sfxs_test", "sfxs_val")
     assert len(open_evaluation_set(tmp_path, "tokyoxs_test").queries) == 1
-    with pytest.raises(InvalidRequest, match="sfxs_test, sfxs_val, tokyoxs_test") as caught:
+    with refused("which_set", "sfxs_test, sfxs_val"):
         open_evaluation_set(tmp_path)
-    assert code_of(caught) == "which_set"
-    with pytest.raises(NotFound, match="Available: sfxs_test, sfxs_val") as missing:
+    with refused("set_missing", "Available: sfxs_test, sfxs_val"):
         open_evaluation_set(tmp_path / "SF_XS", "sfxs_tset")
-    assert code_of(missing) == "set_missing"
 
 
 def test_query_sets_of_sf_xl_share_a_database(tmp_path: Path) -> None:
@@ -62,25 +75,6 @@ def test_query_sets_of_sf_xl_share_a_database(tmp_path: Path) -> None:
     assert second.queries[0].name.startswith("test/queries_v2/")
 
 
-def test_data_sets_of_one_name_are_distinguished(tmp_path: Path) -> None:
-    pair(tmp_path / "my-city", [0], [0])
-    pair(tmp_path / "my_city", [0, 1], [0])
-    assert evaluation_set_names(tmp_path) == ("mycity", "mycity_2")
-    assert len(open_evaluation_set(tmp_path, "mycity_2").database) == 2
-
-
-def test_at_sign_in_a_folders_name_means_nothing(tmp_path: Path) -> None:
-    pair(tmp_path / "me@home@2024@x", [0, 100], [90])
-    assert rows(open_evaluation_set(tmp_path / "me@home@2024@x")) == [[1]]
-
-
-def test_order_is_that_of_the_names_whatever_the_disk_says(tmp_path: Path) -> None:
-    pair(tmp_path, [300, 100, 200], [0])
-    opened = open_evaluation_set(tmp_path)
-    assert names(opened)[0] == sorted(names(opened)[0])
-    assert [shot.easting for shot in opened.database] == [480_100, 480_200, 480_300]
-
-
 def test_list_beside_a_folder_is_the_set_in_its_order(tmp_path: Path) -> None:
     pair(tmp_path, [0, 100, 200], [200])
     listed = [f"database/{utm_name(480_000 + m, 4_880_000)}" for m in (200, 0)]
@@ -89,20 +83,18 @@ def test_list_beside_a_folder_is_the_set_in_its_order(tmp_path: Path) -> None:
     assert names(opened)[0] == listed
     assert rows(opened) == [[0]]
     (tmp_path / "database_images_paths.txt").write_text("elsewhere.jpg\n")
-    with pytest.raises(InvalidRequest) as caught:
+    with refused("bad_list"):
         open_evaluation_set(tmp_path)
-    assert code_of(caught) == "bad_list"
 
 
-def test_vme_compares_metres_of_different_zones_as_it_always_did(tmp_path: Path) -> None:
+def test_vme_compares_metres_of_different_zones(tmp_path: Path) -> None:
     east = utm_name(480_000, 4_880_000).replace("@32@", "@33@")
     write_photos(tmp_path / "database", [east])
     write_photos(tmp_path / "queries", [utm_name(480_000, 4_880_000)])
     assert rows(open_evaluation_set(tmp_path)) == [[]]
     assert rows(open_evaluation_set(tmp_path, protocol="vme")) == [[0]]
-    with pytest.raises(InvalidRequest, match="placewise, vme") as caught:
+    with refused("unknown_protocol", "placewise, vme"):
         open_evaluation_set(tmp_path, protocol="msls-official")
-    assert code_of(caught) == "unknown_protocol"
 
 
 def gps_photo(path: Path, latitude: float, longitude: float) -> None:
@@ -120,7 +112,7 @@ def gps_photo(path: Path, latitude: float, longitude: float) -> None:
     Image.new("RGB", (8, 6)).save(path, exif=exif)
 
 
-def test_photos_of_a_camera_are_placed_by_their_exif(tmp_path: Path) -> None:
+def test_photos_of_a_camera_have_the_position_of_their_exif(tmp_path: Path) -> None:
     gps_photo(tmp_path / "database" / "IMG_1.jpg", 44.07, 8.76)
     gps_photo(tmp_path / "database" / "IMG_2.jpg", 44.0702, 8.76)
     gps_photo(tmp_path / "queries" / "IMG_3.jpg", 44.0703, 8.76)
@@ -129,7 +121,7 @@ def test_photos_of_a_camera_are_placed_by_their_exif(tmp_path: Path) -> None:
     assert opened.database[0].zone == "32T"
 
 
-def test_folders_of_places_are_labels_where_nobody_knows_positions(tmp_path: Path) -> None:
+def test_folders_of_places_are_labels_if_no_photo_has_a_position(tmp_path: Path) -> None:
     write_photos(tmp_path / "database", ["hall/1.jpg", "door/2.jpg", "hall/3.jpg"])
     write_photos(tmp_path / "queries", ["hall/9.jpg"])
     opened = open_evaluation_set(tmp_path)
@@ -137,25 +129,27 @@ def test_folders_of_places_are_labels_where_nobody_knows_positions(tmp_path: Pat
     assert rows(opened) == [[1, 2]]
 
 
-def test_photos_without_position_or_place_are_an_error_that_says_what_helps(
+def test_empty_folders_and_photos_without_positions_are_errors_that_name_a_table(
     tmp_path: Path,
 ) -> None:
-    write_photos(tmp_path / "database", ["1.jpg"])
-    write_photos(tmp_path / "queries", ["2.jpg"])
-    with pytest.raises(InvalidRequest, match="CSV or EXIF") as caught:
+    with refused("no_evaluation_set", HEADER):
         open_evaluation_set(tmp_path)
-    assert code_of(caught) == "no_positions"
+    for role, stems in (("database", "ac"), ("queries", "b")):
+        (tmp_path / role).mkdir()
+        if role == "queries":
+            with refused("empty_set", "no query"):
+                open_evaluation_set(tmp_path)
+        write_photos(tmp_path / role, [f"{stem}.jpg" for stem in stems])
+    for rule, code in (
+        (None, "no_positions"),
+        ("frames 2", "no_frames"),
+        ("heading", "no_headings"),
+    ):
+        with refused(code, HEADER):
+            open_evaluation_set(tmp_path, rule=rule)
 
 
-def test_the_given_rule_is_used(tmp_path: Path) -> None:
-    pair(tmp_path, [0, 30, 100], [0])
-    assert rows(open_evaluation_set(tmp_path, rule="radius 100")) == [[0, 1, 2]]
-    with pytest.raises(InvalidRequest) as caught:
-        open_evaluation_set(tmp_path, rule="closeness")
-    assert code_of(caught) == "unknown_rule"
-
-
-def test_dbstruct_of_matlab_brings_names_metres_and_its_radius(tmp_path: Path) -> None:
+def test_dbstruct_of_matlab_has_names_metres_and_its_radius(tmp_path: Path) -> None:
     def cells(texts: list[str]) -> Any:
         column = np.empty((len(texts), 1), object)
         column[:, 0] = texts
@@ -176,20 +170,19 @@ def test_dbstruct_of_matlab_brings_names_metres_and_its_radius(tmp_path: Path) -
     savemat(tmp_path / "pitts30k_test.mat", {"dbStruct": struct})
     opened = open_evaluation_set(tmp_path, "pitts30k_test")
     assert (rows(opened), opened.rule) == ([[0]], "radius 15 m")
-    assert all(shot.path.is_file() for shot in (*opened.database, *opened.queries))
+    assert all(photo.path.is_file() for photo in (*opened.database, *opened.queries))
     savemat(tmp_path / "pitts30k_test.mat", {"other": struct})
-    with pytest.raises(InvalidRequest, match="no dbStruct") as caught:
+    with refused("bad_dbstruct", "no dbStruct"):
         open_evaluation_set(tmp_path, "pitts30k_test")
-    assert code_of(caught) == "bad_dbstruct"
 
 
-def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path) -> None:
+def test_csv_tables_have_positions_in_degrees_or_metres_across_zones(tmp_path: Path) -> None:
     write_photo(tmp_path / "a.jpg")
-    header = ("path", "latitude", "longitude", "heading", "place", "frame", "sequence", "weather")
+    header = (*HEADER.split(","), "weather")
     write_csv(
         tmp_path / "database.csv",
         header,
-        [("a.jpg", 48, 11.9999, 370, "x", 3, "s", "rain"), ("b.jpg", 48, 12.1, "", "", "", "", "")],
+        [("a.jpg", 48, 11.9999, 370, "x", "3.0", "s", "rain"), ("b.jpg", 48, 12.1, *[""] * 5)],
     )
     metres = utm.from_latlon(48, 12.0001)
     write_csv(
@@ -202,13 +195,12 @@ def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path)
     first = opened.database[0]
     assert (first.heading, first.place, first.frame, first.sequence) == (10, "x", 3, "s")
     assert first.zone == "32U"
-    with pytest.raises(InvalidRequest, match="1 photos have no frame"):
+    with refused("no_frames", "1 photos have no frame"):
         open_evaluation_set(tmp_path, rule="frames 2")
 
 
 def test_photos_of_csv_tables_may_be_in_folders_of_the_same_names(tmp_path: Path) -> None:
     for role, name in (("database", "a.jpg"), ("queries", "q.jpg")):
-        (tmp_path / role).mkdir()
         write_photo(tmp_path / role / name)
         write_csv(tmp_path / f"{role}.csv", ("filename", "place"), [(name, "x")])
     opened = open_evaluation_set(tmp_path)
@@ -221,6 +213,7 @@ def test_photos_of_csv_tables_may_be_in_folders_of_the_same_names(tmp_path: Path
     [
         (("name", "latitude"), ("a.jpg", 1), "missing_column"),
         (("path", "latitude", "longitude"), ("a.jpg", "north", 8), "bad_table"),
+        (("path", "latitude", "longitude"), ("a.jpg", "nan", 8), "bad_table"),
         (("path", "latitude", "longitude"), ("a.jpg", 44, ""), "bad_table"),
         (("path", "latitude", "longitude"), ("a.jpg", 86, 8), "bad_coordinates"),
         (("path", "latitude", "longitude"), ("", 44, 8), "bad_table"),
@@ -229,14 +222,13 @@ def test_photos_of_csv_tables_may_be_in_folders_of_the_same_names(tmp_path: Path
         (("path",), ("@x@y@.jpg",), "bad_coordinates"),
     ],
 )
-def test_tables_that_can_not_be_understood_are_refused(
+def test_invalid_tables_are_refused(
     tmp_path: Path, header: tuple[str, ...], row: tuple[object, ...], code: str
 ) -> None:
     write_csv(tmp_path / "database.csv", header, [row])
     write_csv(tmp_path / "queries.csv", ("path", "lat", "lon"), [("q.jpg", 44, 8)])
-    with pytest.raises(InvalidRequest) as caught:
+    with refused(code, "line 2" if code == "bad_table" else None):
         open_evaluation_set(tmp_path)
-    assert code_of(caught) == code
 
 
 def test_fingerprint_is_of_names_sizes_positives_and_protocol(tmp_path: Path) -> None:
@@ -256,12 +248,191 @@ def test_fingerprint_is_of_names_sizes_positives_and_protocol(tmp_path: Path) ->
     assert open_evaluation_set(tmp_path / "d").fingerprint == base
 
 
-def test_folder_of_nothing_and_empty_folders_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(NotFound) as caught:
-        open_evaluation_set(tmp_path)
-    assert code_of(caught) == "no_evaluation_set"
-    (tmp_path / "database").mkdir()
-    (tmp_path / "queries").mkdir()
-    with pytest.raises(InvalidRequest, match="no database photo") as empty:
-        open_evaluation_set(tmp_path)
-    assert code_of(empty) == "empty_set"
+def npy_set(base: Path, end: str = "_gtImages") -> tuple[list[str], list[str]]:
+    """Lists in another order than the names', and a ground truth that is no rule's."""
+    pair(base / "val", [0, 100, 200], [0, 100])
+    database = [f"val/database/{utm_name(480_000 + m, 4_880_000)}" for m in (200, 0, 100)]
+    queries = [f"val/queries/{utm_name(480_000 + m, 4_880_000)}" for m in (100, 0)]
+    save_names(base / "sfxs_val_dbImages.npy", database)
+    save_names(base / "sfxs_val_qImages.npy", queries)
+    save_lists(base / f"sfxs_val{end}.npy", [[2, 0], []])
+    return database, queries
+
+
+@pytest.mark.parametrize("end", ["_gtImages", "_gt", "_gt_25m"])
+def test_npy_lists_keep_their_order_and_their_ground_truth(tmp_path: Path, end: str) -> None:
+    database, queries = npy_set(tmp_path / "SF_XS", end)
+    opened = open_evaluation_set(tmp_path / "SF_XS", "sfxs_val")
+    assert names(opened) == (database, queries)
+    assert rows(opened) == [[0, 2], []]
+    assert opened.rule == f"given by sfxs_val{end}.npy"
+    assert all(photo.path.is_file() for photo in (*opened.database, *opened.queries))
+    assert rows(open_evaluation_set(tmp_path / "SF_XS", rule="radius")) == [[2], [1]]
+
+
+def test_a_ground_truth_belongs_to_its_lists_and_without_one_names_have_positions(
+    tmp_path: Path,
+) -> None:
+    database, queries = npy_set(tmp_path)
+    truth = tmp_path / "sfxs_val_gtImages.npy"
+    truth.unlink()
+    opened = open_evaluation_set(tmp_path, "sfxs_val")
+    assert (rows(opened), opened.rule) == ([[2], [1]], "radius 25 m")
+    positives = [np.array([0]), np.array([1])]
+    write_ground_truth(truth, positives, database=database, queries=queries, rule="frames 2")
+    opened = open_evaluation_set(tmp_path, "sfxs_val")
+    assert (rows(opened), opened.rule) == ([[0], [1]], "frames 2")
+    save_names(tmp_path / "sfxs_val_dbImages.npy", sorted(database))
+    with refused("ground_truth_of_other_lists"):
+        open_evaluation_set(tmp_path, "sfxs_val")
+    (tmp_path / "sfxs_val_qImages.npy").unlink()
+    with refused("bad_list", r"sfxs_val_qImages\.npy"):
+        open_evaluation_set(tmp_path, "sfxs_val")
+
+
+def test_lists_may_lie_apart_from_their_photos(tmp_path: Path) -> None:
+    database, _ = npy_set(tmp_path / "lists")
+    (tmp_path / "lists" / "val").rename(tmp_path / "val")
+    opened = open_evaluation_set(tmp_path / "lists")
+    assert opened.database[0].path == tmp_path / database[0] == opened.database[0].path.resolve()
+
+
+def test_sped_has_a_table_of_integers_and_msls_a_selection_of_queries(tmp_path: Path) -> None:
+    write_photos(tmp_path, ["ref/0.jpg", "ref/1.jpg", "query/0.jpg", "query/1.jpg"])
+    for name in ("SPED", "msls_val"):
+        save_names(tmp_path / f"{name}_dbImages.npy", ["ref/0.jpg", "ref/1.jpg"])
+        save_names(tmp_path / f"{name}_qImages.npy", ["query/0.jpg", "query/1.jpg"])
+    np.save(tmp_path / "SPED_gt.npy", np.array([[1, -1], [0, 1]]))
+    np.save(tmp_path / "msls_val_qIdx.npy", np.array([1]))
+    save_lists(tmp_path / "msls_val_pIdx.npy", [[0]])
+    assert rows(open_evaluation_set(tmp_path, "SPED")) == [[1], [0, 1]]
+    msls = open_evaluation_set(tmp_path, "msls_val")
+    assert (names(msls)[1], rows(msls)) == (["query/1.jpg"], [[0]])
+
+
+def write_bench(base: Path, truth: list[tuple[Any, Any]]) -> Path:
+    """Eleven reference photos and three queries of VPR-Bench."""
+    write_photos(base / "ref", [f"{number}.jpg" for number in range(11)])
+    write_photos(base / "query", [f"{number:07d}.jpg" for number in range(3)])
+    table = np.empty((len(truth), 2), object)
+    for row, (query, positives) in enumerate(truth):
+        table[row, 0], table[row, 1] = query, positives
+    np.save(base / "ground_truth_new.npy", table, allow_pickle=True)
+    return base
+
+
+def test_photos_of_vpr_bench_are_in_numeric_order_and_rows_belong_to_their_query(
+    tmp_path: Path,
+) -> None:
+    bench = write_bench(tmp_path / "Corridor", [(2, [10, 9]), (0, np.array([2, 3]))])
+    assert evaluation_set_names(tmp_path) == ("corridor",)
+    opened = open_evaluation_set(bench)
+    assert names(opened)[0] == [f"ref/{number}.jpg" for number in range(11)]
+    assert names(opened)[1] == [f"query/{number:07d}.jpg" for number in range(3)]
+    assert rows(opened) == [[2, 3], [], [9, 10]]
+    assert opened.rule == "given by ground_truth_new.npy"
+    assert rows(open_evaluation_set(bench, rule="frames 1")) == [[0, 1], [0, 1, 2], [1, 2, 3]]
+
+
+def test_numbered_frames_in_folders_need_no_table(tmp_path: Path) -> None:
+    write_photos(tmp_path / "database", [f"frame_{number:04d}.jpg" for number in (5, 6, 20)])
+    write_photos(tmp_path / "queries", ["img-7.jpg"])
+    assert rows(open_evaluation_set(tmp_path, rule="frames 2")) == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("truth", "code"),
+    [
+        ([(3, [0])], "ground_truth_of_other_lists"),
+        ([(0, [11])], "ground_truth_of_other_lists"),
+        ([(0, [-1])], "bad_ground_truth"),
+        ([("first", [1])], "bad_ground_truth"),
+        ([([0, 1], [1])], "bad_ground_truth"),
+    ],
+)
+def test_a_vpr_bench_ground_truth_of_other_photos_is_refused(
+    truth: list[tuple[Any, Any]], code: str, tmp_path: Path
+) -> None:
+    with refused(code):
+        open_evaluation_set(write_bench(tmp_path, truth))
+
+
+def msls_city(folder: Path, photos: list[dict[str, Any]]) -> None:
+    """The four tables as Mapillary writes them; `m` is metres east of the city's corner."""
+
+    def write(name: str, header: tuple[str, ...], cells: Any) -> None:
+        table = [(number, *cells(photo)) for number, photo in enumerate(photos)]
+        write_csv(folder / name, ("", *header), table)
+
+    def degrees(photo: dict[str, Any]) -> tuple[float, float]:
+        latitude, longitude = utm.to_latlon(350_000 + photo["m"], 6_170_000, 33, "U")
+        return float(longitude), float(latitude)
+
+    write(
+        "raw.csv",
+        ("key", "lon", "lat", "ca", "captured_at", "pano"),
+        lambda p: (p["key"], *degrees(p), 370.0, "2019-01-01", p.get("pano", False)),
+    )
+    # Metres as if the city lay 7 m further east: only the official protocol uses them.
+    write(
+        "postprocessed.csv",
+        ("key", "easting", "northing", "night", "view_direction"),
+        lambda p: (p["key"], 350_007.0 + p.get("official", p["m"]), 6_170_000.0, False, "Forward"),
+    )
+    write("seq_info.csv", ("key", "sequence_key", "frame_number"), lambda p: (p["key"], "s1", 4))
+    write("subtask_index.csv", ("all", "s2w"), lambda p: (p.get("all", True), False))
+    write_photos(folder / "images", [f"{photo['key']}.jpg" for photo in photos])
+
+
+@pytest.fixture
+def msls(tmp_path: Path) -> Path:
+    queries: dict[str, list[dict[str, Any]]] = {
+        "cph": [
+            {"key": "q0", "m": 0},
+            {"key": "q1", "m": 30, "official": 20},
+            {"key": "pano", "m": 0, "pano": True},
+            {"key": "notask", "m": 0, "all": False},
+            {"key": "far", "m": 900},
+        ],
+        "sf": [{"key": "q5", "m": 5000}],
+    }
+    for city, start in (("cph", 0), ("sf", 5000)):
+        database: list[dict[str, Any]] = [
+            {"key": f"{city}0", "m": start},
+            {"key": f"{city}1", "m": start + 100},
+            {"key": f"{city}pano", "m": start, "pano": True},
+        ]
+        msls_city(tmp_path / "train_val" / city / "database", database)
+        msls_city(tmp_path / "train_val" / city / "query", queries[city])
+    return tmp_path
+
+
+def test_msls_official_drops_panoramas_other_tasks_and_queries_without_positives(
+    msls: Path,
+) -> None:
+    opened = open_evaluation_set(msls)
+    assert (opened.name, opened.protocol) == ("msls_val", "msls-official")
+    stems = [[photo.path.stem for photo in each] for each in (opened.database, opened.queries)]
+    assert stems == [["cph0", "cph1", "sf0", "sf1"], ["q0", "q1", "q5"]]
+    assert rows(opened) == [[0], [0], [2]]
+    query = opened.queries[0]
+    assert (query.heading, query.sequence, query.frame) == (10.0, "s1", 4)
+    assert query.path.is_file()
+    assert names(opened)[1][0] == "train_val/cph/query/images/q0.jpg"
+
+
+def test_msls_vme_keeps_all_queries_and_measures_by_latitude_and_longitude(msls: Path) -> None:
+    opened = open_evaluation_set(msls / "train_val", protocol="vme")
+    assert [photo.path.stem for photo in opened.queries] == ["q0", "q1", "notask", "far", "q5"]
+    assert rows(opened) == [[0], [], [0], [], [2]]
+    assert open_evaluation_set(msls / "train_val").fingerprint != opened.fingerprint
+
+
+def test_msls_of_one_city_or_of_mixed_versions_is_refused(msls: Path) -> None:
+    cut = msls / "train_val" / "cph" / "query" / "subtask_index.csv"
+    cut.write_text("\n".join(cut.read_text().splitlines()[:-1]))
+    with refused("bad_table", "different versions"):
+        open_evaluation_set(msls)
+    (msls / "train_val" / "sf").rename(msls / "train_val" / "amman")
+    with refused("city_missing", r"no city sf\. Available: amman, cph"):
+        open_evaluation_set(msls)

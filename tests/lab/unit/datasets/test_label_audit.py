@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from lab.datasets.check import SuspectLabel, find_suspect_labels
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import find_positives, parse_rule
-from shared.errors import InvalidRequest
+from tests.lab.unit.data_sets import refused
 
 
 def at(
@@ -72,6 +71,5 @@ def test_frames_just_outside_the_rule_are_suspects() -> None:
 
 
 def test_predictions_of_other_queries_are_refused() -> None:
-    with pytest.raises(InvalidRequest) as caught:
+    with refused("predictions_of_other_queries"):
         find_suspect_labels(evaluation("radius", DATABASE, [at(0, "q")]), np.array([[0], [1]]))
-    assert caught.value.code == "predictions_of_other_queries"

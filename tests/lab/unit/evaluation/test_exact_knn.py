@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import faiss
 import numpy as np
 import pytest
 
-from lab.evaluation.exact_knn import exact_knn
-from shared.errors import Misconfigured
+from lab.evaluation.exact_knn import exact_knn, has_faiss_gpu
+from tests.lab.unit.data_sets import refused
 
 pytestmark = pytest.mark.numerics
 
@@ -75,8 +74,7 @@ def test_progress_ends_at_the_announced_total() -> None:
     assert [done for done, _ in reported] == sorted(done for done, _ in reported)
 
 
-def test_gpu_that_faiss_does_not_have_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faiss, "get_num_gpus", lambda: 0)
-    with pytest.raises(Misconfigured, match="Omit --faiss-gpu") as refused:
+@pytest.mark.skipif(has_faiss_gpu(), reason="faiss has a GPU here")
+def test_gpu_that_faiss_does_not_have_is_a_named_error() -> None:
+    with refused("faiss_gpu_missing", "Omit --faiss-gpu"):
         exact_knn(unit_rows(2, 4, 8), unit_rows(2, 4, 9), 1, faiss_gpu=True)
-    assert refused.value.code == "faiss_gpu_missing"

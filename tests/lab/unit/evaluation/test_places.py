@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -84,12 +85,11 @@ def test_clear_queries_are_answered_and_those_outside_the_map_are_not(
 
 
 def test_the_model_is_fitted_on_a_sample_of_a_large_database(
-    building: tuple[EvaluationSet, Rows, Rows], monkeypatch: pytest.MonkeyPatch
+    building: tuple[EvaluationSet, Rows, Rows],
 ) -> None:
     evaluation_set, database, queries = building
-    monkeypatch.setattr("lab.evaluation.places.SAMPLED_PHOTOS", 30)
     ranked = exact_knn(queries, database, 50)
-    places = measure_places(evaluation_set, database, ranked, PATHS, 25.0)
+    places = measure_places(evaluation_set, database, ranked, PATHS, 25.0, sampled_photos=30)
     assert places is not None
     assert places["own_photos"] == 30
 
@@ -102,8 +102,6 @@ def test_a_set_without_known_locations_has_no_levels(
         tuple(DatasetPhoto(photo.path, photo.name) for photo in photos)
         for photos in (made.database, made.queries)
     ]
-    evaluation_set = EvaluationSet(
-        made.name, made.root, unknown[0], unknown[1], made.positives, made.rule, made.protocol
-    )
+    evaluation_set = replace(made, database=unknown[0], queries=unknown[1])
     ranked = exact_knn(queries, database, 50)
     assert measure_places(evaluation_set, database, ranked, PATHS, 25.0) is None

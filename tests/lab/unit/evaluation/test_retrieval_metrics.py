@@ -13,7 +13,7 @@ import pytest
 from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import compute_recalls
-from lab.evaluation.recall import compute_hits
+from lab.evaluation.recall import compute_hits, recall_at_k
 from lab.evaluation.retrieval_metrics import (
     average_precisions,
     calibrate_scores,
@@ -48,6 +48,9 @@ def test_recall_is_reported_with_and_without_queries_that_have_no_positive() -> 
     assert found.recall_all == {1: 1 / 4, 3: 2 / 4}
     assert found.recall_findable == {1: 1 / 3, 3: 2 / 3}
     assert (found.queries, found.without_positive) == (4, 1)
+    assert math.isnan(recall_at_k(np.empty((0, 5), np.int64), [], (1,))[1]), "no query"
+    with pytest.raises(ValueError, match="2 rankings for 1 queries"):
+        recall_at_k(np.array([[0], [1]]), indices([0]))
 
 
 def test_hits_stand_where_the_right_photos_are_ranked() -> None:
@@ -73,10 +76,7 @@ def test_precision_and_recall_go_by_the_score_and_equal_scores_are_believed_toge
     assert curve.precision.tolist() == pytest.approx([1, 2 / 3, 2 / 4, 3 / 5])
     assert curve.recall.tolist() == [1 / 4, 2 / 4, 2 / 4, 3 / 4]
     assert curve.area == pytest.approx(1 / 4 * 1 + 1 / 4 * 2 / 3 + 0 + 1 / 4 * 3 / 5)
-
-
-def test_there_is_no_curve_where_nothing_could_be_found() -> None:
-    assert precision_recall(np.array([0.5]), np.array([False]), queries_with_positive=0) is None
+    assert precision_recall(scores, right, queries_with_positive=0) is None
 
 
 def test_distance_error_counts_queries_whose_first_match_lies_within_x_metres() -> None:
@@ -114,7 +114,7 @@ def test_queries_cluster_by_sequence_then_place_then_square() -> None:
     assert cluster_queries(lost).kind == "queries"
 
 
-def test_squares_by_degrees_equal_squares_by_metres() -> None:
+def test_squares_by_degrees_separate_as_squares_by_metres() -> None:
     degrees = [shot(None, latitude=60.0, longitude=10 + n * 0.01) for n in range(MIN_CLUSTERS)]
     assert cluster_queries(degrees).count == MIN_CLUSTERS
     beside = [*degrees, shot(None, latitude=60.0, longitude=10.0)]
@@ -128,6 +128,7 @@ def test_interval_is_that_of_the_binomial_where_queries_are_independent() -> Non
     # 0.25 +- 1.96 * sqrt(0.25 * 0.75 / 400)
     assert found[0].low == pytest.approx(0.2076, abs=0.006)
     assert found[0].high == pytest.approx(0.2924, abs=0.006)
+    assert bootstrap_intervals(values, np.arange(400) % (MIN_CLUSTERS - 1)) is None
 
 
 def test_copies_of_queries_in_their_clusters_make_no_interval_narrower() -> None:
@@ -137,10 +138,6 @@ def test_copies_of_queries_in_their_clusters_make_no_interval_narrower() -> None
     assert once is not None
     assert copied is not None
     assert copied[0].as_json() == pytest.approx(once[0].as_json())
-
-
-def test_there_is_no_interval_from_a_handful_of_clusters() -> None:
-    assert bootstrap_intervals(np.ones((100, 1)), np.arange(100) % (MIN_CLUSTERS - 1)) is None
 
 
 def test_runs_are_compared_query_by_query() -> None:
@@ -159,9 +156,6 @@ def test_runs_are_compared_query_by_query() -> None:
     assert own[0].low < second.mean(), "the unpaired interval can't tell them apart"
     (same,) = paired_differences(second, second, np.arange(200))
     assert (same.mean, same.low, same.high, same.is_significant) == (0, 0, 0, False)
-
-
-def test_runs_on_other_queries_are_not_compared() -> None:
     with pytest.raises(ValueError, match="different shape"):
         paired_differences(np.ones((3, 1)), np.ones((4, 1)), np.arange(3))
 
@@ -180,20 +174,12 @@ def test_score_that_separates_right_from_wrong_is_calibrated_and_ranks_them() ->
     assert 0 < found.recall_at_99_precision < right.mean()
 
 
-def test_score_that_says_nothing_is_found_out() -> None:
+def test_score_without_information_or_too_few_queries_is_reported_as_such() -> None:
     random = np.random.default_rng(1)
-    right = random.uniform(0, 1, 2000) < 0.5
-    found = calibrate_scores(
-        random.uniform(0, 1, 2000),
-        right,
-        queries_with_positive=2000,
-        clusters=singleton_clusters(2000),
-    )
+    right, scores = random.uniform(0, 1, 2000) < 0.5, random.uniform(0, 1, 2000)
+    found = calibrate_scores(scores, right, 2000, singleton_clusters(2000))
     assert found.auroc == pytest.approx(0.5, abs=0.05)
     assert found.recall_at_99_precision < 0.02
-
-
-def test_calibration_error_is_unknown_where_there_is_too_little_to_learn_from() -> None:
     found = calibrate_scores(np.linspace(0, 1, 10), np.ones(10, bool), 10, singleton_clusters(10))
     assert (found.auroc, found.calibration_error, found.recall_at_99_precision) == (None, None, 1.0)
 

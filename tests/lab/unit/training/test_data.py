@@ -20,13 +20,12 @@ from lab.training.data import (
     PhotoTransform,
     PlaceBatchSampler,
     PlaceDataset,
-    PlaceSample,
     _init_worker,
     load_batches,
     to_tensor,
 )
-from shared.errors import Unprocessable
 from shared.imaging.decode import decode_resized
+from tests.lab.unit.data_sets import refused
 
 
 def places_of(**counts: int) -> list[TrainingPlace]:
@@ -54,17 +53,15 @@ def cities(plan: PlaceBatchSampler, epoch: int = 0) -> list[str]:
     return [plan.places[draw.place].city for batch in plan.batches(epoch) for draw in batch]
 
 
-def test_an_epoch_takes_every_place_once_and_ends_with_a_smaller_batch() -> None:
+def test_an_epoch_takes_every_place_once_and_draws_its_photos_without_replacement() -> None:
     batches = list(PLAN.batches(0))
     assert [len(batch) for batch in batches] == [4, 4, 4, 4, 1]
     assert len(PLAN) == 5
-    assert sorted(draw.place for batch in batches for draw in batch) == list(range(17))
-
-
-def test_a_places_photos_are_drawn_without_replacement() -> None:
-    for draw in itertools.chain.from_iterable(PLAN.batches(0)):
-        assert len(set(draw.photos)) == 3
-        assert max(draw.photos) < len(PLAN.places[draw.place].photos)
+    samples = list(itertools.chain.from_iterable(batches))
+    assert sorted(sample.place for sample in samples) == list(range(17))
+    for sample in samples:
+        assert len(set(sample.photos)) == 3
+        assert max(sample.photos) < len(PLAN.places[sample.place].photos)
 
 
 def test_cities_keep_their_order_and_their_places_are_shuffled() -> None:
@@ -94,12 +91,9 @@ def test_first_photos_are_taken_without_random_sampling() -> None:
     assert {draw.photos for batch in first.batches(3) for draw in batch} == {(0, 1, 2)}
 
 
-def test_the_same_seed_draws_the_same_and_another_does_not() -> None:
+def test_batches_depend_on_seed_and_epoch_and_not_on_earlier_batches() -> None:
     assert list(PLAN.batches(2)) == list(replace(PLAN).batches(2))
     assert list(PLAN.batches(2)) != list(replace(PLAN, seed=2).batches(2))
-
-
-def test_a_plan_that_begins_in_the_middle_draws_what_it_would_have_drawn() -> None:
     assert list(PLAN.batches(1, start=3)) == list(PLAN.batches(1))[3:]
 
 
@@ -172,7 +166,7 @@ def test_reading_ahead_leaves_the_steps_own_random_numbers_alone(
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_photo_that_does_not_decode_is_left_out_and_named(
+def test_a_photo_that_does_not_decode_is_left_out_and_named_or_an_error(
     photos_on_disk: list[TrainingPlace],
 ) -> None:
     broken = photos_on_disk[2].photos[1]
@@ -181,16 +175,8 @@ def test_a_photo_that_does_not_decode_is_left_out_and_named(
     assert [path for batch in batches for path, _ in batch.undecodable] == [str(broken)]
     assert sum(len(batch.photos) for batch in batches) == 7
     assert sorted(torch.cat([batch.labels for batch in batches]).tolist()).count(2) == 1
-
-
-def test_a_photo_that_does_not_decode_is_an_error_in_strict_mode(
-    photos_on_disk: list[TrainingPlace],
-) -> None:
-    broken = photos_on_disk[2].photos[1]
-    broken.write_bytes(b"")
-    with pytest.raises(Unprocessable, match=broken.name) as caught:
+    with refused("undecodable_photo", broken.name):
         list(batches_of(photos_on_disk, bad_is_error=True))
-    assert caught.value.code == "undecodable_photo"
 
 
 def test_augmentation_is_decided_by_its_seed() -> None:
@@ -243,7 +229,3 @@ def test_a_photo_on_its_side_comes_out_upright(tmp_path: Path) -> None:
     assert upright.shape == (64, 32, 3)
     assert upright[:24].mean() > 250
     assert upright[-24:].mean() < 5
-
-
-def test_a_draw_is_plain_enough_to_cross_processes() -> None:
-    assert PlaceSample(1, (0, 1), 5) == PlaceSample(1, (0, 1), 5)

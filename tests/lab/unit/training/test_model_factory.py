@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import pytest
 import torch
-from torchvision.models import resnet18
 
 from lab.training.arguments import build_arguments
 from lab.training.model_factory import build_model_config, make_model
 from lab.training.run_control import NullDisplay
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
-from shared.errors import Conflict, Misconfigured
+from shared.errors import Conflict
 
 NETWORK = {
     "backbone_arch": "resnet18",
@@ -29,28 +27,6 @@ NETWORK = {
 def make(**arguments: Any) -> VprModel:
     torch.manual_seed(1)
     return make_model(build_arguments(NETWORK | arguments), NullDisplay(), resuming=False)
-
-
-def test_weights_that_can_not_be_downloaded_are_tried_once_in_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tried: list[str] = []
-
-    def download(url: str, *_: object, **_options: object) -> None:
-        tried.append(url)
-        raise httpx2.ConnectError("no network")
-
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr("shared.descriptors.vpr_models.backbones.download_file", download)
-    for aggregator in ("ConvAP", "AVG"):
-        with pytest.raises(Misconfigured, match="no network") as caught:
-            make(agg_arch=aggregator, agg_config={})
-        assert caught.value.code == "weights_missing"
-    assert len(tried) == 1
-    make(pretrained=False)
-    given = tmp_path / "given.pth"
-    torch.save(resnet18().state_dict(), given)
-    make(weights=str(given))
 
 
 @pytest.fixture
@@ -95,25 +71,15 @@ def test_a_checkpoint_of_another_network_names_the_arguments_to_pass(published: 
     assert '"out_channels": 8' in refused.value.detail
 
 
-class WarningDisplay(NullDisplay):
-    """Records warnings."""
-
-    def __init__(self) -> None:
-        self.warnings: list[str] = []
-
-    def warn(self, text: str) -> None:
-        self.warnings.append(text)
-
-
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 def test_weights_of_photos_that_are_resized_otherwise_are_a_warning(
     interpolation: str, published: Path
 ) -> None:
-    display = WarningDisplay()
+    display = NullDisplay()
     arguments = {"weights": str(published), "interpolation": interpolation}
     make_model(build_arguments(NETWORK | arguments), display, resuming=False)
-    assert len(display.warnings) == (interpolation != "bilinear")
-    assert all("--interpolation bilinear" in warning for warning in display.warnings)
+    assert len(display.messages) == (interpolation != "bilinear")
+    assert all("--interpolation bilinear" in warning for warning in display.messages)
 
 
 def test_the_size_of_photos_is_a_difference_for_mixvpr_only(tmp_path: Path) -> None:
@@ -127,8 +93,3 @@ def test_the_size_of_photos_is_a_difference_for_mixvpr_only(tmp_path: Path) -> N
     make(weights=str(tmp_path / "GeM.ckpt"), agg_arch="GeM", **other)
     with pytest.raises(Conflict, match=r"--image_size '\[64, 64\]'"):
         make(weights=str(tmp_path / "MixVPR.ckpt"), agg_arch="MixVPR", **other)
-
-
-def test_weights_that_are_not_there_are_named(tmp_path: Path) -> None:
-    with pytest.raises(Misconfigured, match="does not exist"):
-        make(weights=str(tmp_path / "none.ckpt"))

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from pytorch_metric_learning import losses, miners
 
 from lab.training.arguments import TrainingArguments, build_arguments
 from lab.training.losses import make_loss, make_miner
@@ -18,7 +19,7 @@ from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state, load_checkpoint
 from shared.descriptors.vpr_models.config import STAGES
 from shared.descriptors.vpr_models.model import VprModel
-from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from tests.lab.unit.data_sets import refused
 
 CODE = """
 import torch
@@ -87,13 +88,6 @@ def arguments_of(**values: Any) -> TrainingArguments:
     return build_arguments(network | values)
 
 
-def code_of(arguments: TrainingArguments) -> tuple[str, str]:
-    """Code and detail of the error with which the network is refused."""
-    with pytest.raises(PlacewiseError) as caught:
-        make_own(arguments)
-    return caught.value.code, caught.value.detail
-
-
 def make_own(arguments: TrainingArguments) -> VprModel:
     register_own_modules(arguments)
     return make_model(arguments, NullDisplay(), resuming=False)
@@ -115,28 +109,19 @@ def test_own_backbone_and_aggregator_make_a_network_whose_checkpoint_needs_them_
     assert torch.equal(load_checkpoint(path).model(torch.ones(1, 3, 32, 32)),
                        model.eval()(torch.ones(1, 3, 32, 32)))  # fmt: skip
     del AGGREGATORS["walks:Strongest"]
-    with pytest.raises(Unprocessable, match="walks:Strongest") as caught:
+    (tmp_path / "walks.py").write_text("raise SystemExit('executed')")
+    del sys.modules["walks"]
+    with refused("own_module_unknown", "walks:Strongest"):
         load_checkpoint(path)
-    assert caught.value.code == "own_module_unknown"
-
-
-def test_a_checkpoint_that_names_code_never_imports_it(tmp_path: Path) -> None:
-    state = checkpoint_state(make_own(arguments_of()))
-    (tmp_path / "trap.py").write_text("raise SystemExit('executed')")
-    state["hyper_parameters"]["model"]["agg_arch"] = "trap:Aggregator"
-    torch.save(state, tmp_path / "trap.ckpt")
-    with pytest.raises(Unprocessable, match="trap:Aggregator"):
-        load_checkpoint(tmp_path / "trap.ckpt")
-    assert "trap" not in sys.modules
+    assert "walks" not in sys.modules, "loading a checkpoint never imports code"
 
 
 def test_an_own_backbone_is_frozen_as_a_whole_and_gets_the_choice_of_weights() -> None:
     model = make_own(arguments_of(layers_to_freeze=0, pretrained=True, agg_arch="GeM"))
     assert model.dimension == 6, "pretrained weights were requested"
     assert not any(p.requires_grad for p in model.backbone.parameters())
-    code, detail = code_of(arguments_of(layers_to_freeze=1))
-    assert code == "bad_model_config"
-    assert "0 stages" in detail
+    with refused("bad_model_config", "0 stages"):
+        make_own(arguments_of(layers_to_freeze=1))
 
 
 @pytest.mark.parametrize(
@@ -153,26 +138,22 @@ def test_an_own_backbone_is_frozen_as_a_whole_and_gets_the_choice_of_weights() -
 def test_own_code_that_can_not_be_used_is_named_with_the_reason(
     values: dict[str, str], reason: str
 ) -> None:
-    code, detail = code_of(arguments_of(**values))
-    assert code == "own_module_unusable"
-    assert reason in detail
-    assert next(iter(values.values())) in detail
+    with refused("own_module_unusable", f"{next(iter(values.values()))}.*{reason}"):
+        make_own(arguments_of(**values))
 
 
 def test_an_own_backbone_that_makes_no_maps_is_an_error() -> None:
-    code, detail = code_of(arguments_of(backbone_arch="walks:flat_network"))
-    assert code == "backbone_unusable"
-    assert "(1, 3072)" in detail
+    with refused("backbone_unusable", r"\(1, 3072\)"):
+        make_own(arguments_of(backbone_arch="walks:flat_network"))
 
 
 def test_own_losses_and_miners_are_made_without_arguments() -> None:
-    from pytorch_metric_learning import losses, miners
-
     assert isinstance(make_loss("walks:MyLoss"), losses.ContrastiveLoss)
     assert isinstance(make_miner("walks:MyMiner"), miners.BatchHardMiner)
-    with pytest.raises(InvalidRequest, match="parameters of its own"):
+    unusable = "own_module_unusable"
+    with refused(unusable, "parameters of its own"):
         make_loss("walks:learned_loss")
-    with pytest.raises(InvalidRequest, match="argument"):
+    with refused(unusable, "argument"):
         make_loss("walks:Strongest")
-    with pytest.raises(InvalidRequest, match=r"torch\.nn\.Module"):
+    with refused(unusable, r"torch\.nn\.Module"):
         make_miner("builtins:dict")
