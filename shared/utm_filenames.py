@@ -1,4 +1,4 @@
-"""The `@UTM@` file names of visual place recognition datasets: parsing and formatting.
+"""The `@UTM@` file names of visual place recognition datasets.
 
 `@ UTM_east @ UTM_north @ zone_number @ zone_letter @ latitude @ longitude @ pano_id @ tile @
 heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two are always present.
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import utm
@@ -18,89 +17,6 @@ from shared.errors import InvalidRequest
 
 FIELDS = 16  # 14 between the first and the last `@`; splitting gives two more
 FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by length; a year or a month alone is not a date
-
-
-@dataclass(frozen=True, slots=True)
-class UtmFileName:
-    """The fields of an `@UTM@` file name to be written."""
-
-    east: float
-    """metres"""
-    north: float
-    """metres"""
-    zone_number: int
-    zone_letter: str
-    pano_id: str = ""
-    heading: float | None = None
-    """degrees clockwise from north"""
-    captured_at: datetime | None = None
-    """UTC"""
-    note: str = ""
-
-    def file_name(self) -> str:
-        """Format the name; latitude and longitude are computed from the UTM position."""
-        if "@" in self.pano_id + self.note:
-            raise ValueError("the fields of an @UTM@ file name can't contain an @")
-        latitude, longitude = _degrees(self.east, self.north, self.zone_number, self.zone_letter)
-        fields = (
-            f"{self.east:010.2f}",
-            f"{self.north:010.2f}",
-            f"{self.zone_number:02d}",
-            self.zone_letter,
-            f"{latitude:+010.6f}" if latitude < 0 else f"{latitude:09.6f}",
-            f"{longitude:+011.6f}" if longitude < 0 else f"{longitude:010.6f}",
-            self.pano_id,
-            "",
-            "" if self.heading is None else f"{self.heading % 360:06.2f}",
-            "",
-            "",
-            "",
-            f"{self.captured_at:%Y%m%d%H%M%S}" if self.captured_at else "",
-            self.note,
-        )
-        return f"@{'@'.join(fields)}@.jpg"
-
-
-@dataclass(frozen=True, slots=True)
-class FileNameLocation:
-    """The location in an `@UTM@` file name; None means that the field is empty."""
-
-    east: float
-    """metres"""
-    north: float
-    zone: str | None
-    """such as `32T`"""
-    latitude: float | None
-    """degrees"""
-    longitude: float | None
-    heading: float | None
-    """degrees clockwise from north, in [0, 360)"""
-    note: str
-    """free text; gsv_xs stores the place and the city here"""
-    captured_at: datetime | None = None
-    """UTC; None unless the timestamp is a full date"""
-
-
-def parse_utm_file_name(name: str) -> FileNameLocation | None:
-    """Parse the location of an `@UTM@` file name; None for other names.
-
-    `name` is the file name without folders. Raises InvalidRequest (`bad_coordinates`).
-    """
-    position = utm_position_of_file_name(name)
-    if position is None:
-        return None
-    parts = name.split("@")
-    parts += [""] * (FIELDS - len(parts))
-    number, letter, latitude, longitude = parts[3:7]
-    return FileNameLocation(
-        *position,
-        zone=f"{number}{letter}" if number and letter else None,
-        latitude=_number(latitude) if longitude else None,
-        longitude=_number(longitude) if latitude else None,
-        heading=None if (heading := _number(parts[9])) is None else heading % 360,
-        note=parts[14],
-        captured_at=_full_date(parts[13]),
-    )
 
 
 def utm_position_of_file_name(name: str) -> tuple[float, float] | None:
@@ -141,33 +57,25 @@ def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str
                 f"{name} has UTM east and north but no zone. Pass it, for example --utm-zone 32T.",
             )
         try:
-            degrees = _degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
+            degrees = utm_to_degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
         except (ValueError, utm.OutOfRangeError) as error:
             raise _bad_coordinates(name, error) from error
         latitude, longitude = f"{degrees[0]:.7f}", f"{degrees[1]:.7f}"
     fields = {"latitude": latitude, "longitude": longitude}
     with contextlib.suppress(ValueError):  # the heading is optional in the convention
         fields["heading"] = f"{float(parts[9]) % 360:g}"
-    captured_at = _full_date(parts[13])
+    captured_at = parse_full_date(parts[13])
     if captured_at:
         fields["captured_at"] = captured_at.isoformat()
     return fields
 
 
-def _number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _degrees(east: float, north: float, number: int, letter: str) -> tuple[float, float]:
+def utm_to_degrees(east: float, north: float, number: int, letter: str) -> tuple[float, float]:
     latitude, longitude = utm.to_latlon(east, north, number, letter)
     return float(latitude), float(longitude)
 
 
-def _full_date(timestamp: str) -> datetime | None:
+def parse_full_date(timestamp: str) -> datetime | None:
     """Parse a timestamp of a date or of date and time; None for others."""
     digits = timestamp.replace("_", "")
     pattern = FULL_DATES.get(len(digits)) if digits.isdecimal() and digits.isascii() else None

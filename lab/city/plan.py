@@ -27,7 +27,7 @@ from lab.city.sessions import (
 )
 from lab.city.streets import Quarter, ViewPoint, make_quarter
 from lab.city.textures import random_stream
-from shared.utm_filenames import UtmFileName
+from lab.datasets.utm_names import UtmFileName
 
 ZONE_NUMBER, ZONE_LETTER = 32, "T"
 ORIGIN_M = (480_000.0, 4_880_000.0)

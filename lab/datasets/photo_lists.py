@@ -26,9 +26,9 @@ from pydantic import (
 from lab.datasets.dataset import PHOTO_TABLE_HEADER, DatasetPhoto
 from lab.datasets.ground_truth_files import read_names
 from lab.datasets.utm_coordinates import add_utm_positions
+from lab.datasets.utm_names import parse_utm_file_name
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.imaging.photo_header import read_photo_header
-from shared.utm_filenames import parse_utm_file_name
 
 NUMBERED_NAME = re.compile(r"[A-Za-z]*[_-]?(\d{1,15})")
 """Stems of frames: `0000123`, `frame_0123`, `img-123`"""

@@ -22,10 +22,10 @@ import numpy as np
 from lab.datasets.check import SuspectLabel
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, Scores
+from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.recall import Hits, compute_hits
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, hits_at_k
 from shared.errors import Conflict, InvalidRequest, NotFound
-from shared.evaluation.bootstrap import PairedDifference, paired_differences
 
 
 def read_predictions(path: Path) -> Indices:

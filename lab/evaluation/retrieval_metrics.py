@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.utm_coordinates import pairwise_distances_m
+from lab.evaluation.confidence_metrics import auroc, recall_at_precision
 from lab.evaluation.exact_knn import Indices, Scores
 from lab.evaluation.query_clusters import QueryClusters
 from lab.evaluation.ranking import DEFAULT_KS, Recalls, compute_recalls
@@ -25,7 +26,7 @@ from shared.evaluation.bootstrap import (
     ConfidenceInterval,
     bootstrap_intervals,
 )
-from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
+from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.fit import RegressionTable, fit_map_estimate
 from shared.evaluation.places.probability import PlacePrior, sigmoid
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
+from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.seqslam import seqslam_matches
-from shared.evaluation.calibration import expected_calibration_error, recall_at_precision
+from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.levels import LevelScheme
 from shared.search_api.background import background_frames, subtract_background
 from shared.tracks.belief import Belief, TrackStatus

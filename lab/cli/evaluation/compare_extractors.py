@@ -21,6 +21,7 @@ from lab.cli.evaluation.describers import checkpoint_describer, extractor_descri
 from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
+from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
 from lab.evaluation.report.comparison import ComparedExtractor, pareto_front, render_comparison
@@ -43,7 +44,6 @@ from shared.descriptors.inference import inference_clock
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import InvalidRequest
-from shared.evaluation.bootstrap import PairedDifference, paired_differences
 from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
 
 BLOCK_BYTES = 64_000_000

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from lab.datasets.layouts.base import CityPhotos, TrainingLayout, photos_below
 from lab.datasets.photo_lists import TableRow, read_table
+from lab.datasets.utm_names import parse_utm_file_name
 from shared.errors import InvalidRequest
-from shared.utm_filenames import parse_utm_file_name
 
 
 class GsvCities(TrainingLayout):

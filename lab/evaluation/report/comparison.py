@@ -10,10 +10,10 @@ from typing import Any
 from markupsafe import Markup
 
 from lab.datasets.dataset import EvaluationSet
+from lab.evaluation.paired_runs import PairedDifference
 from lab.evaluation.report.charts import GREY, percent_chart, render_chart
 from lab.evaluation.report.page import render_page
 from lab.evaluation.retrieval_metrics import RetrievalMetrics
-from shared.evaluation.bootstrap import PairedDifference
 
 
 def pareto_front(costs: Sequence[float], values: Sequence[float]) -> list[bool]:

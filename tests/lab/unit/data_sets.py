@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from lab.datasets.dataset import EvaluationSet
+from lab.datasets.utm_names import UtmFileName
 from shared.errors import PlacewiseError
-from shared.utm_filenames import UtmFileName
 
 
 def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lab.datasets.open_dataset import open_evaluation_set
+from lab.evaluation.paired_runs import paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import evaluate_recall
 from lab.evaluation.recall import compute_hits
@@ -18,7 +19,6 @@ from lab.training.model_factory import make_model
 from lab.training.resolve import make_fabric
 from lab.training.run_control import NullDisplay
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
-from shared.evaluation.bootstrap import paired_differences
 from tests.lab.training_runs import run_arguments, train, write_tiny_places
 
 pytestmark = pytest.mark.numerics

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from lab.datasets.dataset import DatasetPhoto
+from lab.evaluation.paired_runs import paired_differences
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import compute_recalls
 from lab.evaluation.recall import compute_hits, recall_at_k
@@ -23,7 +24,7 @@ from lab.evaluation.retrieval_metrics import (
     match_distances,
     precision_recall,
 )
-from shared.evaluation.bootstrap import MIN_CLUSTERS, bootstrap_intervals, paired_differences
+from shared.evaluation.bootstrap import MIN_CLUSTERS, bootstrap_intervals
 
 pytestmark = pytest.mark.numerics
 
