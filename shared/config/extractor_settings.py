@@ -9,9 +9,19 @@ from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from shared.errors import Misconfigured
-from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
-from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
+from shared.extractor_config.configs import (
+    EXTRACTOR_CONFIGS,
+    ExtractorConfig,
+    add_extractor_options,
+    get_extractor_config,
+)
 from shared.extractor_config.names import TORCHHUB_PREFIX, parse_torchhub_name
+
+EXTRACTORS_BY_DINO_MODEL = {
+    name.replace("anyloc-", "dinov2_"): name
+    for name in EXTRACTOR_CONFIGS
+    if name.startswith("anyloc-")
+}
 
 
 class ExtractorSettings(BaseSettings):
@@ -138,13 +148,39 @@ class ExtractorSettings(BaseSettings):
             return get_extractor_config(
                 self.extractor, allow_test_extractors=self.allow_test_extractors
             ).name
-        return extractor_from_dino_settings(
-            self.dino_model,
-            desc_layer=self.desc_layer,
-            desc_facet=self.desc_facet,
-            vlad_clusters=self.vlad_clusters,
-            vlad_desc_dim=self.vlad_desc_dim,
-        )
+        return self._dino_extractor(self.dino_model)
+
+    def _dino_extractor(self, dino_model: str) -> str:
+        """Return the canonical name of what AnyLoc's environment variables describe."""
+        base = EXTRACTORS_BY_DINO_MODEL.get(dino_model)
+        if base is None:
+            raise ValueError(
+                f"DINO_MODEL={dino_model} is unknown. Known: {', '.join(EXTRACTORS_BY_DINO_MODEL)}"
+            )
+        options = {
+            "layer": self.desc_layer,
+            "facet": self.desc_facet,
+            "clusters": self.vlad_clusters,
+        }
+        for variable, (option, value) in zip(
+            ("DESC_LAYER", "DESC_FACET", "VLAD_CLUSTERS"), options.items(), strict=True
+        ):
+            try:
+                name = add_extractor_options(base, {option: value})
+                get_extractor_config(name, allow_test_extractors=False)
+            except Misconfigured as error:
+                raise ValueError(
+                    f"{variable}={value} with DINO_MODEL={dino_model}: {error.detail}"
+                ) from error
+        name = add_extractor_options(base, options)
+        config = get_extractor_config(name, allow_test_extractors=False)
+        if self.vlad_desc_dim not in (None, config.width):
+            raise ValueError(
+                f"VLAD_DESC_DIM={self.vlad_desc_dim} contradicts DINO_MODEL={dino_model}, whose "
+                f"features have {config.width} dimensions. Unset VLAD_DESC_DIM, or choose another "
+                "model"
+            )
+        return config.name
 
     def stored_bytes(self, dimension: int) -> int:
         """Return the size in bytes of one stored descriptor of a new map."""

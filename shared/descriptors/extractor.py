@@ -211,7 +211,7 @@ class Extractor:
 
         Returns:
             (n, dimension) float32 rows in the photos' order. Rows have length 1, or 0 for a photo
-            without structure (see `shared.descriptors.aggregation`). A row is NaN throughout if the
+            without structure (see `shared.descriptors.aggregators`). A row is NaN throughout if the
             network's features are not finite; such a row must not be stored (`not_finite_error`).
 
         Raises:

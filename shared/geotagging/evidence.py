@@ -152,7 +152,6 @@ def interpolate_position(
     Args:
         known: In the order of their times.
         time: Comparable with the times of `known`.
-        max_speed_mps: Maximum speed of the motion in m/s.
 
     Returns:
         None if no known time is near enough to say anything (MAX_SIGMA_M).
@@ -191,7 +190,6 @@ class TimeNeighbours:
     The times of one camera can be compared without their time zone, but not with times in UTC.
 
     Args:
-        photos: All photos of a folder, in any order.
         together: Whether the people with the cameras travelled together.
     """
 

@@ -42,17 +42,9 @@ def propose_position(
     track: InterpolatedPosition | None,
     radius_m: float,
 ) -> Proposal | None:
-    """Combine what is known about a photo.
+    """Return the most probable circle of `radius_m`, given all that is known about a photo.
 
-    Args:
-        picture: The search of a map with the photo.
-        neighbours: Interpolated between photos with coordinates.
-        track: Interpolated on a GPX track.
-        radius_m: Radius of the proposal.
-
-    Returns:
-        The most probable circle; None if no source has a position, or the photo was certainly taken
-        elsewhere.
+    None if no source has a position, or the photo was certainly taken elsewhere.
     """
     plane = _plane(picture, neighbours, track)
     if plane is None:

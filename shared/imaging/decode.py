@@ -80,11 +80,6 @@ def decode_photo(
     eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
     which bounds the memory; no preprocessing needs as many pixels.
 
-    Args:
-        preprocessing: Resizes the pixels for the backbone.
-        max_pixels: Maximum of width x height.
-        previews: Whether to make a preview, too, if the photo needs one.
-
     Raises:
         Unprocessable: `undecodable_photo` with the decoder's reason, `too_many_pixels`,
             `photo_too_small`, `no_heic_decoder`.

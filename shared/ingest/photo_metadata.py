@@ -258,11 +258,7 @@ def unescape_csv_text(cell: str) -> str:
 def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
     """Parse a CSV table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
 
-    Text may be as `escape_csv_text` writes it.
-
-    Args:
-        data: the file's bytes, UTF-8.
-        source_name: name of the table in error messages.
+    Text may be as `escape_csv_text` writes it. Errors name the table `source_name`.
 
     Raises:
         InvalidRequest: `bad_table`.
@@ -314,12 +310,8 @@ def read_jsonl_manifest(
 ) -> list[ManifestEntry]:
     """Parse a JSONL manifest: objects with a name and any of the upload form's fields.
 
-    `tags` may be a list, `metadata` an object. Empty lines are skipped.
-
-    Args:
-        data: the file's bytes, UTF-8.
-        source_name: name of the manifest in error messages.
-        name_fields: members that may contain the name.
+    `tags` may be a list, `metadata` an object. Empty lines are skipped. Errors name the manifest
+    `source_name`.
 
     Raises:
         InvalidRequest: `bad_manifest`, with the first MAX_REPORTED_LINES bad lines.

@@ -52,10 +52,7 @@ def insert_photo(
     """Insert the rows of a photo and its job, or return the map's photo with the same bytes.
 
     Args:
-        session: a session that writes.
         map_: id of the map, or the name of a live one.
-        incoming: the validated photo.
-        priority: priority of the job.
 
     Raises:
         NotFound: `map_not_found`.
@@ -115,13 +112,7 @@ _INSERT_JOB = insert(cast(Table, Job.__table__))
 
 @functools.cache
 def _insert_statement(dialect: str, names: tuple[str, ...], by_name: bool) -> Executable:
-    """Return the statement that inserts a photo into the map `map_`, unless it has the same bytes.
-
-    Args:
-        dialect: `postgresql` or `sqlite`.
-        names: attributes of the photo, which are the statement's parameters.
-        by_name: whether `map_` is a name instead of an id.
-    """
+    """Return the insert of a photo into the map `map_`, unless that has the same bytes."""
     columns = {name: Photo.__mapper__.columns[name] for name in names}
     values = [bindparam(name, type_=column.type) for name, column in columns.items()]
     is_map = Map.id == bindparam("map_")

@@ -78,10 +78,6 @@ def sample_pairs(locations: Sequence[PhotoLocation], seed: int, batch_photos: in
 
     Uses coordinates if they give enough pairs, else labels. If neither gives enough, the source
     with more near pairs is returned. The result is deterministic for equal locations and seed.
-
-    Args:
-        locations: the locations of the map's photos.
-        batch_photos: maximum number of photos in a batch.
     """
     candidates = []
     for source in PairSource:

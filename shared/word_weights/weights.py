@@ -156,11 +156,7 @@ def sign_test_p_value(better: int, worse: int) -> float:
     """Compute the p-value of the exact one-sided sign test (McNemar 1947).
 
     Under the null hypothesis that weights do not improve recall, each query whose result differs
-    is equally likely to be better or worse.
-
-    Args:
-        better: number of queries that are correct only with weights.
-        worse: number of queries that are correct only without weights.
+    is equally likely to be better (correct only with weights) or worse.
     """
     total = better + worse
     at_least_as_good: int = sum(math.comb(total, n) for n in range(better, total + 1))

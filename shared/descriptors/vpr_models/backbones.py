@@ -177,17 +177,7 @@ def build_dinov2(
 
 
 def _load_torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
-    """Build the network `torchvision.models.NAME`.
-
-    Args:
-        name: The network's name in torchvision.
-        pretrained: Whether to load weights; else they are random.
-        weights: A `.pth` or `.safetensors` file in torchvision's naming; None for torchvision's
-            IMAGENET1K_V1, from torch.hub's cache or downloaded.
-
-    Raises:
-        Misconfigured: `weights_missing`, `weights_unusable`, `download_corrupt`.
-    """
+    """Build `torchvision.models.NAME`; without `weights` they are torchvision's IMAGENET1K_V1."""
     from torchvision import models  # imported here because it takes seconds
 
     network = models.get_model(name, weights=None)

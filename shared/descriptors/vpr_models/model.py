@@ -80,12 +80,7 @@ def build_vpr_model(config: VprModelConfig, *, weights: Path | None = None) -> V
 def _build_aggregator(
     config: VprModelConfig, shape: FeatureMapShape
 ) -> tuple[Aggregator, dict[str, Any]]:
-    """Build the aggregator for maps of `shape`; return it with all of its arguments.
-
-    Raises:
-        Unprocessable: `bad_agg_config` for an unknown argument, one of a wrong type, or a size that
-            differs from the map's.
-    """
+    """Build the aggregator for maps of `shape`; return it with all of its arguments."""
     aggregator_class = AGGREGATORS[config.agg_arch]
     inferred = {name: getattr(shape, field) for name, field in aggregator_class.inferred.items()}
     for name, size in inferred.items():

@@ -39,14 +39,7 @@ def evaluate_places(
     scheme: LevelScheme,
     spread: float,
 ) -> PlaceEvaluation:
-    """Fit the model of a map, and measure it on held-out samples.
-
-    Args:
-        samples: The map's own photos and their impostors.
-        labelled: Labelled queries of another session.
-        scheme: The levels of the map.
-        spread: Unit of score differences.
-    """
+    """Fit the model of a map (`fit_place_model`), and measure it on held-out samples."""
     fitted = fit_place_model(samples, labelled, scheme, spread)
     if not fitted.held_out:
         return PlaceEvaluation(fitted.model, None)

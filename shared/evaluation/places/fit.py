@@ -81,7 +81,6 @@ def fit_place_model(
     Args:
         samples: The map's own photos and their impostors.
         labelled: Labelled queries, taken in another session than the photos that they match.
-        scheme: The levels of the map.
         spread: Unit of score differences of the samples' features.
 
     Returns:

@@ -105,7 +105,6 @@ def candidate_levels(
     Args:
         ranking: The first photos of the map, best first, for the features.
         neighbours: The ranking of the best photo itself, without it; empty if it is not known.
-        scheme: The levels of the map.
         spread: Unit of score differences.
         position_radius_m: Photos within this distance of the best one determine the position.
         found: The ranking that determines the levels, if a filter restricts it.
@@ -147,13 +146,8 @@ def shared_neighbours(
 ) -> list[float]:
     """Return the share of the first photos that the best photo finds first, too.
 
-    Args:
-        ranking: The first photos of the map, best first.
-        neighbours: The ranking of the best photo itself, without it.
-
-    Returns:
-        For each of SHARED_DEPTHS k, the number of photos that are among the first k of `ranking`
-        and among the best photo and its first k - 1 neighbours, divided by k.
+    For each of SHARED_DEPTHS k, that is the number of photos that are among the first k of
+    `ranking` and among the best photo and its first k - 1 neighbours, divided by k.
     """
     first = [r.photo for r in ranking]
     best = [*first[:1], *(n.photo for n in neighbours)]

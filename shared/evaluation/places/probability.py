@@ -172,7 +172,6 @@ class PlaceModel(BaseModel):
         Args:
             ranking: The first photos of the map, best first; `EVIDENCE_DEPTH` of them count.
             neighbours: The ranking of the best photo itself, without it.
-            scheme: The levels of the map.
             certainty: Share of the answers that must be right, above 0 and at most 1.
             position_radius_m: Photos within this distance of the best one determine the position.
             found: The ranking of a search with a filter; its photos determine the levels.

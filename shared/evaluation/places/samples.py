@@ -52,8 +52,6 @@ class OwnPhotoSampler:
 
     Args:
         locations: The locations of the map's photos; those without a place are left out.
-        captured_at: Their capture times.
-        scheme: The levels of the map.
         position_radius_m: Radius of a place in metres.
         rank: Ranks these photos. Called once per photo.
     """

@@ -83,7 +83,6 @@ def choose_thresholds(
     Args:
         judged: The estimates of which the share `certainty` must be right if they are answered.
         impostors: The estimates of photos whose place is not in the map.
-        certainty: Above 0 and below 1.
     """
     probability = _lowest_probability(judged, certainty)
     least = certainty if probability is None else probability

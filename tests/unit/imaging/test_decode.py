@@ -22,7 +22,6 @@ from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
 
 SQUARE = get_preprocessing("square32")
 PIXELS = 50_000_000
-LOSSLESS = ("PNG", "BMP", "TIFF")
 
 
 def mean_colour(data: bytes) -> tuple[int, int, int]:
@@ -65,9 +64,10 @@ def test_every_accepted_format_decodes_to_the_size_of_the_preprocessing(name: st
     assert detect_media_type(FORMATS[name][:16]) is not None
 
 
-@pytest.mark.parametrize("media", LOSSLESS)
-def test_lossless_formats_keep_every_pixel(media: str) -> None:
-    decoded = decode_photo(photo_bytes(3, media), SQUARE, PIXELS)
+@pytest.mark.parametrize("media", ["PNG", "BMP", "TIFF"])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_lossless_formats_keep_every_pixel(media: str, mode: str) -> None:
+    decoded = decode_photo(encoded(photo_image(3).convert(mode), media), SQUARE, PIXELS)
     np.testing.assert_array_equal(decoded.pixels, SQUARE.apply(photo_image(3)))
 
 
@@ -144,13 +144,6 @@ def test_transparent_parts_show_black_whatever_lies_under_them(
         assert mean_colour(encoded(image, media, lossless=True)) == expected
 
 
-def test_alpha_that_hides_nothing_changes_no_pixel() -> None:
-    with_alpha = photo_image(4).convert("RGBA")
-    for media in ("PNG", "TIFF"):
-        decoded = decode_photo(encoded(with_alpha, media), SQUARE, PIXELS).pixels
-        np.testing.assert_array_equal(decoded, SQUARE.apply(photo_image(4)))
-
-
 @pytest.mark.parametrize(
     ("mode", "colour", "expected"),
     [
@@ -184,7 +177,10 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
     assert reason(whole[: len(whole) * 2 // 3]).code == "undecodable_photo"
 
 
-@pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"GIF89a"])
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"this is a text\n" * 40, *(photo_bytes(1, media) for media in ("GIF", "PPM", "TGA"))],
+)
 def test_what_is_no_photo_is_an_error_that_names_what_is_accepted(data: bytes) -> None:
     assert reason(data).code == "undecodable_photo"
     assert "not JPEG, PNG, WebP, BMP, TIFF or HEIC" in reason(data).detail
@@ -194,11 +190,6 @@ def test_header_that_is_cut_off_is_an_error_that_says_so() -> None:
     error = reason(b"\xff\xd8\xff\xe0")
     assert error.code == "undecodable_photo"
     assert error.detail == "The photo can't be decoded: its header is cut off."
-
-
-def test_formats_that_are_not_accepted_are_not_decoded() -> None:
-    for media in ("GIF", "PPM", "TGA"):
-        assert reason(photo_bytes(1, media)).code == "undecodable_photo"
 
 
 def test_too_many_pixels_are_an_error_that_names_the_limit() -> None:
@@ -279,11 +270,6 @@ def test_a_preview_is_upright_and_carries_nothing_that_the_camera_wrote() -> Non
     assert b"Secret" not in preview
     with Image.open(io.BytesIO(preview)) as image:
         assert image.size == (800, 1600)
-
-
-def test_small_photos_are_not_enlarged_for_their_thumbnail() -> None:
-    decoded = decode_photo(photo_bytes(1), SQUARE, PIXELS)
-    assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48)
 
 
 def test_broken_exif_is_no_reason_to_refuse_the_pixels() -> None:

@@ -59,7 +59,8 @@ def main(counts: list[int]) -> None:
 
 def fit(photos: int) -> dict[str, int]:
     config = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
-    extractor = Extractor(config, torch.device("cpu"), backbone=ManyPatches())
+    backbone: Any = ManyPatches()
+    extractor = Extractor(config, torch.device("cpu"), backbone=backbone)
     fitted = fit_vocabulary(extractor, batches(photos), photos, clusters=CLUSTERS, seed=0)
     return {
         "peak": memory_bytes("VmHWM"),  # of all fits so far
