@@ -230,7 +230,7 @@ def build_row_mask(
 ) -> RowMask:
     """Return the (n,) bool mask of findable photos that pass the filter and are not excluded.
 
-    It selects the same photos as `shared.catalog.photo_search.filter_conditions` does in SQL.
+    It selects the same photos as `services.gateway.photo_search.filter_conditions` does in SQL.
     Conditions that use an index are applied first; distances are computed for the remaining rows
     only.
     """

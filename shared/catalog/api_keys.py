@@ -21,6 +21,7 @@ from shared.catalog.database.base import (
     count_rows,
     db_now,
     db_now_plus,
+    list_newest,
 )
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.catalog.photos import Photo
@@ -136,7 +137,7 @@ def authenticate_api_key(session: Session, sha256: str) -> ApiKey:
 
 def list_api_keys(session: Session) -> list[ApiKey]:
     """List all keys, also revoked and expired ones, newest first."""
-    return list(session.scalars(select(ApiKey).order_by(ApiKey.id.desc())))
+    return list_newest(session, ApiKey)
 
 
 def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:

@@ -22,7 +22,7 @@ from shared.catalog.database.base import (
     db_now,
     for_update,
     get_in_map,
-    page_newest_first,
+    list_newest,
     partial_index,
 )
 from shared.ids import new_id
@@ -126,11 +126,7 @@ def lock_generation(session: Session, generation_id: UUID) -> Generation:
 
 def list_generations(session: Session, map_id: UUID) -> list[Generation]:
     """List the map's generations, newest first."""
-    return list(
-        session.scalars(
-            select(Generation).where(Generation.map_id == map_id).order_by(Generation.id.desc())
-        )
-    )
+    return list_newest(session, Generation, Generation.map_id == map_id)
 
 
 class Evaluation(Base):
@@ -157,15 +153,13 @@ def list_evaluations(
     session: Session, map_id: UUID, limit: int, before: UUID | None = None
 ) -> list[Evaluation]:
     """List the map's evaluations, newest first, up to `limit`; `before` is the page's cursor."""
-    statement = select(Evaluation).where(Evaluation.map_id == map_id)
-    return page_newest_first(session, statement, Evaluation.id, limit, before)
+    is_of_map = Evaluation.map_id == map_id
+    return list_newest(session, Evaluation, is_of_map, limit=limit, before=before)
 
 
 def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:
     """Return the generation's newest evaluation, if any."""
-    return session.scalar(
-        select(Evaluation)
-        .where(Evaluation.generation_id == generation_id)
-        .order_by(Evaluation.id.desc())
-        .limit(1)
+    return next(
+        iter(list_newest(session, Evaluation, Evaluation.generation_id == generation_id, limit=1)),
+        None,
     )

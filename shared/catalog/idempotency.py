@@ -87,8 +87,6 @@ def claim_idempotency_key(
     """Claim the key for a request.
 
     Args:
-        session: The session of a write transaction.
-        request: The request.
         lease_seconds: Time after which another process may take the request over.
         life_seconds: Time for which the key and its response are stored.
 

@@ -40,7 +40,7 @@ from shared.catalog.database.base import (
     db_now,
     db_now_plus,
     get_in_map,
-    page_newest_first,
+    list_newest,
     partial_index,
 )
 from shared.ids import new_id
@@ -232,22 +232,16 @@ def list_jobs(
     limit: int,
     before: UUID | None,
 ) -> list[Job]:
-    """List jobs of the map, newest first.
+    """List jobs of the map, newest first, up to `limit`.
 
     Args:
-        session: The session.
-        map_id: The map.
-        states: States to list; empty for all.
-        kinds: Kinds to list; empty for all but reindex jobs.
-        limit: Page size.
-        before: Cursor: only jobs with a smaller id, which are older.
+        states: Empty for all.
+        kinds: Empty for all but reindex jobs.
     """
-    statement = select(Job).where(Job.map_id == map_id)
+    conditions = [
+        Job.map_id == map_id,
+        Job.kind.in_(kinds) if kinds else Job.kind != JobKind.REINDEX,
+    ]
     if states:
-        statement = statement.where(Job.state.in_(states))
-    statement = (
-        statement.where(Job.kind.in_(kinds))
-        if kinds
-        else statement.where(Job.kind != JobKind.REINDEX)
-    )
-    return page_newest_first(session, statement, Job.id, limit, before)
+        conditions.append(Job.state.in_(states))
+    return list_newest(session, Job, *conditions, limit=limit, before=before)

@@ -37,7 +37,7 @@ from shared.catalog.database.base import (
     db_now_plus,
     for_update,
     get_or_insert,
-    page_newest_first,
+    list_newest,
 )
 from shared.catalog.generations import (
     Generation,
@@ -262,8 +262,7 @@ def list_searches(
     session: Session, map_id: UUID, limit: int, before: UUID | None = None
 ) -> list[Search]:
     """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
-    statement = sa.select(Search).where(Search.map_id == map_id)
-    return page_newest_first(session, statement, Search.id, limit, before)
+    return list_newest(session, Search, Search.map_id == map_id, limit=limit, before=before)
 
 
 MIN_STATISTICS_AGE_SECONDS = 30.0

@@ -34,10 +34,7 @@ from shared.errors import Misconfigured
 def open_catalog(
     settings: Settings, service: str, limits: TransactionTimeouts = BACKGROUND_TIMEOUTS
 ) -> Catalog:
-    """Open the catalog of the settings.
-
-    Args:
-        service: Name of the service, for `pg_stat_activity`.
+    """Open the catalog of the settings; `pg_stat_activity` shows the name of the service.
 
     Raises:
         Misconfigured: `bad_setting`, if DATABASE_URL is malformed.

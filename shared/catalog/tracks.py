@@ -27,7 +27,7 @@ from shared.catalog.database.base import (
     count_rows,
     db_now,
     get_in_map,
-    page_newest_first,
+    list_newest,
     partial_index,
 )
 from shared.errors import Conflict, NotFound
@@ -118,8 +118,7 @@ def get_track(session: Session, map_id: UUID, track_id: UUID, *, lock: bool = Fa
 
 def list_tracks(session: Session, map_id: UUID, limit: int, before: UUID | None) -> list[Track]:
     """List the map's tracks, newest first; `before` is the page's cursor."""
-    statement = sa.select(Track).where(Track.map_id == map_id)
-    return page_newest_first(session, statement, Track.id, limit, before)
+    return list_newest(session, Track, Track.map_id == map_id, limit=limit, before=before)
 
 
 def get_frame(session: Session, track_id: UUID, frame_id: UUID) -> TrackFrame:
@@ -210,9 +209,8 @@ def add_frame(
     """Add a frame to a locked track, or return the frame that it repeats.
 
     Args:
-        session: The session; the caller also adds the frame's job, unless the frame is repeated.
-        track: The track, locked.
-        frame: The new frame; its `version` is set.
+        frame: The new frame; its `version` is set. The caller also adds its job, unless the frame
+            is repeated.
         expected_version: Version that the track must have; None for any.
 
     Raises:

@@ -7,10 +7,18 @@ from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid, select
+from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now, get_in_map
+from shared.catalog.database.base import (
+    Base,
+    Journaled,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    get_in_map,
+    list_newest,
+)
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured
@@ -141,11 +149,7 @@ def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocab
 
 def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
     """List the map's vocabularies, newest first."""
-    return list(
-        session.scalars(
-            select(Vocabulary).where(Vocabulary.map_id == map_id).order_by(Vocabulary.id.desc())
-        )
-    )
+    return list_newest(session, Vocabulary, Vocabulary.map_id == map_id)
 
 
 class StoredWhitening(Journaled, Base):

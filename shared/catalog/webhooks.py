@@ -23,7 +23,7 @@ from shared.catalog.database.base import (
     JsonValue,
     UtcDateTime,
     db_now,
-    page_newest_first,
+    list_newest,
     partial_index,
 )
 from shared.errors import NotFound
@@ -112,7 +112,7 @@ def get_webhook(session: Session, webhook_id: UUID) -> Webhook:
 
 def list_webhooks(session: Session) -> list[Webhook]:
     """List all webhooks, newest first."""
-    return list(session.scalars(select(Webhook).order_by(Webhook.id.desc())))
+    return list_newest(session, Webhook)
 
 
 def delete_webhook(session: Session, webhook_id: UUID) -> Webhook:
@@ -127,8 +127,8 @@ def list_deliveries(
     session: Session, webhook_id: UUID, limit: int, before: UUID | None
 ) -> list[Delivery]:
     """List the webhook's deliveries, newest first, up to `limit`; `before` is the page's cursor."""
-    statement = select(Delivery).where(Delivery.webhook_id == webhook_id)
-    return page_newest_first(session, statement, Delivery.id, limit, before)
+    is_of_webhook = Delivery.webhook_id == webhook_id
+    return list_newest(session, Delivery, is_of_webhook, limit=limit, before=before)
 
 
 def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:

@@ -27,6 +27,7 @@ from services.gateway.dependencies import (
     PageParams,
     invalid_cursor_error,
 )
+from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from services.gateway.schemas import (
     DeletedPhotoResponse,
     JobAcceptedResponse,
@@ -43,7 +44,6 @@ from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
-from shared.catalog.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
 from shared.imaging.file_formats import needs_preview

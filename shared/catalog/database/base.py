@@ -234,19 +234,23 @@ def for_update(statement: sa.Select[Row]) -> sa.Select[Row]:
     return statement.with_for_update().execution_options(populate_existing=True)
 
 
-def page_newest_first(
-    session: Session, statement: sa.Select[Row], id_column: Any, limit: int, before: UUID | None
+def list_newest(
+    session: Session,
+    table: type[Row],
+    *conditions: Condition,
+    limit: int | None = None,
+    before: UUID | None = None,
 ) -> list[Row]:
-    """Return up to `limit` rows by descending id (UUIDv7: newest first).
+    """List up to `limit` rows by descending id (UUIDv7: newest first), all by default.
 
     Args:
-        statement: SELECT of a table, with its conditions.
-        id_column: The id column of the table.
         before: Cursor: the last id of the previous page, if any.
     """
+    id_column: Any = table.id  # type: ignore[attr-defined]
+    statement = sa.select(table).where(*conditions).order_by(id_column.desc()).limit(limit)
     if before is not None:
         statement = statement.where(id_column < before)
-    return list(session.scalars(statement.order_by(id_column.desc()).limit(limit)))
+    return list(session.scalars(statement))
 
 
 def get_in_map(

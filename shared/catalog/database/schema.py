@@ -128,11 +128,7 @@ def schema_revision() -> str:
 
 
 def _is_current(catalog: Catalog, connection: Connection) -> bool:
-    """Return whether the tables of this version exist; False in an empty database.
-
-    Raises:
-        Misconfigured: `schema_differs`.
-    """
+    """Return whether the tables of this version exist; False in an empty database."""
     if not inspect(connection).has_table(VERSION_TABLE):
         return False
     present = connection.scalar(text(f"SELECT version_num FROM {VERSION_TABLE}"))  # noqa: S608

@@ -124,12 +124,6 @@ def test_every_other_error_is_raised_at_once(catalog: Catalog, state: str) -> No
     }[state]
 
 
-def test_violated_constraint_is_no_outage(catalog: Catalog, maps: list[UUID]) -> None:
-    with pytest.raises(IntegrityError) as caught, catalog.write() as session:
-        add_map(session, "a")
-    assert to_unavailable(caught.value) is None
-
-
 def test_limits_hold_inside_the_transaction_and_leave_nothing_behind(catalog: Catalog) -> None:
     """Behind a PgBouncer, what a transaction leaves behind another service would meet."""
     names = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
 
@@ -10,21 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
+from services.gateway.photo_search import MetadataFilter, search_photos
 from shared.catalog.chunks import allocate_slot
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import (
-    Generation,
-)
-from shared.catalog.maps import (
-    DEFAULT_MAP,
-    Map,
-    get_map,
-    get_or_create_default_map,
-    increment_map_version,
-)
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map, get_or_create_default_map, increment_map_version
 from shared.catalog.models import Model, get_or_create_model
-from shared.catalog.photo_search import MetadataFilter, search_photos
 from shared.catalog.photos import (
     count_live_photos,
     find_photo_by_sha256,
@@ -58,47 +52,29 @@ def test_versions_are_strictly_increasing_under_concurrent_bumps(
         assert session.get_one(Map, map_id).version == threads * each
 
 
-def test_a_rolled_back_bump_leaves_no_gap(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        assert increment_map_version(session, map_id) == 1
-        session.rollback()
-    with catalog.write() as session:
-        assert increment_map_version(session, map_id) == 1
-
-
-def test_the_default_map_is_made_once_by_many_at_once(catalog: Catalog) -> None:
+@pytest.mark.parametrize(
+    "get_or_create",
+    [
+        lambda session: get_or_create_default_map(session, "test-tiny-avg"),
+        lambda session: get_or_create_model(session, "net", "f" * 64, "MIT", {"made": "here"}),
+    ],
+    ids=["default map", "model"],
+)
+def test_a_row_that_many_create_at_once_is_created_once(
+    catalog: Catalog, get_or_create: Callable[[Session], Map | Model]
+) -> None:
     together = threading.Barrier(4)
 
-    def ensure() -> UUID:
+    def create() -> Map | Model:
         together.wait()
         with catalog.write() as session:
-            return get_or_create_default_map(session, "test-tiny-avg").id
+            return get_or_create(session)
 
     with ThreadPoolExecutor(4) as pool:
-        found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
-    assert len(found) == 1
+        created = [future.result() for future in [pool.submit(create) for _ in range(4)]]
     with catalog.read() as session:
-        assert {get_map(session, DEFAULT_MAP).id} == found
-
-
-def test_a_model_is_registered_once_by_many_at_once(catalog: Catalog) -> None:
-    together = threading.Barrier(4)
-
-    def ensure() -> UUID:
-        together.wait()
-        with catalog.write() as session:
-            return get_or_create_model(session, "net", "f" * 64, "MIT", {"made": "here"}).id
-
-    with ThreadPoolExecutor(4) as pool:
-        found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
-    with catalog.read() as session:
-        assert set(session.scalars(select(Model.id))) == found
-    assert len(found) == 1
-
-
-def test_an_unknown_map_is_not_found(catalog: Catalog) -> None:
-    with catalog.read() as session, pytest.raises(NotFound, match="nowhere"):
-        get_map(session, "nowhere")
+        assert session.scalars(select(type(created[0]).id)).one() == created[0].id
+    assert len({row.id for row in created}) == 1
 
 
 def test_a_deleted_photo_shows_in_no_query(catalog: Catalog, map_id: UUID) -> None:

@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
+from services.gateway.photo_search import MetadataFilter, filter_conditions, search_photos
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.database.session import Catalog
-from shared.catalog.photo_search import MetadataFilter, filter_conditions, search_photos
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo

@@ -11,20 +11,9 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, StatementError
 
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import (
-    Generation,
-    GenerationState,
-    active_generation,
-)
-from shared.catalog.maps import (
-    Map,
-    increment_map_version,
-)
-from shared.catalog.photos import (
-    Photo,
-    count_live_photos,
-    find_photo_by_sha256,
-)
+from shared.catalog.generations import Generation, GenerationState, active_generation
+from shared.catalog.maps import Map, increment_map_version
+from shared.catalog.photos import Photo, count_live_photos, find_photo_by_sha256
 from shared.ids import new_id
 from tests.support.catalog_rows import add_generation, add_map, add_photo, delete
 
@@ -88,13 +77,6 @@ def test_write_rolls_back_when_its_block_raises(catalog: Catalog, map_id: UUID) 
         assert count_live_photos(session, map_id) == 1
 
 
-def test_what_write_gave_stays_readable_after_the_block(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        photo = add_photo(session, map_id, tags=["night"])
-    assert photo.tags == ["night"]
-    assert photo.filename
-
-
 def test_read_never_writes(catalog: Catalog, map_id: UUID) -> None:
     with pytest.raises(DBAPIError, match=r"read-?only"), catalog.read() as session:
         add_photo(session, map_id)
@@ -115,13 +97,6 @@ def test_read_sees_one_snapshot_while_others_write(catalog: Catalog, map_id: UUI
     assert before == after == (0, 0)
     with catalog.read() as session:
         assert (count_live_photos(session, map_id), session.scalar(select(Map.version))) == (1, 1)
-
-
-def test_an_unfinished_write_is_seen_by_no_one(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as writing:
-        add_photo(writing, map_id)
-        with catalog.read() as session:
-            assert count_live_photos(session, map_id) == 0
 
 
 def test_the_same_live_bytes_twice_in_a_map_are_refused_by_the_database(

@@ -22,7 +22,7 @@ from shared.ingest import store_photo as store_photo_module
 from shared.ingest.photo_metadata import PhotoFields
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto
-from tests.support.catalog_rows import add_map, delete
+from tests.support.catalog_rows import add_map
 
 NAME = "of the photo"
 
@@ -114,12 +114,6 @@ def test_a_photo_whose_twin_is_deleted_between_insert_and_lookup_is_stored(
     second = store(catalog, photo())
     assert second.queued
     assert second.photo.id != first.photo.id
-
-
-def test_deleted_bytes_are_stored_again(catalog: Catalog, map_id: UUID) -> None:
-    first = store(catalog, photo())
-    delete(catalog, map_id, first.photo.id)
-    assert store(catalog, photo()).photo.id != first.photo.id
 
 
 def test_a_map_that_does_not_exist_or_is_deleted_is_not_found(

@@ -10,8 +10,8 @@ from typing import Any
 
 from sqlalchemy import event
 
+from services.gateway.photo_search import MAX_COUNTED_MATCHES
 from shared.catalog.database.session import Catalog
-from shared.catalog.photo_search import MAX_COUNTED_MATCHES
 
 EXPLAINABLE = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)
 LARGE_TABLES = ("photos", "jobs", "descriptors", "searches")
