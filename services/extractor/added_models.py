@@ -20,8 +20,9 @@ from typing import Any
 
 import torch
 
+from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
-from shared.catalog.models import ModelRegistration, get_model_for_loading, register_model
+from shared.catalog.models import Model, get_model_for_loading, register_model
 from shared.config.private_files import make_private_folder
 from shared.config.settings import Settings
 from shared.descriptors.backbones.trained import TrainedBackbone
@@ -194,10 +195,14 @@ class ModelImporter:
         ).check()
         data = encode_model_file(checkpoint)
         sha256 = hashlib.sha256(data).hexdigest()
-        registration = ModelRegistration(
-            name=name,
+        key = new_model_key(sha256)
+        model = Model(
+            id=new_id(),
+            name=f"{TRAINED_MODEL_PREFIX}{name}",
+            added_name=name,
+            added_at=db_now(),
             fingerprint=checkpoint.fingerprint,
-            object_key=new_model_key(sha256),
+            object_key=key,
             sha256=sha256,
             size_bytes=len(data),
             dimension=checkpoint.model.dimension,
@@ -206,18 +211,18 @@ class ModelImporter:
             note=job.params["note"],
             card=card,
         )
-        self._store.put(registration.object_key, data)
-        self._commit(job, registration)
+        self._store.put(key, data)
+        self._commit(job, model)
 
-    def _commit(self, job: Job, registration: ModelRegistration) -> None:
+    def _commit(self, job: Job, new: Model) -> None:
         """Add the catalog row and end the job; a file without its row is deleted as an orphan."""
         with self._catalog.write() as session:
             for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
-                model, added = register_model(session, registration)
+                model, added = register_model(session, new)
                 succeed_job(
                     owned,
                     {
-                        "name": registration.name,
+                        "name": model.added_name,
                         "extractor": model.name,
                         "fingerprint": model.fingerprint,
                         "dimension": model.dimension,

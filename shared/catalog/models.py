@@ -6,7 +6,6 @@ The name of an added model is permanent: descriptors, manifests and caches refer
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 from uuid import UUID
@@ -27,7 +26,6 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured, NotFound, PlacewiseError
 from shared.extractor_config.configs import ExtractorConfig
-from shared.extractor_config.names import TRAINED_MODEL_PREFIX
 from shared.ids import new_id
 
 
@@ -71,28 +69,14 @@ def get_or_create_model(
     return get_or_insert(session, statement, created)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModelRegistration:
-    """A checkpoint that was checked and stored, to be registered."""
-
-    name: str
-    fingerprint: str
-    """SHA-256 of its configuration and weights, independent of the file format."""
-    object_key: str
-    sha256: str
-    """SHA-256 of the stored object."""
-    size_bytes: int
-    dimension: int
-    config: dict[str, Any]
-    licence: str | None
-    note: str | None
-    card: dict[str, Any]
-
-
-def register_model(session: Session, registration: ModelRegistration) -> tuple[Model, bool]:
+def register_model(session: Session, new: Model) -> tuple[Model, bool]:
     """Register a model, or replace the file of a registered or removed model with these weights.
 
     The licence and the note are updated if they are given.
+
+    Args:
+        new: The row to add. Its fingerprint covers configuration and weights, whatever the format
+            of the file; `sha256` is that of the stored object.
 
     Returns:
         The model's row, and whether the model is new or was removed before.
@@ -100,39 +84,26 @@ def register_model(session: Session, registration: ModelRegistration) -> tuple[M
     Raises:
         Conflict: `model_name_taken`: the name belongs, or belonged, to other weights.
     """
-    row = Model(
-        id=new_id(),
-        name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
-        fingerprint=registration.fingerprint,
-        licence=registration.licence or "not stated",
-        card=registration.card,
-        added_name=registration.name,
-        added_at=db_now(),
-        object_key=registration.object_key,
-        sha256=registration.sha256,
-        size_bytes=registration.size_bytes,
-        dimension=registration.dimension,
-        config=registration.config,
-        note=registration.note,
-    )
-    existing = get_or_insert(session, _select_model(registration.name, lock=True), row)
-    if existing is row:
-        return row, True
-    if existing.fingerprint != registration.fingerprint:
+    name, licence = str(new.added_name), new.licence
+    new.licence = licence or "not stated"
+    existing = get_or_insert(session, _select_model(name, lock=True), new)
+    if existing is new:
+        return new, True
+    if existing.fingerprint != new.fingerprint:
         removed = "" if existing.object_key else "; they were removed, but names are not reused"
         raise Conflict(
             "model_name_taken",
-            f"The name {registration.name!r} belongs to other weights (fingerprint "
-            f"{existing.fingerprint[:12]}, these have {registration.fingerprint[:12]}){removed}. "
+            f"The name {name!r} belongs to other weights (fingerprint "
+            f"{existing.fingerprint[:12]}, these have {new.fingerprint[:12]}){removed}. "
             "Choose another name.",
-            model=registration.name,
+            model=name,
         )
     was_removed = existing.object_key is None
-    existing.object_key = registration.object_key
-    existing.sha256 = registration.sha256
-    existing.size_bytes = registration.size_bytes
-    existing.licence = registration.licence or existing.licence
-    existing.note = registration.note or existing.note
+    existing.object_key = new.object_key
+    existing.sha256 = new.sha256
+    existing.size_bytes = new.size_bytes
+    existing.licence = licence or existing.licence
+    existing.note = new.note or existing.note
     if was_removed:
         existing.added_at = db_now()
     session.flush()
