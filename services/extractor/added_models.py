@@ -1,9 +1,9 @@
 """Added models: import of trained checkpoints, local file cache, and loading.
 
-`ModelImporter` turns an uploaded checkpoint into a model of the catalog, if it can be read and used
-safely. `AddedModelLoader` loads added models. `ModelFileCache` provides their files with verified
-hashes: a file-based object store is read in place; from a bucket, files are downloaded into a
-folder of at most MODEL_CACHE_BYTES, which the processes of this machine may share.
+`import_checkpoint` turns an uploaded checkpoint into a model of the catalog, if it can be read and
+used safely. `AddedModelLoader` loads added models. `ModelFileCache` provides their files with
+verified hashes: a file-based object store is read in place; from a bucket, files are downloaded
+into a folder of at most MODEL_CACHE_BYTES, which the processes of this machine may share.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 
+from services.extractor.handlers import ExtractorContext, handles_model_change
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.models import Model, get_model_for_loading, register_model
@@ -35,8 +36,8 @@ from shared.descriptors.vpr_models.checkpoint import (
 from shared.errors import NotFound, Unavailable, Unprocessable
 from shared.extractor_config.names import TRAINED_MODEL_PREFIX
 from shared.ids import new_id
-from shared.jobs import Job
-from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs import Job, JobKind
+from shared.jobs.leases import lock_leased_job
 from shared.jobs.transitions import succeed_job
 from shared.storage import ObjectStore
 from shared.storage.copying import (
@@ -51,6 +52,7 @@ from shared.storage.keys import new_model_key
 log = logging.getLogger(__name__)
 
 MODEL_CACHE_BYTES = 10_000_000_000
+MAX_CARD_CHARACTERS = 20_000  # of the model card as JSON
 
 
 class ModelFileCache:
@@ -157,99 +159,86 @@ class AddedModelLoader:
         )
 
 
-MAX_CARD_CHARACTERS = 20_000  # of the model card as JSON
+@handles_model_change(JobKind.ADD_MODEL)
+def import_checkpoint(context: ExtractorContext, job: Job) -> None:
+    """Validate the checkpoint at `object_key`, store its model file, and add its catalog row.
 
+    A file without its row is deleted as an orphan.
 
-class ModelImporter:
-    """Imports uploaded checkpoints as models, in one step on the CPU."""
-
-    def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
-        """`folder` is that of `ModelFileCache`, which deletes left-over temporary files."""
-        self._catalog = catalog
-        self._store = store
-        self._folder = folder
-
-    def import_checkpoint(self, job: Job) -> None:
-        """Validate the checkpoint at `object_key`, store its model file, and add its catalog row.
-
-        Raises:
-            Unprocessable: As `load_checkpoint` raises it; `model_unusable`, `checkpoint_lost`.
-            Conflict: `model_name_taken`.
-        """
-        filename = job.params["filename"]
-        with self._local_file(job.params["object_key"]) as path:
-            try:
-                checkpoint = load_checkpoint(path)
-            except Unprocessable as error:  # its message names the temporary file
-                detail = error.detail.replace(path.name, filename)
-                raise Unprocessable(error.code, detail, **error.extra) from error
-        card = {"source": filename, **training_card(checkpoint)}
-        name = job.params["name"]
-        TrainedBackbone(
-            f"{TRAINED_MODEL_PREFIX}{name}",
-            checkpoint.model,
-            checkpoint.fingerprint,
-            torch.device("cpu"),
-            licence="",
-            card=card,
-        ).check()
-        data = encode_model_file(checkpoint)
-        sha256 = hashlib.sha256(data).hexdigest()
-        key = new_model_key(sha256)
-        model = Model(
-            id=new_id(),
-            name=f"{TRAINED_MODEL_PREFIX}{name}",
-            added_name=name,
-            added_at=db_now(),
-            fingerprint=checkpoint.fingerprint,
-            object_key=key,
-            sha256=sha256,
-            size_bytes=len(data),
-            dimension=checkpoint.model.dimension,
-            config=checkpoint.config.model_dump(mode="json"),
-            licence=job.params["licence"],
-            note=job.params["note"],
-            card=card,
-        )
-        self._store.put(key, data)
-        self._commit(job, model)
-
-    def _commit(self, job: Job, new: Model) -> None:
-        """Add the catalog row and end the job; a file without its row is deleted as an orphan."""
-        with self._catalog.write() as session:
-            for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
-                model, added = register_model(session, new)
-                succeed_job(
-                    owned,
-                    {
-                        "name": model.added_name,
-                        "extractor": model.name,
-                        "fingerprint": model.fingerprint,
-                        "dimension": model.dimension,
-                        "size_bytes": model.size_bytes,
-                        "already_there": not added,
-                    },
-                )
-
-    @contextlib.contextmanager
-    def _local_file(self, key: str) -> Iterator[Path]:
-        """Yield the object as a local file, which is deleted afterwards if it was downloaded."""
-        stored_file = self._store.file(key)
-        if stored_file is not None:
-            yield stored_file
-            return
-        make_private_folder(self._folder)
-        path = self._folder / f"{new_id()}{PARTIAL_SUFFIX}"
+    Raises:
+        Unprocessable: As `load_checkpoint` raises it; `model_unusable`, `checkpoint_lost`.
+        Conflict: `model_name_taken`.
+    """
+    filename, name = job.params["filename"], job.params["name"]
+    with _local_file(context, job.params["object_key"]) as path:
         try:
-            download_object(self._store, key, path)
-            yield path
-        except NotFound as error:
-            raise Unprocessable(
-                "checkpoint_lost",
-                "The checkpoint is missing from the object store. Upload it again.",
-            ) from error
-        finally:
-            path.unlink(missing_ok=True)
+            checkpoint = load_checkpoint(path)
+        except Unprocessable as error:  # its message names the temporary file
+            detail = error.detail.replace(path.name, filename)
+            raise Unprocessable(error.code, detail, **error.extra) from error
+    card = {"source": filename, **training_card(checkpoint)}
+    TrainedBackbone(
+        f"{TRAINED_MODEL_PREFIX}{name}",
+        checkpoint.model,
+        checkpoint.fingerprint,
+        torch.device("cpu"),
+        licence="",
+        card=card,
+    ).check()
+    data = encode_model_file(checkpoint)
+    sha256 = hashlib.sha256(data).hexdigest()
+    new = Model(
+        id=new_id(),
+        name=f"{TRAINED_MODEL_PREFIX}{name}",
+        added_name=name,
+        added_at=db_now(),
+        fingerprint=checkpoint.fingerprint,
+        object_key=new_model_key(sha256),
+        sha256=sha256,
+        size_bytes=len(data),
+        dimension=checkpoint.model.dimension,
+        config=checkpoint.config.model_dump(mode="json"),
+        licence=job.params["licence"],
+        note=job.params["note"],
+        card=card,
+    )
+    context.store.put(new.object_key, data)
+    with context.catalog.write() as session:
+        if leased := lock_leased_job(session, job):
+            model, added = register_model(session, new)
+            succeed_job(
+                leased,
+                {
+                    "name": model.added_name,
+                    "extractor": model.name,
+                    "fingerprint": model.fingerprint,
+                    "dimension": model.dimension,
+                    "size_bytes": model.size_bytes,
+                    "already_there": not added,
+                },
+            )
+
+
+@contextlib.contextmanager
+def _local_file(context: ExtractorContext, key: str) -> Iterator[Path]:
+    """Yield the object as a local file, which is deleted afterwards if it was downloaded."""
+    stored_file = context.store.file(key)
+    if stored_file is not None:
+        yield stored_file
+        return
+    folder = model_cache_folder(context.settings)  # whose left-over partial files are deleted
+    make_private_folder(folder)
+    path = folder / f"{new_id()}{PARTIAL_SUFFIX}"
+    try:
+        download_object(context.store, key, path)
+        yield path
+    except NotFound as error:
+        raise Unprocessable(
+            "checkpoint_lost",
+            "The checkpoint is missing from the object store. Upload it again.",
+        ) from error
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def training_card(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -10,10 +10,8 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from uuid import UUID
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,20 +20,15 @@ from sqlalchemy import select
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.child_process import run_in_child
 from services.extractor.decoder_pool import DecoderPool
+from services.extractor.describe import read_chunk_row
+from services.extractor.handlers import ExtractorContext
+from services.extractor.model_changes import NewVocabulary, map_extractor, start_generation
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
-from services.extractor.new_generations import (
-    map_extractor,
-    start_generation_with_new_vocabulary,
-    start_whitened_generation,
-)
-from services.extractor.prepare import read_chunk_row
 from shared.catalog.chunks import Descriptor, find_descriptor_rows
-from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation
 from shared.catalog.jobs import FIT_JOBS
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.tables import open_catalog
-from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, get_pca_source_generation
+from shared.catalog.vocabularies import VocabularyOrigin, get_pca_source_generation
 from shared.config.settings import Settings
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.pca_fit import (
@@ -50,13 +43,12 @@ from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind
-from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import JobInterrupted, JobRunner, StepOutcome
+from shared.jobs.progress import JobProgress
+from shared.jobs.runner import JobRunner, StepOutcome
 from shared.storage import ObjectStore
 from shared.storage.open_store import open_store
 
 FIT_PROGRESS_UNITS = 100  # units of job progress for the fit itself: its steps in per cent
-PROGRESS_SECONDS = 0.5  # between two updates of the job's progress
 READ_BATCH_BYTES = 16_000_000  # of descriptor rows read at once
 PCA_SEED = 0
 STAGES = {
@@ -164,57 +156,15 @@ def _compute_in_this_process(request: FitRequest, settings: Settings, report: Re
         return compute_fit(request, store, models, decoders, settings.batch_photos, report)
 
 
-class FitProgress:
-    """Progress and cancellation of a claimed fit: its photos or rows first, then its steps."""
-
-    def __init__(self, catalog: Catalog, job: Job, stop: threading.Event, sampled: int) -> None:
-        self._catalog = catalog
-        self._job = job
-        self._stop = stop
-        self._sampled = sampled
-        self._stage: str | None = None
-        self._done = 0
-        self._written = 0.0
-
-    def report(self, stage: str, done: int, total: int) -> None:
-        """Note the progress of a stage (`STAGES`); raises as `check` does."""
-        self._stage = STAGES[stage]
-        if self._stage in ("sample", "gather"):
-            self._done = min(done, self._sampled)
-        else:
-            self._done = self._sampled + FIT_PROGRESS_UNITS * done // max(1, total)
-        self.check()
-
-    def check(self) -> None:
-        """Store the progress from time to time.
-
-        Raises:
-            JobInterrupted: The job lost its lease (it was cancelled, say), or the worker stops.
-        """
-        if self._stop.is_set():
-            raise JobInterrupted
-        if time.monotonic() - self._written < PROGRESS_SECONDS:
-            return
-        self._written = time.monotonic()
-        with self._catalog.write() as session:
-            leased = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
-            for job in leased:
-                job.stage, job.progress_done = self._stage, self._done
-        if not leased:
-            raise JobInterrupted
+ComputeFit = Callable[[FitRequest, Settings, Report, Callable[[], None]], Fitted]
 
 
-ComputeFit = Callable[[FitRequest, Settings, FitProgress], Fitted]
-
-
-def compute_in_child(request: FitRequest, settings: Settings, progress: FitProgress) -> Fitted:
+def compute_in_child(
+    request: FitRequest, settings: Settings, report: Report, check: Callable[[], None]
+) -> Fitted:
     """Compute a fit in a child process; raises as `run_in_child` does."""
     return run_in_child(
-        _compute_in_this_process,
-        request,
-        settings,
-        on_progress=progress.report,
-        check=progress.check,
+        _compute_in_this_process, request, settings, on_progress=report, check=check
     )
 
 
@@ -223,20 +173,16 @@ class FitWorker:
 
     def __init__(
         self,
-        catalog: Catalog,
-        store: ObjectStore,
-        models: ModelRegistry,
-        settings: Settings,
+        context: ExtractorContext,
         name: str,
         on_outcome: Callable[[JobKind, StepOutcome, int], object],
         compute: ComputeFit = compute_in_child,
     ) -> None:
-        self._catalog = catalog
-        self._store = store
-        self._models = models
-        self._settings = settings
+        self.context = context
+        self._catalog = context.catalog
+        self._models = context.models
         self._compute = compute
-        self._runner = JobRunner(catalog, settings, name, FIT_JOBS, on_outcome)
+        self._runner = JobRunner(context.catalog, context.settings, name, FIT_JOBS, on_outcome)
 
     def run(self, stop: threading.Event) -> None:
         """Run fits until `stop` is set."""
@@ -251,7 +197,7 @@ class FitWorker:
         fit(job, stop)
 
     def _fit_vocabulary(self, job: Job, stop: threading.Event) -> None:
-        extractor = map_extractor(self._catalog, self._models, job)
+        extractor = map_extractor(self.context, job)
         if not extractor.config.needs_vocabulary:
             raise Unprocessable(
                 "vocabulary_unusable",
@@ -281,17 +227,16 @@ class FitWorker:
             job.params["clusters"] or extractor.config.clusters,
             seed,
         )
-        progress = self._begin(job, stop, len(chosen), len(keys))
-        fitted = self._compute(request, self._settings, progress)
+        fitted = self._compute_fit(request, job, stop, len(chosen), len(keys))
         assert isinstance(fitted, VocabularyFile)
-        start_generation_with_new_vocabulary(
-            self._catalog,
-            self._store,
+        start_generation(
+            self.context,
             job,
-            extractor,
-            fitted.centres,
-            VocabularyOrigin.FITTED,
-            {**fitted.provenance, "provisional": len(keys) < MIN_PHOTOS_TO_FIT},
+            DescriptorPipeline(extractor, fitted.centres),
+            NewVocabulary(
+                VocabularyOrigin.FITTED,
+                {**fitted.provenance, "provisional": len(keys) < MIN_PHOTOS_TO_FIT},
+            ),
             progress_done=len(chosen) + FIT_PROGRESS_UNITS,
         )
 
@@ -308,7 +253,7 @@ class FitWorker:
                 )
                 .order_by(Descriptor.photo_id)
             ).all()
-        pipeline = self._source_pipeline(source)
+        pipeline = self._models.pipeline_of_generation(self._catalog, source)
         if pipeline.spec != source.spec:
             # The projection of stored rows would not fit new ones.
             raise Conflict(
@@ -321,39 +266,37 @@ class FitWorker:
         check_pca_fittable(len(photo_ids), source.dimension, components)
         size = sample_size(source.dimension, components)
         chosen = [photo_ids[index] for index in sample_rows(len(photo_ids), size, PCA_SEED)]
-        request = PcaFitRequest(self._locate_rows(source, chosen), source.dimension, components)
-        progress = self._begin(job, stop, len(chosen), len(photo_ids))
-        whitening = self._compute(request, self._settings, progress)
+        with self._catalog.read() as session:
+            chunks = find_descriptor_rows(session, source.id, chosen)
+        located = {photo: (key, row) for key, rows in chunks.items() for row, photo in rows}
+        rows = [located[photo] for photo in chosen if photo in located]
+        request = PcaFitRequest(rows, source.dimension, components)
+        whitening = self._compute_fit(request, job, stop, len(chosen), len(photo_ids))
         assert isinstance(whitening, PcaWhitening)
         projection = PcaProjection(whitening, pipeline.extractor.backbone.device)
-        start_whitened_generation(
-            self._catalog,
-            self._store,
+        start_generation(
+            self.context,
             job,
-            DescriptorPipeline(pipeline.extractor, pipeline.centres, projection),
-            PcaWhiteningFile(whitening, source.spec),
+            replace(pipeline, projection=projection),
             source.vocabulary_id,
+            PcaWhiteningFile(whitening, source.spec),
             progress_done=len(chosen) + FIT_PROGRESS_UNITS,
         )
 
-    def _source_pipeline(self, source: Generation) -> DescriptorPipeline:
-        vocabulary = None
-        if source.vocabulary_id is not None:
-            with self._catalog.read() as session:
-                vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
-        return self._models.pipeline_of_generation(source, vocabulary, None)
+    def _compute_fit(
+        self, request: FitRequest, job: Job, stop: threading.Event, sampled: int, photos: int
+    ) -> Fitted:
+        """Compute a fit; its progress counts the sample, the fit, and the photos to describe."""
+        progress = JobProgress(
+            self._catalog, job, stop, total=sampled + FIT_PROGRESS_UNITS + photos
+        )
+        progress.check()
 
-    def _locate_rows(self, source: Generation, photo_ids: Sequence[UUID]) -> list[tuple[str, int]]:
-        """Return the chunk and the row of each photo, in the order of the photos."""
-        with self._catalog.read() as session:
-            chunks = find_descriptor_rows(session, source.id, photo_ids)
-        located = {photo: (key, row) for key, rows in chunks.items() for row, photo in rows}
-        return [located[photo] for photo in photo_ids if photo in located]
+        def report(step: str, done: int, total: int) -> None:
+            stage = STAGES[step]
+            if stage in ("sample", "gather"):
+                progress.update(min(done, sampled), stage)
+            else:
+                progress.update(sampled + FIT_PROGRESS_UNITS * done // max(1, total), stage)
 
-    def _begin(self, job: Job, stop: threading.Event, sampled: int, photos: int) -> FitProgress:
-        """Set the job's total: what is fitted on, the fit, and the photos to describe with it."""
-        with self._catalog.write() as session:
-            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
-                leased.progress_done = 0
-                leased.progress_total = sampled + FIT_PROGRESS_UNITS + photos
-        return FitProgress(self._catalog, job, stop, sampled)
+        return self._compute(request, self.context.settings, report, progress.check)

@@ -17,6 +17,7 @@ from uuid import UUID
 
 from sqlalchemy import select
 
+from services.extractor.handlers import JobBatch
 from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
@@ -28,19 +29,14 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import QUERY_JOBS, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, lock_map
-from shared.catalog.vocabularies import (
-    StoredWhitening,
-    Vocabulary,
-    VocabularyOrigin,
-    add_vocabulary,
-)
+from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.descriptors.extractor import Extractor, spec_fingerprint
 from shared.descriptors.vocabulary import encode_centres
 from shared.errors import Conflict, PlacewiseError
 from shared.extractor_config.configs import pooled_config
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
-from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
 from shared.jobs.transitions import fail_job, requeue_job
 from shared.storage import ObjectStore
@@ -73,20 +69,13 @@ def resolve_generation(
             generation = session.get(Generation, job.generation_id)
         else:
             generation = active_generation(session, job.map_id)
-        vocabulary, whitening = None, None
-        if generation is not None and generation.vocabulary_id is not None:
-            vocabulary = session.get(Vocabulary, generation.vocabulary_id)
-        if generation is not None and generation.whitening_id is not None:
-            whitening = session.get(StoredWhitening, generation.whitening_id)
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
-        created = _create_first_generation(
-            catalog, store, models, models.extractor(map_extractor), job.map_id
-        )
-        if created is None:
+        extractor = models.extractor(map_extractor)
+        generation = _create_first_generation(catalog, store, models, extractor, job.map_id)
+        if generation is None:
             return None
-        generation, vocabulary = created
-    pipeline = models.pipeline_of_generation(generation, vocabulary, whitening)
+    pipeline = models.pipeline_of_generation(catalog, generation)
     target = ResolvedGeneration(
         pipeline.extractor, pipeline.centres, pipeline.projection, generation=generation
     )
@@ -101,7 +90,7 @@ def _create_first_generation(
     models: ModelRegistry,
     extractor: Extractor,
     map_id: UUID,
-) -> tuple[Generation, Vocabulary | None] | None:
+) -> Generation | None:
     """Create the map's first generation, with the shipped vocabulary if one is needed.
 
     If none is shipped, the generation's extractor pools the same local features, while the map
@@ -122,14 +111,11 @@ def _create_first_generation(
         map_ = lock_map(session, map_id)
         existing = active_generation(session, map_id)
         if existing is not None:  # another worker has created it
-            vocabulary = None
-            if existing.vocabulary_id is not None:
-                vocabulary = session.get_one(Vocabulary, existing.vocabulary_id)
-            return existing, vocabulary
-        vocabulary, centres = None, None
+            return existing
+        vocabulary_id, centres = None, None
         if shipped is not None:
             centres, provenance = shipped
-            vocabulary = add_vocabulary(
+            vocabulary_id = add_vocabulary(
                 session,
                 map_id,
                 VocabularyOrigin.SHIPPED,
@@ -137,7 +123,7 @@ def _create_first_generation(
                 object_key=key,
                 sha256=centres.sha256,
                 provenance=provenance,
-            )
+            ).id
         generation = Generation(
             id=new_id(),
             map_id=map_id,
@@ -145,9 +131,7 @@ def _create_first_generation(
             activated_at=db_now(),
             row_type=map_.row_type,
             **generation_spec_columns(
-                session,
-                DescriptorPipeline(extractor, centres),
-                vocabulary.id if vocabulary else None,
+                session, DescriptorPipeline(extractor, centres), vocabulary_id
             ),
         )
         session.add(generation)
@@ -155,24 +139,26 @@ def _create_first_generation(
         wake_vocabulary_waiters(session, map_id)
         increment_map_version(session, map_id)
     log.info("generation %s created with extractor %s", generation.id, extractor.config.name)
-    return generation, vocabulary
+    return generation
 
 
-def defer_until_vocabulary(catalog: Catalog, jobs: list[Job]) -> None:
+def requeue_until_vocabulary(catalog: Catalog, batch: JobBatch) -> None:
     """Requeue claimed photos until the map has a vocabulary; fail queries."""
     error = Conflict(
         "no_vocabulary",
         "The map's extractor needs a vocabulary, but the map has none yet. Fit one on its photos "
         "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
     )
+    map_id = batch.jobs[0].map_id
     with catalog.write() as session:
-        lock_map(session, jobs[0].map_id)
-        has_generation = active_generation(session, jobs[0].map_id) is not None
-        for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
+        lock_map(session, map_id)
+        has_generation = active_generation(session, map_id) is not None
+        for job in lock_leased_jobs(session, batch.token, batch.jobs):
             if job.kind == JobKind.DESCRIBE and not has_generation:
                 fail_job(job, error.as_problem())
             else:
                 requeue_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
+    batch.outcomes["waiting"] = len(batch.jobs)
 
 
 def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:
@@ -182,25 +168,23 @@ def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int
         The number of model changes started.
     """
     with catalog.read() as session:
-        active = session.execute(
-            select(Generation, Vocabulary, StoredWhitening)
-            .outerjoin(Vocabulary, Vocabulary.id == Generation.vocabulary_id)
-            .outerjoin(StoredWhitening, StoredWhitening.id == Generation.whitening_id)
+        active = session.scalars(
+            select(Generation)
             .join(Map, Map.id == Generation.map_id)
             .where(Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None))
         ).all()
     started = 0
-    for generation, vocabulary, whitening in active:
+    for generation in active:
         try:
-            pipeline = models.pipeline_of_generation(generation, vocabulary, whitening)
+            pipeline = models.pipeline_of_generation(catalog, generation)
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)
             continue
         if spec_fingerprint(pipeline.spec) == generation.spec_fingerprint:
             continue
         params = {
-            "vocabulary_id": str(vocabulary.id) if vocabulary else None,
-            "whitening_id": str(whitening.id) if whitening else None,
+            "vocabulary_id": _text(generation.vocabulary_id),
+            "whitening_id": _text(generation.whitening_id),
         }
         try:
             with catalog.write() as session:
@@ -210,3 +194,7 @@ def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int
         log.warning("generation %s has an outdated spec: reindexing its map", generation.id)
         started += 1
     return started
+
+
+def _text(id_: UUID | None) -> str | None:
+    return None if id_ is None else str(id_)

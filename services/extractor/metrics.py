@@ -1,24 +1,18 @@
-"""Prometheus metrics of an extractor, and statistics of a drain.
-
-One process has one registry: child processes only decode.
-"""
+"""Prometheus metrics of an extractor; its child processes only decode and have none."""
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from services.extractor.publish import PublishResult
+from services.extractor.handlers import JobBatch
 from shared.descriptors.inference import gpu_memory
 from shared.jobs import JobKind
 from shared.jobs.runner import StepOutcome
@@ -43,7 +37,6 @@ STAGE_BUCKETS_SECONDS = (
     120.0,
 )
 LOAD_BUCKETS_SECONDS = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
-STEP_OUTCOME_LABELS = {StepOutcome.INTERRUPTED: "given_back", StepOutcome.FAILED: "refused"}
 
 
 class ExtractorMetrics:
@@ -59,8 +52,8 @@ class ExtractorMetrics:
         self._jobs = counter(
             "jobs",
             "Claimed jobs by outcome. lost: the lease was taken over, or the job was cancelled; "
-            "paused, waiting, given_back: requeued; refused: failed, or paused until an operator "
-            "acts; crashed: retried alone.",
+            "paused, waiting, requeued: back in the queue; refused: failed, or back in the queue "
+            "until an operator acts; crashed: back in the queue, alone.",
             ["kind", "outcome"],
         )
         self._stage_seconds = histogram(
@@ -86,32 +79,18 @@ class ExtractorMetrics:
         """Record the size of a claimed batch."""
         self._batch_jobs.labels(kind).observe(jobs)
 
-    def count_outcome(self, kind: JobKind, outcome: str, jobs: int = 1) -> None:
-        """Count jobs with an outcome."""
-        self._jobs.labels(kind, outcome).inc(jobs)
-
     def count_step_outcome(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
         """Count the jobs of a step that was not done; `observe_batch` counts the others."""
         if outcome != StepOutcome.DONE:
-            self.count_outcome(kind, STEP_OUTCOME_LABELS.get(outcome, outcome), jobs)
+            label = "refused" if outcome == StepOutcome.FAILED else outcome
+            self._jobs.labels(kind, label).inc(jobs)
 
-    def observe_batch(
-        self, kind: JobKind, outcome: PublishResult, seconds: dict[str, float]
-    ) -> None:
-        """Record the outcome of a batch and the seconds of its stages."""
-        for name, jobs in (
-            ("succeeded", outcome.succeeded),
-            ("failed", outcome.failed),
-            ("lost", outcome.lost),
-        ):
-            if jobs:
-                self.count_outcome(kind, name, jobs)
-        for stage, took in seconds.items():
-            self.observe_stage(stage, took)
-
-    def observe_stage(self, name: str, seconds: float) -> None:
-        """Record the duration of a stage."""
-        self._stage_seconds.labels(name.replace(" ", "_")).observe(seconds)
+    def observe_batch(self, batch: JobBatch) -> None:
+        """Record the outcomes of a batch and the seconds of its steps."""
+        for outcome, jobs in (+batch.outcomes).items():
+            self._jobs.labels(batch.kind, outcome).inc(jobs)
+        for step, seconds in batch.seconds.items():
+            self._stage_seconds.labels(step).observe(seconds)
 
     def observe_model_load(self, seconds: float) -> None:
         """Record the duration of loading an extractor."""
@@ -146,42 +125,3 @@ class _DeviceMemoryCollector(Collector):
             total.add_metric([device.name], device.total_bytes)
         yield used
         yield total
-
-
-@dataclass(slots=True)
-class DrainStats:
-    """Statistics of one drain, as logs and Flower show them."""
-
-    maps: set[str] = field(default_factory=set)
-    claimed: int = 0
-    succeeded: int = 0
-    failed: int = 0
-    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    interrupted: bool = False
-    """Whether the drain stopped while there was work left."""
-
-    def merge(self, other: DrainStats) -> None:
-        """Add the counts of another drain."""
-        self.maps |= other.maps
-        self.claimed += other.claimed
-        self.succeeded += other.succeeded
-        self.failed += other.failed
-        for stage, took in other.seconds.items():
-            self.seconds[stage] += took
-
-    def add_batch(self, outcome: PublishResult, seconds: dict[str, float]) -> None:
-        """Add the outcome of a batch and the seconds of its stages."""
-        self.succeeded += outcome.succeeded
-        self.failed += outcome.failed
-        for stage, took in seconds.items():
-            self.seconds[stage] += took
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the statistics as JSON, for logs and for Flower."""
-        return {
-            "maps": sorted(self.maps),
-            "claimed": self.claimed,
-            "succeeded": self.succeeded,
-            "failed": self.failed,
-            "seconds": {stage: round(took, 3) for stage, took in self.seconds.items()},
-        }

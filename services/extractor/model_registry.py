@@ -15,6 +15,7 @@ import torch
 from cachetools import LRUCache
 from sqlalchemy.orm import Session
 
+from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, get_model_for_loading, get_or_create_model
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
@@ -189,15 +190,18 @@ class ModelRegistry:
             return self._projections[whitening.id]
 
     def pipeline_of_generation(
-        self,
-        generation: Generation,
-        vocabulary: Vocabulary | None,
-        whitening: StoredWhitening | None,
+        self, catalog: Catalog, generation: Generation
     ) -> DescriptorPipeline:
-        """Return the pipeline of a generation with the vocabulary and whitening that it names.
+        """Return the pipeline of a generation, with its vocabulary and whitening.
 
         Raises as `extractor_of_generation`, `centres` and `projection` do.
         """
+        vocabulary, whitening = None, None
+        with catalog.read() as session:
+            if generation.vocabulary_id is not None:
+                vocabulary = session.get(Vocabulary, generation.vocabulary_id)
+            if generation.whitening_id is not None:
+                whitening = session.get(StoredWhitening, generation.whitening_id)
         return DescriptorPipeline(
             self.extractor_of_generation(generation),
             self.centres(vocabulary) if vocabulary else None,

@@ -7,171 +7,169 @@ taken over, or that was cancelled, is skipped: its row stays in the chunk as a d
 from __future__ import annotations
 
 import logging
-import time
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
-from services.extractor.prepare import DescribeBatch, photo_id_of
+from services.extractor.handlers import ExtractorContext, JobBatch
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
-from shared.catalog.database.session import Catalog
-from shared.catalog.generations import GenerationState, lock_generation
+from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import get_live_photos
+from shared.errors import PlacewiseError
 from shared.ids import new_id
-from shared.jobs import JobKind
+from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import distinct_request_ids
 from shared.jobs.transitions import cancel_job, fail_job, requeue_job, succeed_job
-from shared.storage import ObjectStore
-from shared.storage.chunks import Rows, encode_rows, write_chunk
+from shared.storage.chunks import Rows, WrittenChunk, encode_rows, write_chunk
 from shared.storage.keys import query_vector_key
 
 log = logging.getLogger(__name__)
 
+Failures = Sequence[tuple[Job, PlacewiseError]]
+"""Jobs whose photo can't be described, each with the reason."""
 
-@dataclass(slots=True)
-class PublishResult:
-    """Number of jobs by outcome."""
 
-    succeeded: int = 0
-    failed: int = 0
-    lost: int = 0
-    """Jobs that another worker took over, or that were cancelled, meanwhile."""
+def photo_id_of(job: Job) -> UUID:
+    """Return the photo of an index or reindex job."""
+    assert job.photo_id is not None, "index and reindex jobs name a photo"
+    return job.photo_id
 
 
 def publish(
-    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
-) -> PublishResult:
-    """Store and commit a described batch; `rows` are those of `batch.ready`."""
-    started = time.perf_counter()
-    rows = batch.reject_non_finite(rows)
+    context: ExtractorContext,
+    batch: JobBatch,
+    generation: Generation,
+    ready: Sequence[Job],
+    failed: Failures,
+    rows: Rows,
+) -> None:
+    """Store and commit the (n, dimension) rows of the jobs in `ready`; fail those in `failed`."""
+    chunk_id, written = new_id(), None
     if batch.kind == JobKind.DESCRIBE:
-        outcome, chunk = _publish_queries(catalog, store, batch, rows), None
-    else:
-        outcome, chunk = _publish_photos(catalog, store, batch, rows, slot_rows)
-    batch.seconds["publish"] = time.perf_counter() - started
+        for job, row in zip(ready, rows, strict=True):
+            context.store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
+    elif ready:
+        written = write_chunk(
+            context.store,
+            generation_id=generation.id,
+            chunk_id=chunk_id,
+            rows=rows.astype(generation.row_type, copy=False),
+            photo_ids=[photo_id_of(job) for job in ready],
+            spec=generation.spec,
+        )
+
+    def commit(session: Session) -> Counter[str]:
+        if batch.kind == JobKind.DESCRIBE:
+            return _commit_queries(session, batch, generation.id, ready, failed)
+        slot_rows = context.settings.slot_rows
+        return _commit_photos(
+            session, batch, generation.id, ready, failed, chunk_id, written, slot_rows
+        )
+
+    batch.outcomes.update(context.catalog.run(commit))
     log.info(
         "published: %d succeeded, %d failed",
-        outcome.succeeded,
-        outcome.failed,
+        batch.outcomes["succeeded"],
+        batch.outcomes["failed"],
         extra={
             "kind": str(batch.kind),
             "map_id": str(batch.jobs[0].map_id),
-            "generation_id": str(batch.target.generation.id),
+            "generation_id": str(generation.id),
             "job_ids": [str(job.id) for job in batch.jobs],
             "request_ids": distinct_request_ids(batch.jobs),
-            "chunk": chunk,
+            "chunk": written.object_key if written else None,
         },
     )
-    return outcome
 
 
-def _publish_photos(
-    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
-) -> tuple[PublishResult, str | None]:
-    """Return the outcome, and the key of the chunk."""
-    generation_id = batch.target.generation.id
-    chunk_id = new_id()
-    written = None
-    if len(rows):
-        written = write_chunk(
-            store,
-            generation_id=generation_id,
-            chunk_id=chunk_id,
-            rows=rows.astype(batch.target.generation.row_type, copy=False),
-            photo_ids=[photo_id_of(job) for job in batch.ready],
-            spec=batch.target.generation.spec,
-        )
-
-    def commit(session: Session) -> PublishResult:
-        outcome = PublishResult()
-        lock_map(session, batch.jobs[0].map_id)
-        generation = lock_generation(session, generation_id)
-        owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
-        outcome.lost = len(batch.jobs) - len(owned)
-        if generation.state not in _accepted_generation_states(batch.kind):
-            # A model change was activated or abandoned while the batch was computed.
-            for job in owned.values():
-                cancel_job(job) if batch.kind == JobKind.REINDEX else requeue_job(job)
-            return outcome
-        live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
-        # A batch that lost its lease after its commit has described photos already.
-        described = set(
-            session.scalars(
-                select(Descriptor.photo_id).where(
-                    Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(live)
-                )
-            )
-        )
+def _commit_photos(
+    session: Session,
+    batch: JobBatch,
+    generation_id: UUID,
+    ready: Sequence[Job],
+    failed: Failures,
+    chunk_id: UUID,
+    written: WrittenChunk | None,
+    slot_rows: int,
+) -> Counter[str]:
+    """Register the chunk and end the jobs; return the number of jobs by outcome."""
+    lock_map(session, batch.jobs[0].map_id)
+    generation = lock_generation(session, generation_id)
+    owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
+    outcomes = Counter(lost=len(batch.jobs) - len(owned))
+    if generation.state not in _accepted_generation_states(batch.kind):
+        # A model change was activated or abandoned while the batch was computed.
         for job in owned.values():
-            if job.photo_id not in live:
-                cancel_job(job)
-        for claimed, error in batch.failed:
-            leased_job = owned.get(claimed.id)
-            if leased_job is not None and leased_job.photo_id in live:
-                fail_job(leased_job, error.as_problem())
-                outcome.failed += 1
-        new_rows: list[dict[str, Any]] = []
-        for row, claimed in enumerate(batch.ready):
-            leased_job = owned.get(claimed.id)
-            if leased_job is None or leased_job.photo_id not in live:
-                continue  # a dead row
-            if leased_job.photo_id not in described:
-                new_rows.append({"photo_id": leased_job.photo_id, "row": row})
-            file_id = str(leased_job.photo_id)
-            succeed_job(leased_job, {"file_id": file_id, "generation_id": str(generation_id)})
-            outcome.succeeded += 1
-        if new_rows and written is not None:
-            session.add(
-                Chunk(
-                    id=chunk_id,
-                    generation_id=generation_id,
-                    slot=allocate_slot(generation, written.rows, slot_rows),
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
-                )
+            cancel_job(job) if batch.kind == JobKind.REINDEX else requeue_job(job)
+        return outcomes
+    live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
+    for job_id, job in list(owned.items()):
+        if job.photo_id not in live:
+            cancel_job(job)
+            del owned[job_id]
+    # A batch that lost its lease after its commit has described photos already.
+    described = set(
+        session.scalars(
+            select(Descriptor.photo_id).where(
+                Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(live)
             )
-            session.flush()
-            place = {"generation_id": generation_id, "chunk_id": chunk_id}
-            session.execute(insert(Descriptor), [place | columns for columns in new_rows])
-            increment_map_version(session, generation.map_id)
-        return outcome
+        )
+    )
+    outcomes["failed"] = _fail_jobs(owned, failed)
+    new_rows: list[dict[str, Any]] = []
+    for row, claimed in enumerate(ready):
+        if (leased := owned.get(claimed.id)) is None:
+            continue  # a dead row
+        if leased.photo_id not in described:
+            new_rows.append({"photo_id": leased.photo_id, "row": row})
+        file_id = str(leased.photo_id)
+        succeed_job(leased, {"file_id": file_id, "generation_id": str(generation_id)})
+        outcomes["succeeded"] += 1
+    if new_rows and written is not None:
+        slot = allocate_slot(generation, written.rows, slot_rows)
+        place = {"generation_id": generation_id, "chunk_id": chunk_id}
+        session.add(Chunk(id=chunk_id, generation_id=generation_id, slot=slot, **asdict(written)))
+        session.flush()
+        session.execute(insert(Descriptor), [place | columns for columns in new_rows])
+        increment_map_version(session, generation.map_id)
+    return outcomes
 
-    return catalog.run(commit), written.object_key if written else None
+
+def _commit_queries(
+    session: Session,
+    batch: JobBatch,
+    generation_id: UUID,
+    ready: Sequence[Job],
+    failed: Failures,
+) -> Counter[str]:
+    owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
+    outcomes = Counter(lost=len(batch.jobs) - len(owned), failed=_fail_jobs(owned, failed))
+    for claimed in ready:
+        if claimed.id in owned:
+            reference = {
+                "generation_id": str(generation_id),
+                "object_key": query_vector_key(claimed.id),
+                "row": 0,
+            }
+            succeed_job(owned[claimed.id], reference)
+            outcomes["succeeded"] += 1
+    return outcomes
 
 
-def _publish_queries(
-    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows
-) -> PublishResult:
-    for job, row in zip(batch.ready, rows, strict=True):
-        store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
-
-    def commit(session: Session) -> PublishResult:
-        outcome = PublishResult()
-        owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
-        outcome.lost = len(batch.jobs) - len(owned)
-        for claimed, error in batch.failed:
-            if claimed.id in owned:
-                fail_job(owned[claimed.id], error.as_problem())
-                outcome.failed += 1
-        for claimed in batch.ready:
-            if claimed.id in owned:
-                reference = {
-                    "generation_id": str(batch.target.generation.id),
-                    "object_key": query_vector_key(claimed.id),
-                    "row": 0,
-                }
-                succeed_job(owned[claimed.id], reference)
-                outcome.succeeded += 1
-        return outcome
-
-    return catalog.run(commit)
+def _fail_jobs(owned: dict[UUID, Job], failed: Failures) -> int:
+    """Fail those of the jobs that are still owned; return their number."""
+    errors = [(owned[claimed.id], error) for claimed, error in failed if claimed.id in owned]
+    for job, error in errors:
+        fail_job(job, error.as_problem())
+    return len(errors)
 
 
 def _accepted_generation_states(kind: JobKind) -> tuple[GenerationState, ...]:

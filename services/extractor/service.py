@@ -7,7 +7,6 @@ receives SIGTERM.
 
 from __future__ import annotations
 
-import logging
 import os
 import socket
 import threading
@@ -16,7 +15,7 @@ from typing import Any
 from celery import signals
 from prometheus_client import CollectorRegistry
 
-from services.extractor.metrics import DrainStats
+from services.extractor.handlers import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.service_process import Announce, service_process, start_service_threads
 from shared.catalog.database.session import Catalog
@@ -34,11 +33,9 @@ from shared.storage import ObjectStore
 from shared.telemetry.heartbeat import Heartbeat
 from shared.telemetry.metrics_server import serve_metrics
 
-log = logging.getLogger(__name__)
-
 
 def serve_extractor(settings: Settings, announce: Announce) -> None:
-    """Run the extractor until SIGTERM; claimed jobs are then released to the queue.
+    """Run the extractor until SIGTERM; claimed jobs are then requeued.
 
     Raises:
         Misconfigured: `redis_missing`.
@@ -66,8 +63,6 @@ def _run_celery_worker(
             result = DrainStats(interrupted=True)
         if result.interrupted and not stop.is_set():
             wakeups.send(WakeupQueue.BULK)  # for the jobs that are still queued
-        elif result.claimed:
-            log.info("drained: %s", result.as_dict())
         return result.as_dict()
 
     app.task(drain, name=DRAIN_TASK, ignore_result=True)

@@ -8,8 +8,6 @@ describe no photos. A job whose steward died starts from the beginning.
 from __future__ import annotations
 
 import threading
-import time
-from typing import Any
 from uuid import UUID
 
 from prometheus_client import CollectorRegistry
@@ -26,54 +24,15 @@ from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_rea
 from shared.config.settings import Settings
 from shared.errors import Conflict
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
-from shared.jobs.leases import get_lease_token, lock_leased_jobs
-from shared.jobs.runner import JobInterrupted, JobRunner
+from shared.jobs.leases import lock_leased_job
+from shared.jobs.progress import JobProgress
+from shared.jobs.runner import JobRunner
 from shared.jobs.transitions import succeed_job
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
 from shared.word_weights.record import parse_word_weights
-
-PROGRESS_INTERVAL_SECONDS = 0.5  # between two updates of the job's progress
-
-
-class _EvaluationProgress:
-    """Progress and cancellation of one claimed job, counted in searches."""
-
-    def __init__(self, catalog: Catalog, job: Job, stop: threading.Event) -> None:
-        self._catalog = catalog
-        self._job = job
-        self._stop = stop
-        self._count = 0
-        self._reported = time.monotonic()
-
-    def set_total(self, total: int) -> None:
-        """Set the estimated total."""
-        self._write_progress(total)
-
-    def advance(self) -> None:
-        """Count one search.
-
-        Raises:
-            JobInterrupted: The job lost its lease, or the steward is shutting down.
-        """
-        self._count += 1
-        if self._stop.is_set():
-            raise JobInterrupted
-        if time.monotonic() - self._reported > PROGRESS_INTERVAL_SECONDS:
-            self._reported = time.monotonic()
-            self._write_progress()
-
-    def _write_progress(self, total: int | None = None) -> None:
-        with self._catalog.write() as session:
-            leased = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
-            for current in leased:
-                current.progress_total = max(1, total or current.progress_total)
-                current.progress_done = min(self._count, current.progress_total)
-        if not leased:
-            raise JobInterrupted
 
 
 class EvaluationWorker:
@@ -105,7 +64,7 @@ class EvaluationWorker:
         return self._runner.run_next(lambda job: self._run_job(job, stop))
 
     def _run_job(self, job: Job, stop: threading.Event) -> None:
-        progress = _EvaluationProgress(self._catalog, job, stop)
+        progress = JobProgress(self._catalog, job, stop)
         with self._catalog.read() as session:
             generation = active_generation(session, job.map_id)
             if generation is None:
@@ -137,46 +96,46 @@ class EvaluationWorker:
         generation: Generation,
         searchable: int,
         evaluation: MapEvaluation,
-        progress: _EvaluationProgress,
+        progress: JobProgress,
     ) -> None:
         record = parse_word_weights(generation.word_weights)
         weights = record.applied if record else ()
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
-        progress.set_total((len(sample) + len(evaluation.queries)) * (2 if weights else 1))
+        progress.total = (len(sample) + len(evaluation.queries)) * (2 if weights else 1)
         unweighted = evaluation.evaluate(sample)
         weighted = evaluation.evaluate(sample, weights) if weights else None
         figures = {
             **unweighted.figures,
             "with_word_weights": weighted.figures if weighted else None,
         }
-        evaluation_id = new_id()
+        result = {"evaluation_id": str(new_id()), "generation_id": str(generation.id), **figures}
         with self._catalog.write() as session:
             # Before the job, in the order in which a deletion of the map locks them.
             map_ = session.get(Map, job.map_id, with_for_update=True)
-            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
-                if map_ is not None and map_.place_labels_are_automatic:
-                    map_.place_labels_are_paths = evaluation.scheme.labels_are_paths
-                current = session.get_one(Generation, generation.id)
-                current.calibration = unweighted.model.model_dump(mode="json")
-                if weighted:
-                    _store_weighted_calibration(session, generation.id, weights, weighted.model)
-                session.add(
-                    Evaluation(
-                        id=evaluation_id,
-                        map_id=job.map_id,
-                        generation_id=generation.id,
-                        automatic=job.params["automatic"],
-                        searchable=searchable,
-                        labelled_queries=len(evaluation.queries),
-                        figures=figures,
-                    )
+            leased = lock_leased_job(session, job)
+            if map_ is None or leased is None:
+                return
+            if map_.place_labels_are_automatic:
+                map_.place_labels_are_paths = evaluation.scheme.labels_are_paths
+            current = session.get_one(Generation, generation.id)
+            current.calibration = unweighted.model.model_dump(mode="json")
+            # Unless the weights changed meanwhile.
+            record = parse_word_weights(current.word_weights)
+            if weighted and record and record.applied == weights:
+                record = record.model_copy(update={"calibration": weighted.model})
+                current.word_weights = record.model_dump(mode="json")
+            session.add(
+                Evaluation(
+                    id=UUID(result["evaluation_id"]),
+                    map_id=job.map_id,
+                    generation_id=generation.id,
+                    automatic=job.params["automatic"],
+                    searchable=searchable,
+                    labelled_queries=len(evaluation.queries),
+                    figures=figures,
                 )
-                result: dict[str, Any] = {
-                    "evaluation_id": str(evaluation_id),
-                    "generation_id": str(generation.id),
-                    **figures,
-                }
-                succeed_job(leased, result)
+            )
+            succeed_job(leased, result)
 
     def _fit_word_weights(
         self,
@@ -185,7 +144,7 @@ class EvaluationWorker:
         words: int,
         searchable: int,
         evaluation: MapEvaluation,
-        progress: _EvaluationProgress,
+        progress: JobProgress,
     ) -> None:
         if job.params["generation_id"] != str(generation.id):
             raise Conflict(
@@ -194,19 +153,15 @@ class EvaluationWorker:
                 generation_id=str(generation.id),
             )
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
-        progress.set_total(2 * len(sample) + len(evaluation.queries))
+        progress.total = 2 * len(sample) + len(evaluation.queries)
         weights_fit = WordWeightsFit(self._catalog, self._store, generation, words, evaluation)
         record = weights_fit.fit(sample, job.params["seed"], searchable)
+        summary = record.model_dump(mode="json", exclude={"weights", "calibration"})
         with self._catalog.write() as session:
-            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
-                session.get_one(Generation, generation.id).word_weights = record.model_dump(
-                    mode="json"
-                )
-                result: dict[str, Any] = {
-                    "generation_id": str(generation.id),
-                    **record.model_dump(mode="json", exclude={"weights", "calibration"}),
-                }
-                succeed_job(leased, result)
+            if leased := lock_leased_job(session, job):
+                current = session.get_one(Generation, generation.id)
+                current.word_weights = record.model_dump(mode="json")
+                succeed_job(leased, {"generation_id": str(generation.id), **summary})
 
 
 def _count_words(session: Session, generation: Generation) -> int:
@@ -216,15 +171,3 @@ def _count_words(session: Session, generation: Generation) -> int:
             "no_word_weights", f"This generation does not support word weights: {reason}."
         )
     return session.get_one(Vocabulary, generation.vocabulary_id).clusters
-
-
-def _store_weighted_calibration(
-    session: Session, generation_id: UUID, weights: tuple[float, ...], calibration: PlaceModel
-) -> None:
-    """Store the place model of rankings by these weights, unless the weights changed meanwhile."""
-    generation = session.get_one(Generation, generation_id)
-    record = parse_word_weights(generation.word_weights)
-    if record and record.applied == weights:
-        generation.word_weights = record.model_copy(update={"calibration": calibration}).model_dump(
-            mode="json"
-        )

@@ -59,7 +59,7 @@ class StewardMetrics:
         self.trash_bytes = gauge("trash_bytes", "Bytes in the trash after the last collection.")
         self._jobs = counter(
             "jobs",
-            "Slices of the steward's own jobs by outcome: done, stopped, paused, failed, crashed.",
+            "Slices of the steward's own jobs by outcome: done, requeued, paused, failed, crashed.",
             ["kind", "outcome"],
         )
         self._last_success: dict[str, float] = {}

@@ -9,41 +9,29 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.steward.batches.worker import cancel_items_of_ended_batches, resume_batches
+import services.steward.batches.worker
+import services.steward.tasks.auto_evaluation
+import services.steward.tasks.auto_fit
+import services.steward.tasks.compaction
+import services.steward.tasks.delete_maps
+import services.steward.tasks.garbage_collection
+import services.steward.tasks.generation_repair
+import services.steward.tasks.maintenance
+import services.steward.tasks.model_changes
+import services.steward.tasks.reindex_jobs  # noqa: F401  (they register their tasks)
 from services.steward.metrics import StewardMetrics
-from services.steward.tasks.auto_evaluation import evaluate_changed_maps
-from services.steward.tasks.auto_fit import fit_due_vocabularies
-from services.steward.tasks.compaction import merge_small_chunks
-from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_garbage
-from services.steward.tasks.generation_repair import repair_generations
+from services.steward.periodic_tasks import PeriodicTask, registered_tasks
 from services.steward.tasks.journal import JournalTask
-from services.steward.tasks.maintenance import (
-    delete_expired_idempotency_keys,
-    delete_old_deliveries,
-    delete_old_jobs,
-    delete_old_searches,
-    delete_old_tracks,
-    reclaim_leases,
-    resend_wakeups,
-    update_statistics_of_large_maps,
-)
-from services.steward.tasks.model_changes import (
-    advance_model_changes,
-    remove_dead_search_workers,
-)
 from services.steward.tasks.orphans import (
     CollectionHeld,
     collect_orphans,
     empty_expired_trash,
 )
-from services.steward.tasks.reindex_jobs import QueuedChunks, cancel_jobs_of_abandoned_generations
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.schema import sqlite_file
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
@@ -77,26 +65,6 @@ SCHEDULER_TICK_SECONDS = 0.25
 FREE_TRASH_FACTOR = 2
 
 
-@dataclass(slots=True)
-class PeriodicTask:
-    """A maintenance task of the scheduler."""
-
-    name: str
-    """What it does, as a verb phrase: also the metrics' label, with underscores."""
-    interval_seconds: float
-    """Pause between the end of a run and the next one."""
-    run: Callable[[], object]
-    """Returns True if the passing of time makes more work due; else a commit has to."""
-    own_thread: bool = False
-    """Whether it can take so long that the others must not wait for it."""
-    uses_catalog: bool = True
-    """Whether its success shows that the catalog can be reached."""
-    next_run: float = field(default=0.0)
-    """By `time.monotonic`."""
-    commits_seen: int = field(default=-1)
-    """`CommitSignal.count` before its last run."""
-
-
 class Scheduler:
     """Runs the periodic tasks when they are due.
 
@@ -116,111 +84,29 @@ class Scheduler:
         self._catalog = catalog
         self._outage = OutageLog("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
-        merge_retries = ReadRetries()
-        queued_chunks: QueuedChunks = {}
 
-        def counted(task: str) -> ObjectStore:
-            counting = _DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
-            return cast("ObjectStore", counting)
+        def counting_store(task: str) -> _DeletionCountingStore:
+            return _DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
 
-        # On the disk of the SQLite file; PostgreSQL reserves its own space.
-        catalog_file = sqlite_file(catalog)
-        reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
-        self._journal = PeriodicTask("write journal", 2.0, JournalTask(catalog, store, metrics))
+        resources = {
+            "catalog": catalog,
+            "wakeups": wakeups,
+            "settings": settings,
+            "retries": ReadRetries(),
+            "queued_chunks": {},
+        }
+        self._journal = PeriodicTask("write_journal", 2.0, JournalTask(catalog, store, metrics))
         self.tasks = [
-            *([PeriodicTask("keep disk reserve", 5.0, reserve.maintain)] if reserve else []),
-            PeriodicTask(
-                "reclaim leases",
-                1.0,
-                lambda: metrics.leases_expired.inc(reclaim_leases(catalog)),
-            ),
-            PeriodicTask(
-                "resend wakeups",
-                2.0,
-                lambda: metrics.wakeups_resent.inc(resend_wakeups(catalog, wakeups)),
-            ),
-            PeriodicTask(
-                "advance model changes",
-                0.5,
-                lambda: advance_model_changes(catalog, wakeups, queued_chunks),
-            ),
-            PeriodicTask(
-                "cancel jobs of ended model changes",
-                0.5,
-                lambda: cancel_jobs_of_abandoned_generations(catalog),
-            ),
-            PeriodicTask(
-                "cancel photos of ended batches",
-                1.0,
-                lambda: cancel_items_of_ended_batches(catalog),
-            ),
-            PeriodicTask("repair generations", 5.0, lambda: repair_generations(catalog, store)),
-            PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
-            PeriodicTask(
-                "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
-            ),
-            PeriodicTask("fit vocabularies", 2.0, lambda: fit_due_vocabularies(catalog, wakeups)),
-            PeriodicTask(
-                "count large maps",
-                10.0,
-                lambda: update_statistics_of_large_maps(catalog),
-                own_thread=True,
-            ),
-            PeriodicTask(
-                "compact",
-                5.0,
-                lambda: metrics.slots_merged.inc(
-                    merge_small_chunks(catalog, store, retries=merge_retries)
-                ),
-                own_thread=True,
-            ),
+            *registered_tasks(resources, counting_store),
             self._journal,
             PeriodicTask(
-                "delete maps",
-                1.0,
-                lambda: purge_deleted_maps(catalog, counted("delete_maps")),
-                own_thread=True,
-            ),
-            PeriodicTask(
-                "collect",
-                10.0,
-                lambda: collect_garbage(catalog, counted("collect"), settings),
-                own_thread=True,
-            ),
-            PeriodicTask(
-                "forget old jobs",
-                10.0,
-                lambda: delete_old_jobs(catalog),
-            ),
-            PeriodicTask(
-                "forget old searches",
-                10.0,
-                lambda: delete_old_searches(catalog, settings.search_history_days),
-            ),
-            PeriodicTask(
-                "delete old tracks",
-                10.0,
-                lambda: delete_old_tracks(catalog, settings.track_retention_days),
-            ),
-            PeriodicTask(
-                "forget old deliveries",
-                10.0,
-                lambda: delete_old_deliveries(catalog),
-            ),
-            PeriodicTask("forget old keys", 10.0, lambda: delete_expired_idempotency_keys(catalog)),
-            PeriodicTask(
-                "evaluate changed maps",
-                2.0,
-                lambda: evaluate_changed_maps(catalog, settings.auto_evaluate_photos),
-            ),
-            PeriodicTask(
-                "collect orphans",
+                "collect_orphans",
                 3600.0,
                 lambda: _collect_orphans(catalog, store, settings, metrics),
                 own_thread=True,
             ),
             PeriodicTask(
-                "free trash",
+                "free_trash",
                 10.0,
                 lambda: metrics.objects_deleted.labels("free_trash").inc(
                     store.free_trash(FREE_TRASH_FACTOR * settings.min_free_bytes)
@@ -228,6 +114,10 @@ class Scheduler:
                 uses_catalog=False,
             ),
         ]
+        # On the disk of the SQLite file; PostgreSQL reserves its own space.
+        if (catalog_file := sqlite_file(catalog)) is not None:
+            reserve = DiskReserve(catalog_file.parent, settings.min_free_bytes)
+            self.tasks.insert(0, PeriodicTask("keep_disk_reserve", 5.0, reserve.maintain))
 
     def run(self, stop: threading.Event) -> None:
         """Run due tasks until `stop` is set; then write the pending rows to the journal."""
@@ -264,6 +154,8 @@ class Scheduler:
         started, outcome, result = time.monotonic(), "done", None
         try:
             result = task.run()
+            if task.counter is not None:
+                getattr(self._metrics, task.counter).inc(result)
             if task.uses_catalog:
                 self._outage.record_success()
         except SQLAlchemyError as error:

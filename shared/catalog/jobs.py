@@ -4,7 +4,7 @@
             claim (lease + token)                succeed, with a valid token
   QUEUED ───────────────────────────> RUNNING ───────────────────────────────────> SUCCEEDED
    ^  ^ │                              │ │ │ └──── the photo or the request is invalid ───> FAILED
-   │  │ │                              │ │ └── release: a slice ended, or a dependency is
+   │  │ │                              │ │ └── requeue: a slice ended, or a dependency is
    │  │ │ cancel                       │ │     unavailable (no attempt counted) ──> QUEUED, or
    │  │ └─────────> CANCELLED <────────┘ │     RUNNING without a lease for a checkpointed job
    │  │                 │    cancel      │

@@ -81,3 +81,8 @@ def lock_leased_jobs(session: Session, token: UUID, jobs: Sequence[Job]) -> list
             .execution_options(populate_existing=True)
         )
     )
+
+
+def lock_leased_job(session: Session, job: Job) -> Job | None:
+    """Lock and return the claimed job; None if it was cancelled or taken over meanwhile."""
+    return next(iter(lock_leased_jobs(session, get_lease_token(job), [job])), None)

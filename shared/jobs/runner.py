@@ -1,7 +1,7 @@
 """Job runner: claims jobs, renews their lease, and decides what happens when a job fails.
 
 The extractor and the steward run their jobs through it, so this is the one place where a job is
-retried automatically after an error of its worker (`retry_job` is the manual way):
+requeued after an error of its worker (`retry_job` is the manual way):
 
 | failure | what happens to the job |
 |---|---|
@@ -10,7 +10,7 @@ retried automatically after an error of its worker (`retry_job` is the manual wa
 | `PlacewiseError` that stops other jobs | failed with the error |
 | one photo of a batch can't be described | not handled here: `publish` fails its job |
 | lease lost, or the worker stops (`JobInterrupted`) | requeued |
-| other exception, or the worker died | retried alone, then failed after MAX_ATTEMPTS |
+| other exception, or the worker died | requeued to run alone, then failed after MAX_ATTEMPTS |
 
 A `PlacewiseError` stops the step of a whole batch of `index` or `reindex` jobs if, say, weights are
 missing. The jobs store the error and are retried, because an operator can remove the cause. Jobs
@@ -66,7 +66,7 @@ class StepOutcome(StrEnum):
     """How a step of claimed jobs ended."""
 
     DONE = "done"
-    INTERRUPTED = "stopped"
+    INTERRUPTED = "requeued"
     PAUSED = "paused"
     FAILED = "failed"
     CRASHED = "crashed"
@@ -161,7 +161,7 @@ class JobRunner:
     def run_next(self, handler: Callable[[Job], None]) -> bool:
         """Claim the next job and run it, or a slice of it, with `handler`.
 
-        The handler completes the job or releases it until its next slice. Returns False if there
+        The handler completes the job or requeues it for its next slice. Returns False if there
         was no job.
         """
         claimed = self.claim()
@@ -237,7 +237,7 @@ class JobRunner:
                 outcome, refusal = StepOutcome.FAILED, error.as_problem()
                 log.error("%s: %s", jobs, error.detail)
                 updated = self._update(
-                    claimed, lambda session, job: _fail_or_defer(session, job, refusal)
+                    claimed, lambda session, job: _fail_or_requeue(session, job, refusal)
                 )
                 claimed.failed = sum(job.state == JobState.FAILED for job in updated)
             except Exception as error:
@@ -245,7 +245,7 @@ class JobRunner:
                 log.exception("%s: crashed", jobs)
                 self._update(
                     claimed,
-                    lambda session, job: _retry_after_crash(session, job, together, event),
+                    lambda session, job: _requeue_after_crash(session, job, together, event),
                 )
             self.on_outcome(claimed.kind, outcome, together)
 
@@ -276,16 +276,16 @@ def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> int
         expired = expired.where(Job.lease_until < db_now())
     jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
     for job in jobs:
-        _retry_after_crash(session, job, job.claimed_together, "died")
+        _requeue_after_crash(session, job, job.claimed_together, "died")
     return len(jobs)
 
 
-def _retry_after_crash(session: Session, job: Job, together: int, event: str) -> None:
-    """Retry or fail a job whose worker died or raised an exception (`event`).
+def _requeue_after_crash(session: Session, job: Job, together: int, event: str) -> None:
+    """Requeue or fail a job whose worker died or raised an exception (`event`).
 
-    A job that ran `together` with others is retried alone without counting an attempt, to isolate
-    the job that crashed the worker. A job that ran alone fails after MAX_ATTEMPTS. A job that had
-    not started (0) can't be the cause.
+    A job that ran `together` with others is requeued to run alone, without counting an attempt, to
+    isolate the job that crashed the worker. A job that ran alone fails after MAX_ATTEMPTS. A job
+    that had not started (0) can't be the cause.
     """
     job.attempts += together == 1
     # An upload batch continues without the photo that may be the cause: see BatchWorker.
@@ -301,8 +301,8 @@ def _retry_after_crash(session: Session, job: Job, together: int, event: str) ->
     requeue_job(job)
 
 
-def _fail_or_defer(session: Session, job: Job, problem: dict[str, Any]) -> None:
-    """Fail the job; a stored photo is retried instead, because an operator can remove the cause."""
+def _fail_or_requeue(session: Session, job: Job, problem: dict[str, Any]) -> None:
+    """Fail the job; a stored photo is requeued, because an operator can remove the cause."""
     if job.kind in (JobKind.INDEX, JobKind.REINDEX):
         requeue_job(job, after_seconds=REFUSED_RETRY_SECONDS, problem=problem)
     else:

@@ -25,7 +25,6 @@ PHOTOS = 12
 WIDTH = 16  # of the tiny extractor's local features
 VOCABULARIES = "/api/v1/vocabularies"
 GENERATIONS = "/api/v1/generations"
-fresh = itertools.count(4000)
 
 
 def got(answer: httpx2.Response) -> Any:
@@ -231,30 +230,6 @@ def test_one_model_change_at_a_time(server: ServerProcess, before: Before) -> No
 
 
 @pytest.mark.usefixtures("fitted")
-@pytest.mark.parametrize(
-    "data",
-    [
-        pytest.param(npy(centres(5, width=WIDTH - 1)), id="wrong width"),
-        pytest.param(npy(np.ones((8, WIDTH), np.int64)), id="no floats"),
-        pytest.param(npy(np.ones((8, WIDTH), np.float32)), id="all the same"),
-        pytest.param(npy(np.full((8, WIDTH), np.nan, np.float32)), id="NaN"),
-        pytest.param(npy(centres(6)[0]), id="one row"),
-        pytest.param(npy(centres(7))[:-9], id="cut off"),
-        pytest.param(b"cluster centres, in words", id="text"),
-    ],
-)
-def test_an_unusable_vocabulary_fails_with_the_reason_and_changes_nothing(
-    server: ServerProcess, before: Before, data: bytes
-) -> None:
-    answering, known = active(server), got(server.client.get(VOCABULARIES))
-    error = refused(server, post_import(server, data))
-    assert (error["code"], error["status"]) == ("vocabulary_unusable", 422)
-    assert active(server) == answering
-    assert got(server.client.get(VOCABULARIES)) == known
-    assert got(server.similar(before.photos[0]))["generation_id"] == answering["generation_id"]
-
-
-@pytest.mark.usefixtures("fitted")
 def test_bad_requests_for_a_model_change_are_refused(server: ServerProcess) -> None:
     post = server.client.post
     field_refused(post(VOCABULARIES, json={"clusters": 0}), "clusters")
@@ -309,22 +284,3 @@ def test_search_never_fails_while_the_model_changes(server: ServerProcess, befor
     for answer in answers:
         assert answer.json()["missing"] == []
         assert len(answer.json()["similar_images"]) == 10
-
-
-@pytest.mark.usefixtures("fitted")
-def test_a_photo_that_arrives_during_a_model_change_is_in_the_new_generation(
-    server: ServerProcess,
-) -> None:
-    data = photo_bytes(next(fresh))
-    with server.no_decoding():
-        change = started(server.client.post(VOCABULARIES, json={"clusters": 5}))
-        uploaded = server.upload(data).json()
-    assert server.finished(uploaded["job_id"])["state"] == "succeeded"
-    job = server.finished(change)
-    assert job["state"] == "succeeded"
-    assert job["progress"]["done"] == job["progress"]["total"]
-    stats = got(server.client.get("/api/v1/database/stats"))
-    assert stats["searchable_images"] == stats["total_images"] == active(server)["photos"]
-    best = got(server.ask(data))["similar_images"][0]
-    assert best["image_id"] == uploaded["file_id"]
-    assert best["similarity_score"] == pytest.approx(1, abs=1e-4)

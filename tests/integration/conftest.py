@@ -11,10 +11,9 @@ from uuid import UUID
 import pytest
 
 from services.extractor import fits
-from services.extractor import worker as worker_module
 from services.extractor.added_models import AddedModelLoader
 from services.extractor.decoder_pool import DecoderPool
-from services.extractor.fits import FitProgress, FitRequest, Fitted
+from services.extractor.fits import FitRequest, Fitted, Report
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import auto_fit, reindex_jobs
@@ -67,26 +66,24 @@ def make_worker(
     store: FolderStore,
     settings: Settings,
     decoders: DecoderPool,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Callable[..., ExtractorWorker]]:
     """Makes extractors, which are closed in the end; keywords change their settings.
 
     They fit in this process: starting another one takes seconds.
     """
     lent: Any = LentDecoders(decoders)
-    monkeypatch.setattr(worker_module, "DecoderPool", lambda settings: lent)
     small = settings.model_copy(update={"batch_photos": BATCH_PHOTOS, "device": "cpu"})
     made: list[ExtractorWorker] = []
     load_added = AddedModelLoader(catalog, store, small).load
 
-    def fit_here(request: FitRequest, own: Settings, progress: FitProgress) -> Fitted:
+    def fit_here(request: FitRequest, own: Settings, report: Report, _check: Any) -> Fitted:
         models = ModelRegistry(store, own, load_added)
-        return fits.compute_fit(request, store, models, lent, own.batch_photos, progress.report)
+        return fits.compute_fit(request, store, models, lent, own.batch_photos, report)
 
     def make(**changes: object) -> ExtractorWorker:
         own = small.model_copy(update=changes)
         name = f"worker-{len(made)}"
-        made.append(ExtractorWorker(catalog, store, own, name, compute_fit=fit_here))
+        made.append(ExtractorWorker(catalog, store, own, name, decoders=lent, compute_fit=fit_here))
         return made[-1]
 
     yield make

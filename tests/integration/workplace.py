@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.metrics import DrainStats
+from services.extractor.handlers import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from services.steward.tasks.model_changes import advance_model_changes
@@ -107,11 +107,11 @@ class Workplace:
         return self._worker
 
     def drain(self) -> DrainStats:
-        """Do all jobs of the extractor, fits too, which do not count in the result."""
+        """Do all jobs of the extractor, fits too; the result is that of the first drain."""
         stop = threading.Event()
         result = self.worker.drain(stop)
         while self.worker.fits.run_next(stop):
-            result.merge(self.worker.drain(stop))
+            self.worker.drain(stop)
         return result
 
     def advance(self) -> None:

@@ -277,3 +277,13 @@ def take(
             lease_seconds=lease_seconds,
             min_priority=least_priority,
         )
+
+
+def problem_of(job: Job) -> dict[str, Any]:
+    assert job.error is not None
+    return job.error
+
+
+def failure_code(job: Job) -> str:
+    assert job.state == JobState.FAILED
+    return str(problem_of(job)["code"])

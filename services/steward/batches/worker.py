@@ -25,6 +25,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.batches.listing import list_prefix_photos
 from services.steward.metrics import StewardMetrics
+from services.steward.periodic_tasks import periodic_task
 from shared.catalog.batch_items import (
     BatchItem,
     BatchSource,
@@ -55,7 +56,7 @@ from shared.ingest.validation import (
     validate_photo,
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.leases import get_lease_token, lock_leased_job
 from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner
 from shared.jobs.transitions import (
     cancel_batch_items,
@@ -191,10 +192,11 @@ class _BatchItemImporter:
     @staticmethod
     def _lock_item(session: Session, job: Job, item: BatchItem) -> BatchItem:
         """Return the item under the batch's lock; JobInterrupted if the batch lost its lease."""
-        for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
-            leased.attempts = 0  # progress: an earlier crash was not caused by this item
-            return session.get_one(BatchItem, (job.id, item.number))
-        raise JobInterrupted
+        leased = lock_leased_job(session, job)
+        if leased is None:
+            raise JobInterrupted
+        leased.attempts = 0  # progress: an earlier crash was not caused by this item
+        return session.get_one(BatchItem, (job.id, item.number))
 
 
 SLICE_SECONDS = 2.0
@@ -203,6 +205,7 @@ YIELD_SECONDS = 0.1  # pause of a batch, so that another one is claimed first
 READ_ITEMS = 50  # items per query
 
 
+@periodic_task(5.0)
 def resume_batches(catalog: Catalog, settings: Settings) -> None:
     """Wake the batches that wait for disk space once MIN_FREE_BYTES are free.
 
@@ -220,6 +223,7 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
         make_waiting_jobs_claimable(session, waits)
 
 
+@periodic_task(1.0)
 def cancel_items_of_ended_batches(catalog: Catalog) -> None:
     """Cancel the photos of cancelled and failed batches that are still being indexed."""
     is_ended = (Job.kind == JobKind.BATCH) & Job.state.in_((JobState.CANCELLED, JobState.FAILED))
@@ -286,16 +290,16 @@ class BatchWorker:
     def _list_prefix(self, job: Job) -> None:
         """Write the items of a prefix; the gateway writes those of files and keys."""
         with self._catalog.write() as session:
-            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+            if leased := lock_leased_job(session, job):
                 leased.stage = "list"
         max_photos = self._settings.max_batch_photos
         listing = list_prefix_photos(self._store, job.params["prefix"], max_photos)
         with self._catalog.write() as session:
-            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
-                leased.params = {**leased.params, "ignored": listing.ignored}
-                add_batch_items(session, leased, listing.items)
-                return
-        raise JobInterrupted
+            leased = lock_leased_job(session, job)
+            if leased is None:
+                raise JobInterrupted
+            leased.params = {**leased.params, "ignored": listing.ignored}
+            add_batch_items(session, leased, listing.items)
 
     def _fail_suspect_item(self, job: Job) -> None:
         """Fail the next item: several workers died on it, since no photo was imported meanwhile."""
@@ -319,7 +323,7 @@ class BatchWorker:
             return next_queued_items(session, job.id, min(READ_ITEMS, room)) if room > 0 else []
 
     def _finish_slice(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
-        """Update the progress; complete the batch, or release it until its next slice."""
+        """Update the progress; complete the batch, or requeue it for its next slice."""
         with self._catalog.write() as session:
             leased = lock_batch(session, job, get_lease_token(job))
             if leased is None:

@@ -12,12 +12,14 @@ from uuid import UUID
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.auto_fit import is_fit_due
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
 from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
 from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
 from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
+from shared.config.settings import Settings
 from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
@@ -31,12 +33,14 @@ DueJob = tuple[JobKind, dict[str, Any]]
 """Kind and params of an evaluation or word-weight job that a map needs now."""
 
 
-def evaluate_changed_maps(catalog: Catalog, min_photos: int) -> None:
+@periodic_task(2.0)
+def evaluate_changed_maps(catalog: Catalog, settings: Settings) -> None:
     """Queue an evaluation for each idle map that has changed enough since its last one.
 
-    Maps with fewer geotagged photos than `min_photos` are skipped; 0 turns automatic evaluation
-    off. Word weights are fitted once the evaluation is up to date.
+    Maps with fewer geotagged photos than AUTO_EVALUATE_PHOTOS are skipped; 0 turns automatic
+    evaluation off. Word weights are fitted once the evaluation is up to date.
     """
+    min_photos = settings.auto_evaluate_photos
     if not min_photos:
         return
     with catalog.read() as session:

@@ -12,6 +12,7 @@ from uuid import UUID
 from sqlalchemy import exists, or_, select
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
@@ -33,6 +34,7 @@ QUIET_SECONDS = 5.0
 OVERDUE_FACTOR = 4
 
 
+@periodic_task(2.0)
 def fit_due_vocabularies(catalog: Catalog, wakeups: Wakeups) -> bool:
     """Start a vocabulary fit for each map that is due.
 

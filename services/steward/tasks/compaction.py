@@ -14,6 +14,7 @@ import numpy as np
 from sqlalchemy import case, delete, func, select, update
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
@@ -37,6 +38,7 @@ DEAD_ROW_SAMPLE_SLOTS = 100  # slots whose dead rows one run counts: 100,000 row
 DEAD_ROW_SHARE = 0.2  # of a slot's rows; with more, it is rewritten
 
 
+@periodic_task(5.0, own_thread=True, counter="slots_merged")
 def merge_small_chunks(
     catalog: Catalog,
     store: ObjectStore,

@@ -16,6 +16,7 @@ from uuid import UUID
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.garbage_collection import delete_with_objects
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
 from services.steward.tasks.maintenance import TRACKS_PER_TRANSACTION
@@ -46,6 +47,7 @@ ROWS_PER_TRANSACTION = 500  # rows deleted in one transaction
 SLICE_SECONDS = 2.0  # of one run, so that the steward's other tasks are not delayed
 
 
+@periodic_task(1.0, own_thread=True)
 def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
     """Continue purging the deleted maps, for up to SLICE_SECONDS."""
     journal_deletions(catalog, store, Map)

@@ -16,6 +16,7 @@ from uuid import UUID
 from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
 from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs, settle_photo_jobs
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
@@ -279,6 +280,7 @@ def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
             store.delete(key)
 
 
+@periodic_task(10.0, own_thread=True)
 def collect_garbage(
     catalog: Catalog,
     store: ObjectStore,

@@ -14,6 +14,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks import model_changes
 from shared.catalog.chunks import Chunk
 from shared.catalog.database.base import db_now_plus
@@ -36,6 +37,7 @@ REPAIRED_PARAM = "mended_chunks"
 """Key in the params of a model change: the number of chunks described again."""
 
 
+@periodic_task(5.0)
 def repair_generations(catalog: Catalog, store: ObjectStore) -> None:
     """Drop damaged chunks of building generations and queue their photos again.
 

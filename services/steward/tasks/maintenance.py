@@ -12,6 +12,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, delete, exists, or_, select
 from sqlalchemy.orm import InstrumentedAttribute
 
+from services.steward.periodic_tasks import periodic_task
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
@@ -28,12 +29,14 @@ from shared.catalog.maps import (
 from shared.catalog.photos import Photo
 from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.webhooks import Delivery
+from shared.config.settings import Settings
 from shared.jobs import Wakeups, reclaim_expired_leases
 from shared.jobs.wakeups import WakeupQueue
 
 log = logging.getLogger(__name__)
 
 
+@periodic_task(1.0, counter="leases_expired")
 def reclaim_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
     """Requeue or fail the jobs of dead workers; see `reclaim_expired_leases`."""
     with catalog.write() as session:
@@ -43,6 +46,7 @@ def reclaim_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
     return reclaimed
 
 
+@periodic_task(2.0, counter="wakeups_resent")
 def resend_wakeups(catalog: Catalog, wakeups: Wakeups) -> int:
     """Wake a worker for each queue with claimable jobs: the first wakeup may have been lost.
 
@@ -69,27 +73,32 @@ DAY_SECONDS = 86_400.0
 JOB_RETENTION_DAYS = 30.0  # also of webhook deliveries
 
 
-def delete_old_jobs(catalog: Catalog, retention_days: float = JOB_RETENTION_DAYS) -> None:
-    """Delete jobs that ended more than `retention_days` ago.
+@periodic_task(10.0)
+def delete_old_jobs(catalog: Catalog) -> None:
+    """Delete jobs that ended more than JOB_RETENTION_DAYS ago.
 
     An unsuccessful job that is its photo's current job stays: it has the reason why the photo is
     not described, and a retry or another upload of the same bytes queues it again.
     """
     is_current_of_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
     is_over = or_(Job.state == JobState.SUCCEEDED, ~is_current_of_photo)
-    _delete_rows(catalog, Job.id, Job.finished_at < _days_ago(retention_days), is_over)
+    is_old = Job.finished_at < _days_ago(JOB_RETENTION_DAYS)
+    _delete_rows(catalog, Job.id, is_old, is_over)
 
 
-def delete_old_searches(catalog: Catalog, history_days: float) -> None:
-    """Delete searches from the history that are older than `history_days`."""
-    _delete_rows(catalog, Search.id, Search.searched_at < _days_ago(history_days))
+@periodic_task(10.0)
+def delete_old_searches(catalog: Catalog, settings: Settings) -> None:
+    """Delete searches from the history that are older than SEARCH_HISTORY_DAYS."""
+    is_old = Search.searched_at < _days_ago(settings.search_history_days)
+    _delete_rows(catalog, Search.id, is_old)
 
 
-def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
-    """Delete tracks without a new frame for `retention_days`."""
+@periodic_task(10.0)
+def delete_old_tracks(catalog: Catalog, settings: Settings) -> None:
+    """Delete tracks without a new frame for TRACK_RETENTION_DAYS."""
     old = (
         select(Track.id)
-        .where(Track.updated_at < _days_ago(retention_days))
+        .where(Track.updated_at < _days_ago(settings.track_retention_days))
         .limit(TRACKS_PER_TRANSACTION)
         .with_for_update(skip_locked=True)
     )
@@ -97,13 +106,15 @@ def delete_old_tracks(catalog: Catalog, retention_days: float) -> None:
         delete_tracks(session, Track.id.in_(session.scalars(old).all()))
 
 
-def delete_old_deliveries(catalog: Catalog, retention_days: float = JOB_RETENTION_DAYS) -> None:
-    """Delete webhook deliveries older than `retention_days`: retries end long before that."""
-    _delete_rows(catalog, Delivery.id, Delivery.created_at < _days_ago(retention_days))
+@periodic_task(10.0)
+def delete_old_deliveries(catalog: Catalog) -> None:
+    """Delete webhook deliveries older than JOB_RETENTION_DAYS: retries end long before that."""
+    is_old = Delivery.created_at < _days_ago(JOB_RETENTION_DAYS)
+    _delete_rows(catalog, Delivery.id, is_old)
 
 
+@periodic_task(10.0)
 def delete_expired_idempotency_keys(catalog: Catalog) -> None:
-    """Delete expired idempotency keys."""
     _delete_rows(catalog, IdempotencyRecord.id, IdempotencyRecord.expires_at <= db_now())
 
 
@@ -121,6 +132,7 @@ def _delete_rows(
         session.execute(delete(ids.class_).where(ids.in_(found)))
 
 
+@periodic_task(10.0, own_thread=True)
 def update_statistics_of_large_maps(catalog: Catalog) -> None:
     """Refresh the cached statistics of each map that is too large to be counted per request.
 

@@ -20,6 +20,7 @@ from uuid import UUID
 from sqlalchemy import exists, func, select
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.reindex_jobs import (
     ADVANCED_WAITS,
     QueuedChunks,
@@ -61,6 +62,7 @@ MAX_LOST_SHARE = 0.01  # of the searchable photos that a model change may fail t
 MAX_LISTED_PHOTOS = 10
 
 
+@periodic_task(2.0)
 def remove_dead_search_workers(catalog: Catalog) -> None:
     """Unregister search workers without a recent heartbeat; a paused one registers again."""
     with catalog.write() as session:
@@ -102,6 +104,7 @@ def _search_workers_have_loaded(session: Session, job: Job, generation: Generati
     return False
 
 
+@periodic_task(0.5)
 def advance_model_changes(
     catalog: Catalog, wakeups: Wakeups, queued_chunks: QueuedChunks | None = None
 ) -> None:

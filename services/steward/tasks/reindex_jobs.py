@@ -14,6 +14,7 @@ from uuid import UUID
 from sqlalchemy import Select, delete, insert, or_, select, update
 from sqlalchemy.orm import Session
 
+from services.steward.periodic_tasks import periodic_task
 from shared.catalog.chunks import IDS_PER_QUERY, Chunk, Descriptor, select_failed_photos
 from shared.catalog.database.base import affected_rows
 from shared.catalog.database.session import Catalog
@@ -173,6 +174,7 @@ def _photo_sources(session: Session, map_id: UUID) -> dict[UUID, Select[UUID]]:
     return {active.id: select_failed_photos(map_id), **chunks}
 
 
+@periodic_task(0.5)
 def cancel_jobs_of_abandoned_generations(catalog: Catalog) -> None:
     """Cancel the reindex jobs of model changes that were cancelled or failed.
 

@@ -13,7 +13,7 @@ from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
-from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
+from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job, list_jobs
 from shared.errors import NotFound
 from shared.jobs import (
     Job,
@@ -58,12 +58,6 @@ def test_a_batch_holds_the_oldest_up_to_its_limit(catalog: Catalog, map_id: UUID
     assert ids(take(catalog, limit=3)) == waiting[:3]
     assert ids(take(catalog, limit=3)) == waiting[3:]
     assert take(catalog, limit=3) == []
-
-
-def test_comparisons_are_claimed_one_at_a_time(catalog: Catalog, map_id: UUID) -> None:
-    first, second = queue(catalog, map_id, 2, kind=JobKind.COMPARE)
-    assert ids(take(catalog, limit=10)) == [first]
-    assert ids(take(catalog, limit=10)) == [second]
 
 
 def test_a_claim_names_the_worker_and_the_end_of_its_lease(catalog: Catalog, map_id: UUID) -> None:
@@ -113,14 +107,11 @@ def test_a_job_marked_alone_comes_alone(catalog: Catalog, map_id: UUID) -> None:
     assert ids(take(catalog)) == oldest
 
 
-def test_a_model_change_comes_alone(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-    changes = [queue(catalog, of, kind=k)[0] for of in (map_id, other) for k in MODEL_CHANGE_JOBS]
-    changes += queue(catalog, map_id, 2, kind=JobKind.FIT)  # not even with one of its kind
-    taken = [take(catalog, limit=10) for _ in changes]
-    assert [len(jobs) for jobs in taken] == [1] * len(changes)
-    assert sorted(job.id for jobs in taken for job in jobs) == sorted(changes)
+def test_jobs_that_are_as_much_work_as_a_batch_come_alone(catalog: Catalog, map_id: UUID) -> None:
+    single = [queue(catalog, map_id, 2, kind=kind) for kind in SINGLE_CLAIM_JOBS]
+    taken = [ids(take(catalog, limit=10)) for _ in range(2 * len(single))]
+    assert {len(jobs) for jobs in taken} == {1}
+    assert sorted(taken) == sorted([job_id] for pair in single for job_id in pair)
 
 
 def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: UUID) -> None:

@@ -1,4 +1,4 @@
-"""Transitions: finish, fail, cancel, release, retry and requeue jobs, on both databases."""
+"""Transitions: finish, fail, cancel, retry and requeue jobs, on both databases."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from shared.jobs.transitions import (
     cancel_job,
     fail_job,
     requeue_job,
-    requeue_job_as_new,
     retry_job,
     succeed_job,
 )
@@ -75,7 +74,7 @@ def test_success_and_failure_are_stored_with_their_figures(catalog: Catalog, map
     assert (failed.progress_done, failed.progress_failed) == (0, 1)
 
 
-def test_a_released_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_id: UUID) -> None:
+def test_a_requeued_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 2)
     jobs = take(catalog)
     with catalog.write() as session:
@@ -87,7 +86,7 @@ def test_a_released_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_
     assert [read_job(catalog, job_id).attempts for job_id in waiting] == [0, 0]
 
 
-def test_a_released_model_change_stays_running(catalog: Catalog, map_id: UUID) -> None:
+def test_a_requeued_model_change_stays_running(catalog: Catalog, map_id: UUID) -> None:
     for kind in MODEL_CHANGE_JOBS:
         (job_id,) = queue(catalog, map_id, kind=kind)
         jobs = take(catalog)
@@ -153,14 +152,3 @@ def test_the_job_of_a_deleted_photo_can_not_be_retried(catalog: Catalog, map_id:
     with pytest.raises(Conflict) as refused, catalog.write() as session:
         retry_job(session, session.get_one(Job, job_id))
     assert refused.value.code == "photo_deleted"
-
-
-def test_a_requeued_job_has_lost_its_past(catalog: Catalog, map_id: UUID) -> None:
-    (job_id,) = queue(catalog, map_id, attempts=2, alone=True)
-    jobs = take(catalog)
-    with catalog.write() as session:
-        requeue_job_as_new(session.get_one(Job, job_id))
-    assert end(catalog, jobs) == []
-    job = read_job(catalog, job_id)
-    assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
-    assert (job.started_at, job.lease_token, job.result) == (None, None, None)

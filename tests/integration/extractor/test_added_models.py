@@ -13,7 +13,7 @@ import pytest
 import torch
 from sqlalchemy import select, update
 
-from services.extractor import new_generations
+from services.extractor import model_changes
 from services.steward.tasks.garbage_collection import collect_checkpoints
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
@@ -406,15 +406,13 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
     walks: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = active(walks).id
-    real = new_generations.start_generation_with_stored_vocabulary
+    real = model_changes.start_generation
 
     def remove_first(*arguments: Any) -> None:
         with walks.catalog.write() as session:
             remove_model(session, "walks", "test-tiny-avg")
         real(*arguments)
 
-    monkeypatch.setattr(
-        "services.extractor.model_changes.start_generation_with_stored_vocabulary", remove_first
-    )
+    monkeypatch.setattr(model_changes, "start_generation", remove_first)
     failed(walks, switch(walks, extractor="gsv:walks"), "model_missing")
     assert active(walks).id == before

@@ -11,7 +11,7 @@ from shared.catalog.jobs import WaitingFor
 from shared.config.settings import Settings
 from shared.jobs import JobState
 from tests.integration.workplace import Workplace
-from tests.support.catalog_rows import set_columns
+from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
 
@@ -44,10 +44,9 @@ def test_photos_wait_for_weights_then_for_a_vocabulary_and_a_fit_makes_them_sear
     workplace.drain()
     job = workplace.job_of(photo)
     assert job.state == JobState.QUEUED
-    assert job.error is not None
-    assert job.error["code"] == "weights_missing"
-    assert str(weights) in job.error["detail"]
-    assert "Three ways" in job.error["detail"]
+    assert problem_of(job)["code"] == "weights_missing"
+    assert str(weights) in problem_of(job)["detail"]
+    assert "Three ways" in problem_of(job)["detail"]
 
     save(random_weights(SHAPES["vits14"], blocks=1), weights)
     set_columns(workplace.catalog, job.id, run_after=None)

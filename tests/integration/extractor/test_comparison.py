@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import Any
 from uuid import UUID
 
 import numpy as np
 import pytest
 from sqlalchemy import select
 
-from services.extractor import prepare
-from services.extractor.comparison import ComparisonRunner, PreparedComparison
+from services.extractor import describe
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_ended_generations, collect_queries
 from services.steward.tasks.orphans import collect_orphans
@@ -19,9 +19,9 @@ from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
+from shared.descriptors.reranking import rerank_score
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, reclaim_expired_leases
-from shared.search_api.comparison import CompareResult
 from shared.storage import FolderStore, ObjectStore
 from shared.storage.chunks import Row, read_row
 from shared.storage.keys import comparison_key, query_key
@@ -239,18 +239,17 @@ def test_cancelled_comparison_can_be_retried(service: Service) -> None:
 def test_comparison_of_a_worker_that_was_given_up_is_ended_by_the_next_one(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = ComparisonRunner._compare
     given_up: list[int] = []
 
-    def compare(self: ComparisonRunner, prepared: PreparedComparison) -> CompareResult:
+    def score(*arguments: Any) -> float:
         if not given_up:
             with service.catalog.write() as session:
                 given_up.append(reclaim_expired_leases(session, all_leases=True))
-        return real(self, prepared)
+        return rerank_score(*arguments)
 
     query = service.indexed(0, 1, 2)[0]
     started = begun(service, f"/similarity/{query}")
-    monkeypatch.setattr(ComparisonRunner, "_compare", compare)
+    monkeypatch.setattr("services.extractor.comparison.rerank_score", score)
     assert service.worker.drain(threading.Event()).succeeded == 1
     assert given_up == [1]
     job = service.json("GET", f"/jobs/{started['job_id']}")
@@ -328,7 +327,7 @@ def test_candidate_whose_descriptor_is_damaged_is_compared_and_not_explained(
         whole = read_row(store, key, row)
         return (whole / 2).astype(np.float32) if (key, row) == (at, number) else whole
 
-    monkeypatch.setattr(prepare, "read_row", read)
+    monkeypatch.setattr(describe, "read_row", read)
     answer = compared(service, query)
     assert set(ids(answer)) == set(ids(before))
     for found_photo in answer["similar_images"]:

@@ -14,10 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import func, select
 
-from services.extractor import fits
-from services.extractor import worker as worker_module
+from services.extractor import describe, fits
 from services.extractor.generation_resolver import resolve_generation
-from services.extractor.worker import ExtractorWorker
+from services.extractor.worker import QUERY_POLL_SECONDS, ExtractorWorker
 from services.steward.tasks import auto_fit
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from shared.catalog.chunks import Chunk, list_live_chunks
@@ -33,7 +32,7 @@ from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
 from tests.integration.workplace import Workplace, expected_row, once, same
-from tests.support.catalog_rows import set_columns
+from tests.support.catalog_rows import failure_code, problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 # tests/e2e/test_upload.py and test_model_changes.py do the same on SQLite.
@@ -111,9 +110,8 @@ def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
     ):
         job = averages.job(job_id)
         assert (job.state, job.progress_failed) == (JobState.FAILED, 1)
-        assert job.error is not None
-        assert job.error["code"] == code
-        assert job.error["detail"]
+        assert problem_of(job)["code"] == code
+        assert problem_of(job)["detail"]
 
 
 @pytest.mark.databases("sqlite", "postgresql")
@@ -176,8 +174,7 @@ def test_photos_of_different_sizes_are_described_in_one_batch(
     for photo, photo_id in zip(photos[:4], photo_ids[:4], strict=True):
         assert same(rows[photo_id], expected_row(extractor, photo))
     too_small = place.job_of(photo_ids[4])
-    assert too_small.error is not None
-    assert too_small.error["code"] == "photo_too_small"
+    assert problem_of(too_small)["code"] == "photo_too_small"
     spec = place.active().spec
     assert spec["preprocessing"] == {"name": "demo1024", "version": 1}
     assert (spec["aggregator"], spec["dimension"]) == ("gem", 16)
@@ -245,7 +242,7 @@ def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
     def ask(_: NDArray[np.uint8]) -> None:
         if not queries:
             queries.append(averages.ask(photo_bytes(99)))
-            time.sleep(3 * worker_module.QUERY_POLL_SECONDS)
+            time.sleep(3 * QUERY_POLL_SECONDS)
             during.append(JobState(averages.job(queries[0]).state))
 
     before_describing(ask)
@@ -288,9 +285,7 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
         assert (job.state, job.waiting_for) == (JobState.QUEUED, WaitingFor.VOCABULARY)
         assert job.attempts == 0
     refused = vlads.job(query)
-    assert refused.state == JobState.FAILED
-    assert refused.error is not None
-    assert refused.error["code"] == "no_vocabulary"
+    assert failure_code(refused) == "no_vocabulary"
 
     assert vlads.fit_if_due() == []
     assert not vlads.wakeups.wait(0)
@@ -404,7 +399,7 @@ def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
     fit = once(lambda: _fit_with(vlads, quick))
     _drain(slow)
     late += vlads.upload(3)
-    monkeypatch.setattr(worker_module, "resolve_generation", find_or_fit)
+    monkeypatch.setattr(describe, "resolve_generation", find_or_fit)
     _drain(slow)  # sees no vocabulary; before it says so, the other worker has fitted one
     assert vlads.job_of(late[0]).state == JobState.SUCCEEDED
     assert set(vlads.rows()) >= set(late)

@@ -31,7 +31,7 @@ from shared.storage import FolderStore
 from tests.integration.extractor.conftest import Hook
 from tests.integration.extractor.test_describe_photos import _drain
 from tests.integration.workplace import Workplace, expected_row, once, pixels_of, same
-from tests.support.catalog_rows import end_pauses, expire_lease, states
+from tests.support.catalog_rows import end_pauses, expire_lease, problem_of, states
 from tests.support.photos import photo_bytes
 
 # tests/faults/test_kills.py kills extractors on SQLite.
@@ -58,9 +58,8 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
     assert batches == [3] + [1] * MAX_ATTEMPTS
     poisonous = averages.job_of(photo_ids[1])
     assert (poisonous.state, poisonous.attempts) == (JobState.FAILED, 3)
-    assert poisonous.error is not None
-    assert poisonous.error["code"] == "worker_crashed"
-    assert "RuntimeError" in poisonous.error["detail"]
+    assert problem_of(poisonous)["code"] == "worker_crashed"
+    assert "RuntimeError" in problem_of(poisonous)["detail"]
     for photo_id in (photo_ids[0], photo_ids[2]):
         job = averages.job_of(photo_id)
         assert (job.state, job.alone, job.attempts) == (JobState.SUCCEEDED, True, 0)
@@ -86,8 +85,7 @@ def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
     assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
     refused = averages.job_of(photo_ids[1])
     assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
-    assert refused.error is not None
-    assert refused.error["code"] == "features_not_finite"
+    assert problem_of(refused)["code"] == "features_not_finite"
     rows = averages.rows()
     assert set(rows) == {photo_ids[0], photo_ids[2]}
     for number, photo_id in ((1, photo_ids[0]), (3, photo_ids[2])):
@@ -292,8 +290,7 @@ def test_photos_wait_for_a_worker_that_reproduces_the_generation(
         averages.drain()
     job = averages.job_of(photo_id)
     assert (job.state, job.attempts) == (JobState.QUEUED, 0)
-    assert job.error is not None
-    assert job.error["code"] == "spec_differs"
+    assert problem_of(job)["code"] == "spec_differs"
     end_pauses(averages.catalog)
     averages.drain()
     job = averages.job_of(photo_id)

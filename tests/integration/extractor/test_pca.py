@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.extractor import fits, prepare
+from services.extractor import describe, fits
 from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_registry import ModelRegistry
 from services.steward.tasks import model_changes
@@ -32,6 +32,7 @@ from shared.storage.chunks import Rows, decode_rows, read_row
 from shared.storage.keys import WHITENINGS, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
+from tests.support.catalog_rows import failure_code
 from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
@@ -77,12 +78,6 @@ def projected(whitening: PcaWhitening, row: Rows) -> Rows:
 def whitenings(workplace: Workplace) -> list[StoredWhitening]:
     with workplace.catalog.read() as session:
         return list(session.query(StoredWhitening))
-
-
-def refusal(job: Job) -> str:
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    return str(job.error["code"])
 
 
 def forbid_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +192,7 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
         return half
 
     monkeypatch.setattr(fits, "read_chunk_row", read_row)  # the fit is not meant
-    monkeypatch.setattr(prepare, "read_row", read)
+    monkeypatch.setattr(describe, "read_row", read)
     reduce(described)
     for photo_id, row in described.rows().items():
         assert same(row, projected(expected, before[photo_id]))
@@ -221,7 +216,7 @@ def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
     assert described.rows().keys() == before.keys() - {refused}
     with described.catalog.read() as session:
         (job,) = session.query(Job).filter_by(kind=JobKind.REINDEX, state=JobState.FAILED)
-    assert (job.photo_id, refusal(job)) == (refused, "features_not_finite")
+    assert (job.photo_id, failure_code(job)) == (refused, "features_not_finite")
 
 
 def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
@@ -275,14 +270,14 @@ def test_a_new_vocabulary_comes_without_pca(vlads: Workplace) -> None:
 
 def test_a_pca_of_a_pca_is_refused(reduced: Workplace) -> None:
     before = reduced.active().id
-    assert refusal(reduced.finish(reduced.start(JobKind.PCA, pca=3))) == "already_reduced"
+    assert failure_code(reduced.finish(reduced.start(JobKind.PCA, pca=3))) == "already_reduced"
     assert reduced.active().id == before
 
 
 def test_what_can_not_be_fitted_fails_with_the_reason(described: Workplace) -> None:
     before = described.active().id
     for pca, code in ((PHOTOS, "pca_too_few_rows"), (17, "pca_too_many_dimensions")):
-        assert refusal(described.finish(described.start(JobKind.PCA, pca=pca))) == code
+        assert failure_code(described.finish(described.start(JobKind.PCA, pca=pca))) == code
     assert described.active().id == before
 
 
@@ -293,18 +288,18 @@ def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
         averages.upload_bytes(photo_bytes(1) + bytes([number]))
     averages.drain()
     job = averages.finish(averages.start(JobKind.PCA, pca=2))
-    assert refusal(job) == "pca_too_many_dimensions"
+    assert failure_code(job) == "pca_too_many_dimensions"
 
 
 def test_a_whitening_is_not_fitted_on_rows_of_another_release(
     described: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extractor_module, "DECODER", "another release")
-    assert refusal(described.finish(described.start(JobKind.PCA, pca=3))) == "spec_differs"
+    assert failure_code(described.finish(described.start(JobKind.PCA, pca=3))) == "spec_differs"
 
 
 def test_a_map_without_descriptors_is_refused(averages: Workplace) -> None:
-    assert refusal(averages.finish(averages.start(JobKind.PCA, pca=3))) == "nothing_described"
+    assert failure_code(averages.finish(averages.start(JobKind.PCA, pca=3))) == "nothing_described"
 
 
 def test_a_cancelled_pca_changes_nothing(described: Workplace) -> None:

@@ -17,7 +17,7 @@ from shared.jobs import JobState
 from shared.storage import FolderStore
 from tests.integration.extractor.small_gpu import make_too_heavy
 from tests.integration.workplace import Workplace, expected_row, same
-from tests.support.catalog_rows import set_columns
+from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 
 # tests/faults/test_kills.py kills extractors on SQLite.
@@ -40,16 +40,15 @@ class Gate:
             self.seen.append(f"describe {len(pixels)}")
             return describe(made, pixels, *made_with)
 
-        def published(catalog: Any, store: Any, batch: Any, *more: Any) -> Any:
+        def published(context: Any, batch: Any, *more: Any) -> None:
             if len(batch.jobs) == BATCH:
                 self.waiting.set()
                 assert self.open.wait(WAIT_SECONDS)
-            outcome = publish(catalog, store, batch, *more)
+            publish(context, batch, *more)
             self.seen.append(f"published {len(batch.jobs)}")
-            return outcome
 
         monkeypatch.setattr(Extractor, "describe", described)
-        monkeypatch.setattr("services.extractor.worker.publish", published)
+        monkeypatch.setattr("services.extractor.describe.publish", published)
 
     def await_seen(self, *expected: str) -> None:
         deadline = time.monotonic() + WAIT_SECONDS
@@ -172,7 +171,7 @@ def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_t
             raise RuntimeError("a row of the wrong length")
         return publish(*arguments)
 
-    monkeypatch.setattr("services.extractor.worker.publish", crash_once)
+    monkeypatch.setattr("services.extractor.describe.publish", crash_once)
     photo_ids = averages.upload(*range(2 * BATCH))
     averages.drain()
     jobs = [averages.job_of(photo_id) for photo_id in photo_ids]
@@ -209,8 +208,7 @@ def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
     assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
     refused = averages.job_of(photo_ids[1])
     assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
-    assert refused.error is not None
-    assert refused.error["code"] == "gpu_out_of_memory"
+    assert problem_of(refused)["code"] == "gpu_out_of_memory"
     rows = averages.rows()
     for number, photo_id in ((1, photo_ids[0]), (2, photo_ids[2])):
         assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))

@@ -118,7 +118,7 @@ def test_describing_the_photos_again_leaves_the_vocabulary_pending(
     with pooled.catalog.write() as session:
         outdated = session.get_one(type(generation), generation.id)
         outdated.spec, outdated.spec_fingerprint = spec, "0" * 64
-    started = reindex_outdated_generations(pooled.catalog, pooled.worker._models)
+    started = reindex_outdated_generations(pooled.catalog, pooled.worker.context.models)
     assert started == 1
     switch = newest_job(pooled, JobKind.SWITCH)
     assert switch is not None

@@ -19,26 +19,11 @@ from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
 from shared.jobs import JobKind, JobState
 from tests.integration.workplace import Workplace, same
+from tests.support.catalog_rows import problem_of
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_model_changes.py changes models on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
-
-
-@pytest.fixture
-def make_set(
-    make_worker: Callable[[], ExtractorWorker],
-) -> Callable[[str], ExtractorWorker]:
-    """Makes an extractor whose PRECISION is that one."""
-
-    def make(precision: str) -> ExtractorWorker:
-        worker = make_worker()
-        worker._models._settings = worker._models._settings.model_copy(
-            update={"precision": precision}
-        )
-        return worker
-
-    return make
 
 
 def row(precision: Precision, number: int) -> Any:
@@ -54,12 +39,12 @@ def precision_of(generation: Generation) -> str:
 
 
 def test_photos_join_a_generation_in_the_precision_that_it_was_begun_in(
-    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     assert not same(row("float32", 2), row("bfloat16", 2)), "else this test could not fail"
     first = averages.upload(1)
     averages.drain()
-    averages._worker = make_set("bfloat16")
+    averages._worker = make_worker(precision="bfloat16")
     second = averages.upload(2)
     query = averages.ask(photo_bytes(3))
     averages.drain()
@@ -71,13 +56,13 @@ def test_photos_join_a_generation_in_the_precision_that_it_was_begun_in(
 
 
 def test_setting_decides_for_a_map_that_begins(
-    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
-    averages._worker = make_set("bfloat16")
+    averages._worker = make_worker(precision="bfloat16")
     (photo_id,) = averages.upload(2)
     averages.drain()
     assert precision_of(averages.active()) == "bfloat16"
-    averages._worker = make_set("auto")  # another machine of the fleet, without a GPU
+    averages._worker = make_worker(precision="auto")  # another machine of the fleet, without a GPU
     (other,) = averages.upload(3)
     averages.drain()
     assert same(averages.rows()[photo_id], row("bfloat16", 2))
@@ -85,11 +70,11 @@ def test_setting_decides_for_a_map_that_begins(
 
 
 def test_model_change_brings_the_other_precision_to_all_photos(
-    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
     averages.drain()
-    averages._worker = make_set("bfloat16")
+    averages._worker = make_worker(precision="bfloat16")
     job = averages.finish(averages.start(JobKind.SWITCH, vocabulary_id=None))
     assert job.state == JobState.SUCCEEDED
     assert precision_of(averages.active()) == "bfloat16"
@@ -99,12 +84,12 @@ def test_model_change_brings_the_other_precision_to_all_photos(
 
 
 def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
-    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     averages.upload(*range(6))
     averages.drain()
     whole = averages.active().spec
-    averages._worker = make_set("bfloat16")
+    averages._worker = make_worker(precision="bfloat16")
     job = averages.finish(averages.start(JobKind.PCA, pca=2))
     assert job.state == JobState.SUCCEEDED, job.error
     shortened = averages.active().spec
@@ -113,11 +98,11 @@ def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
 
 
 def test_another_setting_alone_describes_nothing_anew(
-    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     averages.upload(1)
     averages.drain()
-    models: ModelRegistry = make_set("bfloat16")._models
+    models: ModelRegistry = make_worker(precision="bfloat16").context.models
     assert reindex_outdated_generations(averages.catalog, models) == 0
 
 
@@ -129,9 +114,8 @@ def test_photos_wait_where_the_generations_precision_is_not_known(averages: Work
     averages.drain()
     job = averages.job_of(photo_id)
     assert (job.state, job.attempts) == (JobState.QUEUED, 0)
-    assert job.error is not None
-    assert job.error["code"] == "spec_differs"
-    assert "float8" in job.error["detail"]
+    assert problem_of(job)["code"] == "spec_differs"
+    assert "float8" in problem_of(job)["detail"]
 
 
 def _set_precision(place: Workplace, generation_id: UUID, precision: str) -> None:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.extractor.fits import STAGES, FitProgress
+from services.extractor import fits
 from shared.catalog.generations import GenerationState
 from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.errors import Conflict
-from shared.jobs import JobKind, JobState
+from shared.jobs import JobKind, JobState, progress
+from shared.jobs.progress import JobProgress
 from tests.integration.extractor.model_changes import (
     PHOTOS,
     WIDTH,
@@ -26,6 +27,7 @@ from tests.integration.extractor.model_changes import (
     some_centres,
 )
 from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_model_changes.py and test_serve_models.py switch maps on SQLite.
@@ -38,16 +40,16 @@ def test_a_fit_can_be_cancelled_in_each_stage(
 ) -> None:
     old = fitted.active().id
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
-    real = FitProgress.report
+    real = JobProgress.update
 
-    def cancel_there(self: FitProgress, *news: Any) -> None:
-        if STAGES[news[0]] == stage:
+    def cancel_there(self: JobProgress, done: int, now: str | None = None) -> None:
+        if now == stage:
             fitted.cancel(job_id)
-            self._written = 0.0  # the next look at the job is now
-        real(self, *news)
+        real(self, done, now)
 
     with monkeypatch.context() as patched:
-        patched.setattr(FitProgress, "report", cancel_there)
+        patched.setattr(progress, "PROGRESS_SECONDS", 0.0)
+        patched.setattr(JobProgress, "update", cancel_there)
         fitted.drain()
     assert fitted.job(job_id).state == JobState.CANCELLED
     assert fitted.building() is None
@@ -62,14 +64,14 @@ def test_a_worker_that_stops_gives_its_fit_back(
 ) -> None:
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
     stop = threading.Event()
-    real = FitProgress.report
+    real = fits.compute_fit
 
-    def stop_there(self: FitProgress, *news: Any) -> None:
+    def stop_and_fit(*arguments: Any) -> Any:
         stop.set()
-        real(self, *news)
+        return real(*arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(FitProgress, "report", stop_there)
+        patched.setattr(fits, "compute_fit", stop_and_fit)
         fitted.worker.fits.run_next(stop)
     job = fitted.job(job_id)
     assert (job.lease_token, job.attempts) == (None, 0)
@@ -183,10 +185,8 @@ def test_an_unusable_vocabulary_is_refused_with_the_reason_and_changes_nothing(
     }
     for reason, data in unfit.items():
         job = fitted.finish(import_file(fitted, data))
-        assert job.state == JobState.FAILED, reason
-        assert job.error is not None
-        assert job.error["code"] == "vocabulary_unusable"
-        assert reason in job.error["detail"]
+        assert failure_code(job) == "vocabulary_unusable", reason
+        assert reason in problem_of(job)["detail"]
     assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
     assert fitted.building() is None
 
@@ -219,9 +219,7 @@ def test_a_switch_that_can_not_be_fails_with_the_reason(
         (None, "vocabulary_unusable"),  # the extractor needs one
     ):
         job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=vocabulary_id))
-        assert job.state == JobState.FAILED
-        assert job.error is not None
-        assert job.error["code"] == code
+        assert failure_code(job) == code
     assert fitted.active().id == old.id
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 from collections.abc import Callable
@@ -13,8 +14,8 @@ import pytest
 
 from services.extractor import fits
 from services.extractor.child_process import ChildKilled
-from services.extractor.fits import FIT_PROGRESS_UNITS, FitProgress, FitWorker
-from services.extractor.model_registry import ModelRegistry
+from services.extractor.fits import FIT_PROGRESS_UNITS
+from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import model_changes, reindex_jobs
 from services.steward.tasks.garbage_collection import collect_garbage
 from services.steward.tasks.model_changes import advance_model_changes
@@ -27,7 +28,8 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
 from shared.integrity.verify import discard_chunk
-from shared.jobs import Job, JobKind, JobState
+from shared.jobs import Job, JobKind, JobState, progress
+from shared.jobs.progress import JobProgress
 from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import cancel_job, requeue_job_as_new, retry_job
 from tests.integration.extractor.model_changes import (
@@ -39,7 +41,7 @@ from tests.integration.extractor.model_changes import (
     some_centres,
 )
 from tests.integration.workplace import FIT, Workplace, expected_row, same
-from tests.support.checkpoints import none_added
+from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
 # tests/e2e/test_model_changes.py fits vocabularies on SQLite.
@@ -125,17 +127,13 @@ def test_a_fit_that_names_no_number_makes_as_many_clusters_as_the_extractors_nam
 
 def test_a_fit_without_photos_fails_with_the_reason(vlads: Workplace) -> None:
     job = vlads.fit()
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    assert job.error["code"] == "no_photos"
+    assert failure_code(job) == "no_photos"
 
 
 def test_a_fit_on_photos_that_no_one_can_decode_fails_with_the_reason(vlads: Workplace) -> None:
     vlads.upload_bytes(b"nothing")
     job = vlads.fit()
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    assert job.error["code"] == "no_photos"
+    assert failure_code(job) == "no_photos"
 
 
 def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: Workplace) -> None:
@@ -143,9 +141,7 @@ def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: 
     averages.drain()
     generation = averages.active().id
     for job in (averages.fit(), averages.finish(import_file(averages, npy(some_centres(3))))):
-        assert job.state == JobState.FAILED
-        assert job.error is not None
-        assert job.error["code"] == "vocabulary_unusable"
+        assert failure_code(job) == "vocabulary_unusable"
     assert averages.active().id == generation
 
 
@@ -157,14 +153,13 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
     """The child opens the catalog and the store of the settings itself."""
     with_child = workplace_of("test-tiny-vlad")
     with_child.upload(*range(PHOTOS))
-    progress: list[tuple[str | None, int]] = []
-    real = FitProgress.report
+    reported: list[tuple[str | None, int]] = []
+    real = JobProgress.update
 
-    def report(self: FitProgress, *news: Any) -> None:
-        self._written = 0.0  # so that each is stored
+    def update(self: JobProgress, *news: Any) -> None:
         real(self, *news)
         job = with_child.job(job_id)
-        progress.append((job.stage, job.progress_done))
+        reported.append((job.stage, job.progress_done))
 
     settings = with_child.settings.model_copy(
         update={
@@ -173,13 +168,12 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
             "device": "cpu",
         }
     )
-    monkeypatch.setattr(FitProgress, "report", report)
+    monkeypatch.setattr(progress, "PROGRESS_SECONDS", 0.0)
+    monkeypatch.setattr(JobProgress, "update", update)
     job_id = with_child.start(JobKind.FIT, **FIT)
-    models = ModelRegistry(with_child.store, settings, none_added)
-    worker = FitWorker(
-        with_child.catalog, with_child.store, models, settings, "with a child", lambda *_: None
-    )
-    assert worker.run_next(threading.Event())
+    worker = ExtractorWorker(with_child.catalog, with_child.store, settings, "with a child")
+    with contextlib.closing(worker):
+        assert worker.fits.run_next(threading.Event())
     total = with_child.job(job_id).progress_total
     with_child.finish(job_id)
     ours, expected = (
@@ -190,7 +184,7 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
     )
     # The child has other threads, which sum in another order.
     np.testing.assert_allclose(ours.array, expected.array, atol=1e-3)
-    stages, done = zip(*progress, strict=True)
+    stages, done = zip(*reported, strict=True)
     assert [stage for stage, _ in itertools.groupby(stages)] == ["sample", "cluster"]
     assert list(done) == sorted(done)
     assert (done[-1], total) == (PHOTOS + FIT_PROGRESS_UNITS, 2 * PHOTOS + FIT_PROGRESS_UNITS)
@@ -212,8 +206,7 @@ def test_a_fit_whose_process_is_killed_is_tried_again_and_then_fails(
     job = fitted.job(job_id)
     assert job.state == JobState.FAILED
     assert next(deaths) == MAX_ATTEMPTS + 1
-    assert job.error is not None
-    assert job.error["code"] == "worker_crashed"
+    assert problem_of(job)["code"] == "worker_crashed"
     assert "its process was killed (SIGKILL)" in caplog.text
     monkeypatch.undo()
     assert fitted.active().id == old
@@ -334,8 +327,7 @@ def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing
     delete_done_reindex_jobs(fitted.catalog)
     (failed,) = fitted.reindex_jobs(new)
     assert (failed.state, failed.photo_id) == (JobState.FAILED, bad)
-    assert failed.error is not None
-    assert failed.error["code"] == "undecodable_photo"
+    assert problem_of(failed)["code"] == "undecodable_photo"
     assert fitted.job_of(bad).id == failed.id  # the photo says so itself
     assert all(fitted.job_of(photo_id).state == JobState.SUCCEEDED for photo_id in good)
 
@@ -395,11 +387,10 @@ def test_a_change_that_loses_more_than_one_per_cent_of_the_searchable_photos_fai
     spoil(fitted, bad)
     job = fitted.finish(job_id)
     assert (job.state, job.progress_failed) == (JobState.FAILED, 1)
-    assert job.error is not None
-    assert job.error["code"] == "change_loses_photos"
-    assert (job.error["lost"], job.error["searchable"]) == (1, PHOTOS)
-    assert job.error["file_ids"] == [str(bad)]
-    assert f"the photo {bad}: The photo can't be decoded" in job.error["detail"]
+    assert problem_of(job)["code"] == "change_loses_photos"
+    assert (problem_of(job)["lost"], problem_of(job)["searchable"]) == (1, PHOTOS)
+    assert problem_of(job)["file_ids"] == [str(bad)]
+    assert f"the photo {bad}: The photo can't be decoded" in problem_of(job)["detail"]
     assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
     assert fitted.generation(new).state == GenerationState.ABANDONED
     fitted.delete(bad)

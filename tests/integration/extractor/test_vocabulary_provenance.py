@@ -18,6 +18,7 @@ from shared.imaging import preprocessing
 from shared.jobs import JobKind, JobState
 from shared.storage.keys import new_vocabulary_key
 from tests.integration.workplace import FIT, Workplace
+from tests.support.catalog_rows import failure_code, problem_of
 
 # tests/e2e/test_vocabulary_command.py exports and imports vocabularies on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
@@ -101,13 +102,11 @@ def test_a_vocabulary_of_other_weights_is_refused_with_both_specs(vlads: Workpla
     before = vlads.active().id
     other = vocabulary_file(backbone="dinov2-vits14", backbone_fingerprint="cd" * 32, layer="10")
     job = vlads.finish(import_file(vlads, other, "vits14.npz"))
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    assert job.error["code"] == "vocabulary_unusable"
-    assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in job.error["detail"]
-    assert "test-tiny-vlad computes test-tiny (weights" in job.error["detail"]
-    assert job.error["learnt_with"]["backbone"] == "dinov2-vits14"
-    assert job.error["extractor_makes"] == tiny_features()
+    assert failure_code(job) == "vocabulary_unusable"
+    assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in problem_of(job)["detail"]
+    assert "test-tiny-vlad computes test-tiny (weights" in problem_of(job)["detail"]
+    assert problem_of(job)["learnt_with"]["backbone"] == "dinov2-vits14"
+    assert problem_of(job)["extractor_makes"] == tiny_features()
     assert vlads.active().id == before
 
 
@@ -120,10 +119,8 @@ def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace)
         retained = session.get_one(Vocabulary, first)
         retained.provenance = {**retained.provenance, "backbone_fingerprint": "ef" * 32}
     job = vlads.finish(vlads.start(JobKind.SWITCH, vocabulary_id=str(first)))
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    assert job.error["code"] == "vocabulary_unusable"
-    assert "efefefefefef" in job.error["detail"]
+    assert failure_code(job) == "vocabulary_unusable"
+    assert "efefefefefef" in problem_of(job)["detail"]
 
 
 def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switched_to(
@@ -146,12 +143,10 @@ def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switche
     refused = upgraded.finish(
         upgraded.start(JobKind.SWITCH, vocabulary_id=str(former.vocabulary_id))
     )
-    assert refused.state == JobState.FAILED
-    assert refused.error is not None
-    assert refused.error["code"] == "vocabulary_unusable"
-    assert "square32 version 1; the extractor" in refused.error["detail"].replace("name ", "")
-    assert refused.error["learnt_with"]["preprocessing"] == version_1
-    assert refused.error["extractor_makes"]["preprocessing"] == version_2
+    assert failure_code(refused) == "vocabulary_unusable"
+    assert "square32 version 1; the extractor" in problem_of(refused)["detail"].replace("name ", "")
+    assert problem_of(refused)["learnt_with"]["preprocessing"] == version_1
+    assert problem_of(refused)["extractor_makes"]["preprocessing"] == version_2
     assert upgraded.active().id == former.id
 
     # Of unknown origin: that it belongs to the extractor was someone's word, and still is.

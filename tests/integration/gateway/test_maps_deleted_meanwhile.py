@@ -49,7 +49,7 @@ def before_publishing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[],
                 break
             return publish(*arguments)
 
-        monkeypatch.setattr("services.extractor.worker.publish", act_and_publish)
+        monkeypatch.setattr("services.extractor.describe.publish", act_and_publish)
 
     return meanwhile
 

@@ -191,18 +191,18 @@ def test_a_steward_counts_its_tasks_and_repairs(
         add_job(session, map_id)
     expire_lease(catalog, take(catalog, 1)[0].id)
     tasks = {task.name: task for task in steward.tasks}
-    for name in ("reclaim leases", "resend wakeups", "collect"):
+    for name in ("reclaim_leases", "resend_wakeups", "collect_garbage"):
         steward._run_task(tasks[name])
-    tasks["compact"].run = lambda: 1 / 0
-    steward._run_task(tasks["compact"])
+    tasks["merge_small_chunks"].run = lambda: 1 / 0
+    steward._run_task(tasks["merge_small_chunks"])
     value = registry.get_sample_value
     assert value("placewise_steward_leases_expired_total") == 1
     assert value("placewise_steward_wakeups_resent_total") == 1
     counted = "placewise_steward_tasks_total"
     assert value(counted, {"task": "reclaim_leases", "outcome": "done"}) == 1
-    assert value(counted, {"task": "compact", "outcome": "failed"}) == 1
-    assert value("placewise_steward_task_lag_seconds", {"task": "collect"}) is not None
-    assert value("placewise_steward_task_lag_seconds", {"task": "compact"}) is None
+    assert value(counted, {"task": "merge_small_chunks", "outcome": "failed"}) == 1
+    assert value("placewise_steward_task_lag_seconds", {"task": "collect_garbage"}) is not None
+    assert value("placewise_steward_task_lag_seconds", {"task": "merge_small_chunks"}) is None
 
 
 def test_figures_are_answered_on_a_port_of_their_own(

@@ -14,6 +14,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
+from shared.config.settings import Settings
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import JobKind, JobState
 from shared.jobs.transitions import cancel_job, fail_job
@@ -32,14 +33,16 @@ from tests.support.catalog_rows import (
 # tests/e2e/test_estimates.py has a map on SQLite evaluated by itself.
 pytestmark = pytest.mark.databases("postgresql")
 
-LEAST = 20
+LEAST = Settings().auto_evaluate_photos
 
 
 def automatic(town: Town, least_photos: int = LEAST) -> bool:
     """Whether the steward queues an evaluation now; it is done at once."""
     before = len(town.evaluation_jobs())
     for _ in range(2):  # the second time there is always one under way
-        evaluate_changed_maps(town.catalog, least_photos)
+        evaluate_changed_maps(
+            town.catalog, Settings().model_copy(update={"auto_evaluate_photos": least_photos})
+        )
     jobs = town.evaluation_jobs()[before:]
     assert len(jobs) <= 1
     if jobs:
@@ -121,13 +124,13 @@ def test_an_evaluation_that_came_to_nothing_is_not_tried_again_before_the_next_c
         assert automatic(town)
         town.publish([(100 + n, at(40 + n)) for n in range(LEAST)])
     done = len(town.evaluation_jobs())
-    evaluate_changed_maps(town.catalog, LEAST)
+    evaluate_changed_maps(town.catalog, Settings())
     job = town.evaluation_jobs()[-1]
     with town.catalog.write() as session:
         mine = get_job(session, town.map_id, job.id, lock=True)
         cancel_job(mine) if end == "is cancelled" else fail_job(mine, {"code": "out_of_luck"})
     for _ in range(3):
-        evaluate_changed_maps(town.catalog, LEAST)
+        evaluate_changed_maps(town.catalog, Settings())
     assert len(town.evaluation_jobs()) == done + 1
     town.publish([(200 + n, at(-40 + n)) for n in range(2 * LEAST)])
     assert automatic(town)
@@ -155,7 +158,7 @@ def test_two_stewards_queue_one_evaluation(town: Town) -> None:
     def look() -> None:
         together.wait()
         for _ in range(3):
-            evaluate_changed_maps(town.catalog, LEAST)
+            evaluate_changed_maps(town.catalog, Settings())
 
     with ThreadPoolExecutor(4) as pool:
         for look_ in [pool.submit(look) for _ in range(4)]:

@@ -144,7 +144,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     chunk_map.age(orphans, 2 * DAY_SECONDS)
     metrics = StewardMetrics(CollectorRegistry())
     steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings, metrics)
-    (task,) = [task for task in steward.tasks if task.name == "collect orphans"]
+    (task,) = [task for task in steward.tasks if task.name == "collect_orphans"]
     assert MAX_ORPHAN_SHARE * len(live | orphans) < 4
 
     task.run()

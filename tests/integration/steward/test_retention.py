@@ -10,10 +10,12 @@ import pytest
 from sqlalchemy import select, update
 
 from services.steward.tasks import maintenance
+from services.steward.tasks.maintenance import JOB_RETENTION_DAYS as DAYS
 from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Search, get_map
+from shared.config.settings import Settings
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job
@@ -21,7 +23,6 @@ from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
 DAY_SECONDS = 86_400.0
-DAYS = 30.0
 
 
 def age_jobs(catalog: Catalog, days: float) -> None:
@@ -56,13 +57,13 @@ def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: 
             session, map_id, JobKind.FIT, state=JobState.FAILED, finished_at=db_now_plus(0)
         ).id
     age_jobs(catalog, DAYS - 0.01)
-    delete_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog)
     assert jobs(catalog) == {done, response, str(failed_fit)}
     age_jobs(catalog, DAYS + 0.01)
     recent = service.upload(photo_bytes(2))["job_id"]
     service.drain()
     waiting = service.upload(photo_bytes(3))["job_id"]
-    delete_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog)
     assert jobs(catalog) == {recent, waiting}
     problem(service("GET", f"/jobs/{done}"), 404, "job_not_found")
 
@@ -71,7 +72,7 @@ def test_a_described_photo_needs_its_job_no_more(service: Service, catalog: Cata
     first = service.upload(photo_bytes(1))
     service.drain()
     age_jobs(catalog, DAYS + 1)
-    delete_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog)
     assert jobs(catalog) == set()
     status, again = upload_again(service, photo_bytes(1))
     assert (status, again["file_id"], again["job_id"]) == (200, first["file_id"], None)
@@ -92,7 +93,7 @@ def test_a_photo_that_was_not_described_keeps_its_job_and_can_be_queued_again(
         service.json("POST", f"/jobs/{first['job_id']}/cancel")
     service.drain()
     age_jobs(catalog, 10 * DAYS)
-    delete_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog)
     assert service.json("GET", f"/jobs/{first['job_id']}")["state"] == end
     status, again = upload_again(service, data)
     assert (status, again["job_id"], again["status"]) == (202, first["job_id"], "queued")
@@ -107,7 +108,7 @@ def test_an_old_failure_that_was_tried_again_is_not_old(service: Service, catalo
     service.json("POST", f"/jobs/{job_id}/cancel")
     age_jobs(catalog, 10 * DAYS)
     service.json("POST", f"/jobs/{job_id}/retry")
-    delete_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog)
     assert service.json("GET", f"/jobs/{job_id}")["state"] == "queued"
 
 
@@ -119,7 +120,7 @@ def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog
     with catalog.write() as session:
         session.get_one(Search, UUID(old)).searched_at = datetime.now(UTC) - timedelta(days=91)
         session.get_one(Search, UUID(recent)).searched_at = datetime.now(UTC) - timedelta(days=89)
-    delete_old_searches(catalog, 90)
+    delete_old_searches(catalog, Settings())
     found = service.json("GET", "/searches")["searches"]
     assert [search["search_id"] for search in found] == [recent]
     assert service.json("GET", "/database/stats")["total_searches"] == 1
@@ -137,10 +138,10 @@ def test_more_than_one_transaction_takes_goes_in_several(
                 map_id,
                 JobKind.EVALUATE,
                 state=JobState.SUCCEEDED,
-                finished_at=db_now_plus(-2 * DAY_SECONDS),
+                finished_at=db_now_plus(-2 * DAYS * DAY_SECONDS),
             )
     left = []
     for _ in range(3):
-        delete_old_jobs(catalog, 1)
+        delete_old_jobs(catalog)
         left.append(len(jobs(catalog)))
     assert left == [3, 1, 0]

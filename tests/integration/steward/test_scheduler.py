@@ -9,7 +9,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
-from services.steward.scheduler import PeriodicTask, Scheduler
+from services.steward.periodic_tasks import PeriodicTask
+from services.steward.scheduler import Scheduler
 from services.steward.tasks import auto_fit
 from services.steward.tasks.compaction import COMPACT_CHUNKS, merge_slot
 from services.steward.tasks.garbage_collection import (

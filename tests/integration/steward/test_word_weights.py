@@ -273,7 +273,7 @@ def small_samples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def queued(city: City) -> str | None:
     """The kind of job that the steward queues now; it is done at once."""
-    evaluate_changed_maps(city.catalog, 20)
+    evaluate_changed_maps(city.catalog, Settings())
     with city.catalog.read() as session:
         job = session.query(Job).filter(Job.state == JobState.QUEUED).one_or_none()
     if job is None:

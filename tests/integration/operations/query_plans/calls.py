@@ -39,7 +39,7 @@ from tests.integration.operations.query_plans.fill import LARGEST_MAP, Synthetic
 # Calls that may read a whole map: a periodic count, an evaluation, and substrings of file names
 # that are too short for an index.
 KNOWN_FULL_SCANS = (
-    "steward: count large maps",
+    "steward: update_statistics_of_large_maps",
     "evaluation: located photos",
     "GET /search?filename=zq",
 )
@@ -110,8 +110,8 @@ def _all_calls(
         base_url="http://localhost",
     )
     steward = Scheduler(catalog, store, InProcessWakeups(), settings)
-    # First, because requests read its counts.
-    for task in sorted(steward.tasks, key=lambda task: task.name != "count large maps"):
+    counts = "update_statistics_of_large_maps"  # first, because requests read them
+    for task in sorted(steward.tasks, key=lambda task: task.name != counts):
         yield f"steward: {task.name}", task.run
     yield from _gateway_requests(client, catalog, filled, ids)
     yield from _extractor_calls(catalog)

@@ -1,0 +1,232 @@
+"""Handler of `index`, `reindex` and `describe` jobs: describes the photos of a batch.
+
+A batch that is reindexed needs no photos if its rows follow from those of the active generation:
+with the same spec before PCA, they are projected; with the same spec and more precision, they are
+rounded.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import select
+
+from services.extractor.generation_resolver import (
+    ResolvedGeneration,
+    requeue_until_vocabulary,
+    resolve_generation,
+)
+from services.extractor.handlers import ExtractorContext, JobBatch, handles
+from services.extractor.publish import photo_id_of, publish
+from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.database.session import Catalog
+from shared.catalog.generations import RowType, active_generation
+from shared.catalog.photos import Photo, get_live_photos
+from shared.descriptors.extractor import not_finite_error
+from shared.descriptors.inference import PhotoTooLargeForGpu
+from shared.errors import NotFound, PlacewiseError
+from shared.imaging.decode import DecodedPhoto
+from shared.imaging.file_formats import Previews
+from shared.jobs import Job, JobKind
+from shared.storage import ObjectStore
+from shared.storage.chunks import Row, Rows, read_row, rows_are_valid
+from shared.storage.keys import preview_key, query_key, query_preview_key, thumbnail_key
+
+log = logging.getLogger(__name__)
+
+PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
+
+
+@handles(JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE)
+def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None]:
+    """Prepare, describe and publish the photos of claimed jobs."""
+    target = resolve_generation(context.catalog, context.store, context.models, batch.jobs[0])
+    if target is None:
+        requeue_until_vocabulary(context.catalog, batch)
+        return
+    photos = _read_rows(context, batch, target) or _read_photos(context, batch, target)
+    yield
+    with batch.timed("describe"):
+        rows = photos.compute_rows(target.generation.dimension)
+    yield
+    with batch.timed("publish"):
+        publish(context, batch, target.generation, photos.ready, photos.failed, rows)
+
+
+@dataclass(slots=True)
+class _PreparedPhotos:
+    """The photos of a batch."""
+
+    convert: Callable[[list[NDArray[Any]]], Rows]
+    """Computes (n, dimension) rows of n inputs."""
+    ready: list[Job] = field(default_factory=list)
+    inputs: list[NDArray[Any]] = field(default_factory=list)
+    """The pixels, or else a stored row, of each of the jobs in `ready`."""
+    failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
+    """Jobs whose photo can't be described, each with the reason."""
+
+    def compute_rows(self, dimension: int) -> Rows:
+        """Compute a row for each job of `ready`.
+
+        Photos that are too large for the GPU's memory, and those whose row is not finite, are moved
+        to `failed`.
+        """
+        while self.ready:
+            try:
+                rows = self.convert(self.inputs)
+            except PhotoTooLargeForGpu as error:
+                self._reject(error.place, error)
+                continue
+            finite = np.isfinite(rows).all(axis=1)
+            for index in reversed(np.flatnonzero(~finite).tolist()):
+                self._reject(index, not_finite_error())
+            return rows[finite]
+        return np.empty((0, dimension), np.float32)
+
+    def _reject(self, index: int, error: PlacewiseError) -> None:
+        del self.inputs[index]
+        self.failed.append((self.ready.pop(index), error))
+
+
+def _read_photos(
+    context: ExtractorContext, batch: JobBatch, target: ResolvedGeneration
+) -> _PreparedPhotos:
+    """Read and decode the photos; store thumbnails and previews of new ones.
+
+    Deleted photos are left out. Query photos get a preview if not all browsers show their format.
+    """
+    photos = _PreparedPhotos(
+        lambda pixels: target.extractor.describe(pixels, target.centres, target.projection)
+    )
+    with batch.timed("read"):
+        keys = _photo_object_keys(context.catalog, batch.jobs)
+    present: list[Job] = []
+
+    def read() -> Iterator[bytes]:
+        # Read as they are decoded: a batch of the largest photos would take gigabytes.
+        for job in batch.jobs:
+            if job.id not in keys:
+                continue
+            try:
+                with batch.timed("read"):
+                    data = context.store.get(keys[job.id])
+            except NotFound as error:
+                # Deleted since the catalog was read, or lost: `publish` checks under the map's
+                # lock.
+                photos.failed.append((job, error))
+                continue
+            present.append(job)
+            yield data
+
+    previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
+    with batch.timed("decode"):
+        outcomes = context.decoders.decode(
+            read(), target.extractor.preprocessing, previews=previews
+        )
+    # Stored here and not with the chunk, while the model runs the previous batch.
+    with batch.timed("thumbnails"):
+        for job, outcome in zip(present, outcomes, strict=True):
+            if isinstance(outcome, PlacewiseError):
+                photos.failed.append((job, outcome))
+                continue
+            photos.ready.append(job)
+            photos.inputs.append(outcome.pixels)
+            _store_previews(context.store, job, outcome)
+    return photos
+
+
+def _store_previews(store: ObjectStore, job: Job, decoded: DecodedPhoto) -> None:
+    if job.kind == JobKind.INDEX:
+        store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
+    if decoded.preview is not None:
+        is_query = job.kind == JobKind.DESCRIBE
+        key = query_preview_key(job.id) if is_query else preview_key(photo_id_of(job))
+        store.put(key, decoded.preview)
+
+
+def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
+    """Return the object key of each job's photo; deleted photos are left out."""
+    if jobs[0].kind == JobKind.DESCRIBE:
+        return {job.id: query_key(job.id) for job in jobs}
+    with catalog.read() as session:
+        found = session.execute(
+            select(Job.id, Photo.object_key)
+            .join(Photo, Photo.id == Job.photo_id)
+            .where(Job.id.in_([job.id for job in jobs]), Photo.deleted_at.is_(None))
+        )
+        return {row.id: row.object_key for row in found}
+
+
+def _read_rows(
+    context: ExtractorContext, batch: JobBatch, target: ResolvedGeneration
+) -> _PreparedPhotos | None:
+    """Read stored rows instead of the photos of REINDEX jobs; deleted photos are left out.
+
+    Returns None if the photos have to be described: the target's rows do not follow from those of
+    the active generation, or the row of a photo is missing.
+    """
+    if batch.kind != JobKind.REINDEX:
+        return None
+    with batch.timed("read"):
+        photo_ids = [photo_id_of(job) for job in batch.jobs]
+        with context.catalog.read() as session:
+            source = active_generation(session, batch.jobs[0].map_id)
+            live = get_live_photos(session, photo_ids).keys()
+        if source is None:
+            return None
+        row_types = (source.row_type, target.generation.row_type)
+        if source.spec == target.spec and row_types == (RowType.FLOAT32, RowType.FLOAT16):
+            projection = None
+        elif target.projection and source.spec == target.extractor.spec(target.centres):
+            projection = target.projection
+        else:
+            return None
+        rows = read_stored_rows(context.catalog, context.store, source.id, photo_ids)
+        if live - rows.keys():
+            return None
+
+    def convert(rows: list[Row]) -> Rows:
+        stacked = np.stack(rows)
+        return stacked if projection is None else projection.project(stacked)
+
+    ready = [job for job in batch.jobs if job.photo_id in rows]
+    return _PreparedPhotos(convert, ready, [rows[photo_id_of(job)] for job in ready])
+
+
+def read_stored_rows(
+    catalog: Catalog, store: ObjectStore, generation_id: UUID, photo_ids: Sequence[UUID]
+) -> dict[UUID, Row]:
+    """Return the (dimension,) rows of those photos that are live and described in the generation.
+
+    A row that can't be read, or whose norm is neither 1 nor 0, is left out and logged: its photo
+    has to be described again.
+    """
+    with catalog.read() as session:
+        live = get_live_photos(session, photo_ids)
+        rows_by_chunk = find_descriptor_rows(session, generation_id, list(live))
+    rows = {}
+    for object_key in sorted(rows_by_chunk):
+        for row_number, photo_id in rows_by_chunk[object_key]:
+            row = read_chunk_row(store, object_key, row_number)
+            if row is not None:
+                rows[photo_id] = row
+    return rows
+
+
+def read_chunk_row(store: ObjectStore, object_key: str, row_number: int) -> Row | None:
+    """Return a (dimension,) row; None, and an error in the log, if it is missing or damaged."""
+    try:
+        row = read_row(store, object_key, row_number)
+    except (NotFound, IndexError, ValueError) as error:
+        log.error("row %d of the chunk %s can't be read: %s", row_number, object_key, error)
+        return None
+    if rows_are_valid(row[np.newaxis]).all():
+        return row
+    log.error("row %d of the chunk %s is not a valid descriptor", row_number, object_key)
+    return None

@@ -1,0 +1,135 @@
+"""Registry of the extractor's job handlers, which `worker` runs stage by stage.
+
+A handler is a generator that reads from top to bottom: prepare, describe, publish. Each `yield`
+ends a stage, because each of the three runs in another thread: batches are pipelined.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any
+
+from services.extractor.decoder_pool import DecoderPool
+from services.extractor.model_registry import ModelRegistry
+from shared.catalog.database.session import Catalog
+from shared.catalog.jobs import Job, JobKind
+from shared.config.settings import Settings
+from shared.jobs.runner import ClaimedJobs
+from shared.storage import ObjectStore
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractorContext:
+    """What the handlers of one worker share."""
+
+    catalog: Catalog
+    store: ObjectStore
+    settings: Settings
+    models: ModelRegistry
+    decoders: DecoderPool
+
+
+@dataclass(slots=True)
+class JobBatch(ClaimedJobs):
+    """Claimed jobs of one kind, map and generation, and what has become of them."""
+
+    stages: Iterator[None] = field(default_factory=lambda: iter(()))
+    """The running handler."""
+    prepared: Future[bool] = field(default_factory=Future)
+    """Whether a stage follows the preparation."""
+    outcomes: Counter[str] = field(default_factory=Counter)
+    """Number of jobs that succeeded, failed, were lost (taken over or cancelled) or are waiting."""
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    """Duration of each step."""
+
+    @contextlib.contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Add the duration of the block to those of the step."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[step] += time.perf_counter() - started
+
+
+Handler = Callable[[ExtractorContext, JobBatch], Iterator[None]]
+
+HANDLERS: dict[JobKind, Handler] = {}
+
+
+def handles(*kinds: JobKind) -> Callable[[Handler], Handler]:
+    """Register the function as the handler of these kinds."""
+
+    def register(handler: Handler) -> Handler:
+        HANDLERS.update(dict.fromkeys(kinds, handler))
+        return handler
+
+    return register
+
+
+ModelChange = Callable[[ExtractorContext, Job], None]
+
+
+def handles_model_change(kind: JobKind) -> Callable[[ModelChange], ModelChange]:
+    """Register the function as the handler of one job at a time, which has one stage."""
+
+    def register(change_model: ModelChange) -> ModelChange:
+        def handler(context: ExtractorContext, batch: JobBatch) -> Iterator[None]:
+            yield
+            with batch.timed("model_change"):
+                change_model(context, batch.jobs[0])
+
+        handles(kind)(handler)
+        return change_model
+
+    return register
+
+
+@dataclass(slots=True)
+class DrainStats:
+    """Statistics of one drain, as logs and Flower show them; several threads update it."""
+
+    maps: set[str] = field(default_factory=set)
+    claimed: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    seconds: Counter[str] = field(default_factory=Counter)
+    interrupted: bool = False
+    """Whether the drain stopped while there was work left."""
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add_claim(self, jobs: Sequence[Job]) -> None:
+        """Count claimed jobs of one map."""
+        with self._lock:
+            self.maps.add(str(jobs[0].map_id))
+            self.claimed += len(jobs)
+
+    def add_batch(self, batch: JobBatch) -> None:
+        """Add the outcomes of a batch and the seconds of its steps."""
+        with self._lock:
+            self.outcomes.update(batch.outcomes)
+            self.outcomes["failed"] += batch.failed
+            self.seconds.update(batch.seconds)
+
+    @property
+    def succeeded(self) -> int:
+        return self.outcomes["succeeded"]
+
+    @property
+    def failed(self) -> int:
+        return self.outcomes["failed"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the statistics as JSON, for logs and for Flower."""
+        return {
+            "maps": sorted(self.maps),
+            "claimed": self.claimed,
+            "succeeded": self.succeeded,
+            "failed": self.failed,
+            "seconds": {step: round(took, 3) for step, took in self.seconds.items()},
+        }
