@@ -21,7 +21,6 @@ from sqlalchemy import select
 from services.search.chunk_loader import (
     ChunkLoader,
     LoadedChunk,
-    generation_loader,
     hold_in_memory,
     memory_parts,
 )
@@ -88,7 +87,7 @@ def sync_snapshot(
     Returns:
         The new snapshot; None if the generation no longer exists.
     """
-    loader = generation_loader(store, folder, generation_id)
+    loader = ChunkLoader(store, folder / str(generation_id))
     with catalog.read() as session:
         generation = session.get(Generation, generation_id)
         if generation is None:

@@ -254,11 +254,6 @@ class ChunkLoader:
         )
 
 
-def generation_loader(store: ObjectStore, folder: Path, generation_id: UUID) -> ChunkLoader:
-    """Return the loader of a generation, whose files are cached below `folder`."""
-    return ChunkLoader(store, folder / str(generation_id))
-
-
 def list_generation_folders(folder: Path) -> list[Path]:
     """Return the cache folders of the generations."""
     return list(folder.iterdir()) if folder.is_dir() else []

@@ -6,7 +6,6 @@ and rank by float64 cosines; they differ in the certificate of the result.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from uuid import UUID
 
@@ -24,8 +23,6 @@ from shared.search_api.protocol import (
     SearchHit,
     SearchResponse,
 )
-
-log = logging.getLogger(__name__)
 
 # Largest plausible error in standard deviations (exceeded by one row in ten million); beyond it
 # the sign codes are not trusted.
@@ -194,22 +191,13 @@ class _Query:
 
     def _search_on_gpu(self) -> _ScoredRows | None:
         """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
-        resident = self.snapshot.gpu_snapshot
-        if resident is None or resident.failure is not None:
+        snapshot, k, min_score = self.snapshot, self.options.k, self.options.min_score
+        if snapshot.gpu is None:
             return None
-        from services.search.gpu import GpuError
-
-        options = self.options
-        try:
-            rows = resident.find_candidates(
-                self.vector, self.row_mask, options.k, options.min_score
-            )
-        except GpuError as error:
-            log.error(
-                "generation %s is searched by the CPU: %s", self.snapshot.generation_id, error
-            )
+        rows = snapshot.gpu.find_candidates(snapshot, self.vector, self.row_mask, k, min_score)
+        if rows is None:
             return None
-        scores = exact_scores(self.snapshot.chunks, self.vector, rows)
+        scores = exact_scores(snapshot.chunks, self.vector, rows)
         return _ScoredRows(rows, scores, EXHAUSTIVE, self._selected())
 
     def _search_by_sign_codes(self) -> _ScoredRows | None:
@@ -227,13 +215,7 @@ class _Query:
         result = search.search(first)
         if result.max_z > MAX_Z:
             return None
-        return _ScoredRows(
-            result.rows,
-            result.scores,
-            STATISTICAL,
-            result.scanned,
-            result.max_z,
-        )
+        return _ScoredRows(result.rows, result.scores, STATISTICAL, result.scanned, result.max_z)
 
     def _selected(self) -> int:
         return int(np.count_nonzero(self.row_mask))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -91,61 +92,55 @@ class _SnapshotCollector(Collector):
         self._worker = worker
 
     def collect(self) -> Iterable[Metric]:
-        status = self._worker.status()
-        prefix = METRIC_PREFIX
-        yield GaugeMetricFamily(
-            f"{prefix}_resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes
-        )
-        yield GaugeMetricFamily(
-            f"{prefix}_mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes
-        )
-        on_device = GaugeMetricFamily(
-            f"{prefix}_device_resident_bytes",
-            "Bytes of descriptors in a GPU's memory.",
-            labels=["device"],
-        )
-        failed = GaugeMetricFamily(
-            f"{prefix}_device_failed",
-            "1 while the CPU searches because the GPU has failed.",
-            labels=["device"],
-        )
-        for device in status.devices:
-            on_device.add_metric([device.name], device.resident_bytes)
-            failed.add_metric([device.name], float(device.failure is not None))
-        yield on_device
-        yield failed
+        status, batcher = self._worker.status(), self._worker.query_batcher
+        for name, text, value in (
+            ("resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes),
+            ("mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes),
+            ("rows", "Searchable rows.", status.rows),
+            ("missing_chunks", "Unreadable chunks.", len(status.missing)),
+        ):
+            yield GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, value)
+        scans = "First-level scans of the sign codes."
+        yield CounterMetricFamily(f"{METRIC_PREFIX}_code_scans", scans, batcher.batches_run)
+        queries = "Queries in first-level scans of the sign codes."
         yield CounterMetricFamily(
-            f"{prefix}_code_scans",
-            "First-level scans of the sign codes.",
-            self._worker.query_batcher.batches_run,
+            f"{METRIC_PREFIX}_code_scan_queries", queries, batcher.queries_run
         )
-        yield CounterMetricFamily(
-            f"{prefix}_code_scan_queries",
-            "Queries in first-level scans of the sign codes.",
-            self._worker.query_batcher.queries_run,
+        devices, lags = status.devices, status.lags.items()
+        labelled: tuple[tuple[str, str, str, Mapping[Any, float]], ...] = (
+            (
+                "device_resident_bytes",
+                "Bytes of descriptors in a GPU's memory.",
+                "device",
+                {device.name: device.resident_bytes for device in devices},
+            ),
+            (
+                "device_failed",
+                "1 while the CPU searches because the GPU has failed.",
+                "device",
+                {device.name: device.failure is not None for device in devices},
+            ),
+            (
+                "snapshot_version",
+                "Version of the map in the snapshot.",
+                "generation",
+                status.versions,
+            ),
+            (
+                "snapshot_lag_versions",
+                "Versions behind the map.",
+                "generation",
+                {key: lag.versions for key, lag in lags},
+            ),
+            (
+                "snapshot_lag_seconds",
+                "Seconds since the snapshot was last known to be current.",
+                "generation",
+                {key: lag.seconds for key, lag in lags},
+            ),
         )
-        yield GaugeMetricFamily(f"{prefix}_rows", "Searchable rows.", status.rows)
-        yield GaugeMetricFamily(
-            f"{prefix}_missing_chunks", "Unreadable chunks.", len(status.missing)
-        )
-        version = GaugeMetricFamily(
-            f"{prefix}_snapshot_version",
-            "Version of the map in the snapshot.",
-            labels=["generation"],
-        )
-        for generation_id, version_number in status.versions.items():
-            version.add_metric([str(generation_id)], version_number)
-        yield version
-        lag_versions = GaugeMetricFamily(
-            f"{prefix}_snapshot_lag_versions", "Versions behind the map.", labels=["generation"]
-        )
-        lag_seconds = GaugeMetricFamily(
-            f"{prefix}_snapshot_lag_seconds",
-            "Seconds since the snapshot was last known to be current.",
-            labels=["generation"],
-        )
-        for generation_id, lag in status.lags.items():
-            lag_versions.add_metric([str(generation_id)], lag.versions)
-            lag_seconds.add_metric([str(generation_id)], lag.seconds)
-        yield lag_versions
-        yield lag_seconds
+        for name, text, label, values in labelled:
+            family = GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, labels=[label])
+            for key, amount in values.items():
+                family.add_metric([str(key)], float(amount))
+            yield family

@@ -108,11 +108,28 @@ class PhotoColumns:
         self.tags[row] = frozenset(photo.tags)
 
 
+def _joined(column: str, dtype: Any) -> cached_property[NDArray[Any]]:
+    """Return a property that concatenates the column of the parts on first use."""
+
+    def join(self: JoinedColumns) -> NDArray[Any]:
+        empty = np.empty(0, dtype)  # without parts
+        return np.concatenate([empty, *(getattr(part, column) for part in self.parts)])
+
+    return cached_property(join)
+
+
 @dataclass(frozen=True, eq=False)
 class JoinedColumns:
-    """Concatenated columns of several chunks; each column is joined on first use."""
+    """Concatenated columns of several chunks."""
 
     parts: Sequence[PhotoColumns]
+
+    findable = _joined("findable", np.bool_)
+    latitude = _joined("latitude", np.float64)
+    longitude = _joined("longitude", np.float64)
+    captured_at = _joined("captured_at", UNKNOWN_TIME.dtype)
+    id_low_bits = _joined("id_low_bits", np.uint64)
+    has_place = _joined("has_place", np.bool_)
 
     def __len__(self) -> int:
         return int(self.first_rows[-1])
@@ -123,30 +140,6 @@ class JoinedColumns:
         return np.cumsum([0, *(len(part) for part in self.parts)])
 
     @cached_property
-    def findable(self) -> NDArray[np.bool_]:
-        return self._joined([part.findable for part in self.parts], np.bool_)
-
-    @cached_property
-    def latitude(self) -> NDArray[np.float64]:
-        return self._joined([part.latitude for part in self.parts], np.float64)
-
-    @cached_property
-    def longitude(self) -> NDArray[np.float64]:
-        return self._joined([part.longitude for part in self.parts], np.float64)
-
-    @cached_property
-    def captured_at(self) -> NDArray[np.datetime64]:
-        return self._joined([part.captured_at for part in self.parts], UNKNOWN_TIME.dtype)
-
-    @cached_property
-    def id_low_bits(self) -> NDArray[np.uint64]:
-        return self._joined([part.id_low_bits for part in self.parts], np.uint64)
-
-    @cached_property
-    def has_place(self) -> NDArray[np.bool_]:
-        return self._joined([part.has_place for part in self.parts], np.bool_)
-
-    @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
         return _JoinedRowIndex([part.rows_by_tag for part in self.parts], self.first_rows)
 
@@ -154,18 +147,15 @@ class JoinedColumns:
     def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
         return _JoinedRowIndex([part.rows_by_place for part in self.parts], self.first_rows)
 
-    def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
-        """Return the photo ids of these rows; None for dead rows."""
+    def locate(self, rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+        """Yield the chunk, and the row in it, of each row."""
         chunks = np.searchsorted(self.first_rows, rows, side="right") - 1
         rows_in_chunk = rows - self.first_rows[chunks]
-        return [
-            self.parts[chunk].photo_id[row]
-            for chunk, row in zip(chunks.tolist(), rows_in_chunk.tolist(), strict=True)
-        ]
+        return zip(chunks.tolist(), rows_in_chunk.tolist(), strict=True)
 
-    @staticmethod
-    def _joined(parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:
-        return np.concatenate(parts) if parts else np.empty(0, dtype)
+    def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
+        """Return the photo ids of these rows; None for dead rows."""
+        return [self.parts[chunk].photo_id[row] for chunk, row in self.locate(rows)]
 
 
 class _JoinedRowIndex(Mapping[str, NDArray[np.int64]]):

@@ -16,7 +16,7 @@ from services.search.photo_columns import JoinedColumns
 from shared.search_api.protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
-    from services.search.gpu import GpuSnapshot
+    from services.search.gpu import GpuRows
     from services.search.sign_code_search import SignCodeBlocks
 
 
@@ -34,8 +34,8 @@ class Snapshot:
     missing: tuple[str, ...] = ()
     parts: tuple[IndexPart, ...] = ()
     """Parts of the index, and whether they are resident or mapped files."""
-    gpu_snapshot: GpuSnapshot | None = None
-    """The rows in a GPU's memory; None if they are not loaded there."""
+    gpu: GpuRows | None = None
+    """A GPU that may have loaded the rows; None if there is none."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -69,11 +69,8 @@ class Snapshot:
 
     def prefetch_rows(self, rows: NDArray[np.int64]) -> None:
         """Advise the system that these rows are read next, where they are mapped files."""
-        first_rows = self.photos.first_rows
-        chunks = np.searchsorted(first_rows, rows, side="right") - 1
-        rows_in_chunk = rows - first_rows[chunks]
-        for number, row in zip(chunks.tolist(), rows_in_chunk.tolist(), strict=True):
-            self.chunks[number].prefetch_row(row)
+        for chunk, row in self.photos.locate(rows):
+            self.chunks[chunk].prefetch_row(row)
 
     @cached_property
     def sign_code_blocks(self) -> SignCodeBlocks:

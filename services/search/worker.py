@@ -2,8 +2,8 @@
 
 `SearchWorker` keeps a snapshot of each generation in sync with the catalog and runs queries on the
 current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk of
-another shard, in a chunk that has been merged since, or under `queries/`. It caches the rows read
-last: the gateway asks for more hits of the same query, and evaluations use the same photos again.
+another shard, in a chunk that has been merged since, or under `queries/`. It caches stored rows:
+the gateway asks for more hits of the same query, and evaluations use the same photos again.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 from uuid import UUID
 
@@ -29,7 +30,7 @@ from services.search.chunk_loader import list_generation_folders, remove_stale_f
 from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.query_batcher import QueryBatcher
-from services.search.residency import GpuResidency, MemoryBudget, open_search_device
+from services.search.residency import MemoryBudget, open_search_gpu
 from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog, ChangePoll
@@ -51,13 +52,12 @@ from shared.storage.read_retries import ReadRetries
 from shared.word_weights.weights import apply_word_weights
 
 if TYPE_CHECKING:
-    from services.search.gpu import GpuDevice
+    from services.search.gpu import GpuRows
 
 
 log = logging.getLogger(__name__)
 
-CACHED_ROWS = 64  # 25 MB at 98,304 dimensions
-BACKGROUND_CACHE_BYTES = 50_000_000  # successive frames of a track share their background
+CACHED_ROW_BYTES = 75_000_000  # 190 rows of 98,304 dimensions
 
 
 class QueryRowReader:
@@ -66,9 +66,8 @@ class QueryRowReader:
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._cache: LRUCache[tuple[str, int], Row] = LRUCache(CACHED_ROWS)
-        self._background: LRUCache[RowReference, Row] = LRUCache(
-            BACKGROUND_CACHE_BYTES, getsizeof=lambda row: row.nbytes
+        self._cache: LRUCache[RowReference, Row] = LRUCache(
+            CACHED_ROW_BYTES, getsizeof=lambda row: row.nbytes
         )
 
     def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
@@ -82,52 +81,57 @@ class QueryRowReader:
         if request.object_key in snapshot.missing:
             raise _unreadable_error(request.object_key)
         if chunk is None:
-            return self._read_cached(request.object_key, request.row)
+            reference = RowReference(object_key=request.object_key, row=request.row)
+            if request.object_key.startswith(QUERIES):  # expires with its object
+                return self._read(reference)
+            return self._read_cached(reference)
         if request.row >= len(chunk.rows):
             raise _reference_expired_error(f"row {request.row} of {request.object_key}")
         row: Row = chunk.rows[request.row].astype(np.float32)
         return row
 
     def read_background(self, references: Sequence[RowReference]) -> list[Row]:
-        """Return the rows of a background that still exist."""
+        """Return the rows of a background that still exist.
+
+        They are cached: successive frames of a track share their background.
+        """
         rows = []
         for reference in references:
-            with self._lock:
-                row = self._background.get(reference)
-            if row is None:
-                try:
-                    row = read_row(self._store, reference.object_key, reference.row)
-                except (NotFound, IndexError):
-                    continue  # expired
-                except ValueError as error:
-                    log.warning("%s is left out of the background: %s", reference, error)
-                    continue
-                with self._lock:
-                    self._background[reference] = row
-            rows.append(row)
+            try:
+                rows.append(self._read_cached(reference))
+            except Gone:
+                continue
+            except Unavailable as error:
+                if error.code != UNREADABLE:
+                    raise
+                log.warning("%s is left out of the background: %s", reference, error)
         return rows
 
-    def _read_cached(self, object_key: str, row: int) -> Row:
-        cache_key = (object_key, row)
+    def _read_cached(self, reference: RowReference) -> Row:
         with self._lock:
-            cached = self._cache.get(cache_key)
-            if cached is not None:
-                return cached
+            row = self._cache.get(reference)
+        if row is None:
+            row = self._read(reference)
+            with self._lock:
+                self._cache[reference] = row
+        return row
+
+    def _read(self, reference: RowReference) -> Row:
+        key = reference.object_key
         try:
-            loaded = read_row(self._store, object_key, row)
+            row = read_row(self._store, key, reference.row)
         except NotFound:
-            raise _reference_expired_error(f"descriptor {object_key}") from None
+            raise _reference_expired_error(f"descriptor {key}") from None
         except IndexError:
-            raise _reference_expired_error(f"row {row} of {object_key}") from None
+            raise _reference_expired_error(f"row {reference.row} of {key}") from None
         except ValueError as error:
-            raise _unreadable_error(object_key) from error
-        if object_key.startswith(QUERIES):
-            return loaded  # not cached: it expires with its object, after QUERY_TTL_SECONDS
-        if not rows_are_valid(loaded[np.newaxis]).all():
-            raise _unreadable_error(object_key)
-        with self._lock:
-            self._cache[cache_key] = loaded
-        return loaded
+            raise _unreadable_error(key) from error
+        if not key.startswith(QUERIES) and not rows_are_valid(row[np.newaxis]).all():
+            raise _unreadable_error(key)
+        return row
+
+
+UNREADABLE = "chunk_unreadable"
 
 
 def _reference_expired_error(what: str) -> Gone:
@@ -137,15 +141,17 @@ def _reference_expired_error(what: str) -> Gone:
 
 def _unreadable_error(object_key: str) -> Unavailable:
     return Unavailable(
-        "chunk_unreadable",
+        UNREADABLE,
         f"The descriptor in {object_key} can't be read: the object is missing or damaged. "
         "Query with the photo itself, or restore the object from a backup.",
         object_key=object_key,
     )
 
 
+MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a shard
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
+MAX_SYNC_COPY_BYTES = 1 << 28  # to a GPU, before a new snapshot is served: a tenth of a second
 FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
@@ -163,13 +169,15 @@ class SearchWorker:
         store: ObjectStore,
         settings: Settings,
         shard: Shard = SINGLE_SHARD,
-        device: GpuDevice | None = None,
+        *,
+        gpu: GpuRows | None = None,
+        max_wait_seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
         """Create a worker without any snapshot; its GPU is by default as SEARCH_DEVICE says."""
         self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
-        self._settings = settings
+        self._max_wait_seconds = max_wait_seconds
         self._store = store
         self._folder = settings.search_cache_folder(shard)
         self.query_batcher = QueryBatcher()
@@ -178,7 +186,7 @@ class SearchWorker:
         self._snapshots: dict[UUID, Snapshot] = {}
         self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
-        self._residency = GpuResidency(device or open_search_device(settings.search_device))
+        self._gpu = gpu or open_search_gpu(settings.search_device)
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
@@ -223,11 +231,14 @@ class SearchWorker:
                 self._sync_generation(generation_id, target.version)
             elif self._needs_reload(snapshot):
                 self._sync_generation(generation_id, target.version, damaged=snapshot)
-            self._update_gpu(generation_id)
+            if self._gpu is not None and (new := self._snapshots.get(generation_id)):
+                self._gpu.load(new)
             self.replication_lag.record_synced(generation_id, read_at)
         ended = held - current.keys()
         for generation_id in ended:
             self._memory_budget.release_generation(generation_id)
+        if self._gpu is not None:
+            self._gpu.release(ended)
         with self._snapshots_lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
             known = {*current, *self._snapshots}
@@ -249,11 +260,7 @@ class SearchWorker:
             background = self._query_rows.read_background(request.background)
             query = subtract_background(query, background)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        options = SearchOptions(
-            k=request.k,
-            min_score=request.min_score,
-            mode=request.mode,
-        )
+        options = SearchOptions(request.k, request.min_score, request.mode)
         weighted = _weight_query(query, request.word_weights)
         return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)
 
@@ -272,7 +279,7 @@ class SearchWorker:
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.replication_lag.current_lags(versions),
-            devices=self._residency.status(snapshots.values()),
+            devices=() if self._gpu is None else (self._gpu.status(),),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
@@ -280,9 +287,9 @@ class SearchWorker:
 
         Raises:
             Gone: `query_expired` if the generation no longer exists.
-            Unavailable: `search_behind` if the version is not reached within SEARCH_WAIT_SECONDS.
+            Unavailable: `search_behind` if the version is not reached within `max_wait_seconds`.
         """
-        deadline = time.monotonic() + self._settings.search_wait_seconds
+        deadline = time.monotonic() + self._max_wait_seconds
         while True:
             snapshot = self._snapshots.get(generation_id)
             if snapshot is not None and snapshot.version >= min_version:
@@ -321,7 +328,9 @@ class SearchWorker:
                 self.shard,
             )
             if new is not None:
-                new = self._residency.carry_over(new, old)
+                if self._gpu is not None:
+                    self._gpu.load(new, MAX_SYNC_COPY_BYTES)
+                    new = replace(new, gpu=self._gpu)
                 with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
@@ -335,23 +344,6 @@ class SearchWorker:
             return False
         self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
         return any(chunk.was_changed() for chunk in snapshot.chunks)
-
-    def _update_gpu(self, generation_id: UUID) -> None:
-        """Load the generation onto the GPU, or drop it after a failure; queries continue."""
-        snapshot = self._snapshots.get(generation_id)
-        if snapshot is None or not self._residency.needs_update(snapshot):
-            return
-        filled = self._residency.update(snapshot)
-        if filled.gpu_snapshot is None and snapshot.gpu_snapshot is None:
-            return
-        with self._snapshots_lock:
-            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
-        with load_lock:
-            current = self._snapshots.get(generation_id)
-            if current is not None:
-                new = self._residency.carry_over(current, filled)
-                with self._snapshots_lock:
-                    self._snapshots = {**self._snapshots, generation_id: new}
 
 
 def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:

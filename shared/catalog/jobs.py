@@ -80,8 +80,11 @@ class JobKind(StrEnum):
 FIT_JOBS = (JobKind.FIT, JobKind.PCA)
 MODEL_CHANGE_JOBS = (*FIT_JOBS, JobKind.IMPORT, JobKind.SWITCH)
 
-# A client waits for their result, which is stored for QUERY_TTL_SECONDS.
+# A client waits for their result.
 QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
+# Retention of their photos and results: long enough for a client that polls, and for the background
+# of a track; short, because nobody has chosen to store these photos.
+QUERY_TTL_SECONDS = 3600.0
 
 # Extractors run the jobs that need photos and a backbone, the steward those that need only search.
 EXTRACTOR_JOBS = (

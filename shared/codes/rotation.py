@@ -139,22 +139,6 @@ class Rotation:
         """Length of a rotated vector, a multiple of 64."""
         return self.blocks * self.block
 
-    @property
-    def error(self) -> float:
-        """Upper bound of the error of a computed rotation, relative to the row's length.
-
-        In units of u = 2^-24, by standard rounding analysis (Higham 2002, chapters 2 and 3), for
-        each round: every one of the log2(b) stages of the transform adds two numbers once, with an
-        error of at most u of the length; the signs are exact, and the scale is a power of two. The
-        reflection adds 2 (n + 1) u through the sum over n blocks (n - 1 additions, the rounded 2/n
-        and its product) and u through its subtraction. Later steps rotate errors of earlier ones,
-        but do not amplify them. One per cent more covers the terms in u^2 and denormal numbers, in
-        rows that are not tiny as a whole.
-        """
-        stages = self.block.bit_length() - 1
-        mixing = 2 * self.blocks + 3 if self.blocks > 1 else 0
-        return 1.01 * ROUNDS * (stages + mixing) * 2.0**-24
-
     def rotate(self, rows: Floats) -> Floats:
         """Rotate (n, dimension) float32 rows to (n, padded) float32; lengths are preserved.
 

@@ -15,11 +15,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shared.codes.rotation import ROUNDS, SEED, StoredFloats, get_rotation
 from shared.codes.sign_codes import SignCodes, encode_signs, level_words
@@ -28,14 +26,17 @@ SIGN_CODES_FORMAT = 1
 ALIGNMENT_BYTES = 64
 MAX_HEADER_BYTES = 4096
 
-Layout = tuple[str, tuple[int, ...]]
-"""Dtype of an array, and the shape of its entry for one row."""
-
 
 def encode_sign_codes(rows: StoredFloats, chunk_sha256: str) -> bytes:
     """Encode the sign codes of (n, dimension) rows of the chunk with this hash."""
     codes = encode_signs(rows)
-    return _encode(_sign_codes_spec(rows.shape[1]), [codes.norms, *codes.levels], chunk_sha256)
+    arrays = (codes.norms, *codes.levels)
+    body = b"".join(_padded(np.ascontiguousarray(array).tobytes()) for array in arrays)
+    header = {
+        **_parameters(len(rows), rows.shape[1], chunk_sha256),
+        "sha256": hashlib.sha256(body).hexdigest(),
+    }
+    return _padded(json.dumps(header).encode(), b" ", end=b"\n") + body
 
 
 def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> SignCodes:
@@ -50,68 +51,44 @@ def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str
     Raises:
         ValueError: The codes belong to another chunk, have other parameters, or are damaged.
     """
-    spec = _sign_codes_spec(dimension)
-    layout: list[Layout] = [("<f4", ()), *(("<u8", (words,)) for words in spec["levels"])]
-    norms, *levels = _decode(data, spec, layout, rows, chunk_sha256)
-    return SignCodes(tuple(levels), norms)
-
-
-def _sign_codes_spec(dimension: int) -> dict[str, Any]:
-    """Parameters of sign codes; codes with different parameters can't be compared."""
-    return {
-        "format": SIGN_CODES_FORMAT,
-        "dimension": dimension,
-        "seed": SEED,
-        "rounds": ROUNDS,
-        "levels": list(level_words(get_rotation(dimension).padded)),
-    }
-
-
-def _encode(spec: dict[str, Any], arrays: list[NDArray[Any]], chunk_sha256: str) -> bytes:
-    blocks = [_padded(np.ascontiguousarray(array).tobytes()) for array in arrays]
-    digest = hashlib.sha256()
-    for block in blocks:
-        digest.update(block)
-    header = {
-        **spec,
-        "rows": len(arrays[0]),
-        "chunk_sha256": chunk_sha256,
-        "sha256": digest.hexdigest(),
-    }
-    return b"".join([_padded(json.dumps(header).encode(), b" ", end=b"\n"), *blocks])
-
-
-def _decode(
-    data: Any, spec: dict[str, Any], layout: list[Layout], rows: int, chunk_sha256: str
-) -> list[NDArray[Any]]:
-    """Return the arrays of a file; ValueError if its parameters, chunk or hash differ."""
     view = memoryview(data)
     line, _, _ = bytes(view[:MAX_HEADER_BYTES]).partition(b"\n")
     header = json.loads(line)  # a JSONDecodeError is a ValueError
     if not isinstance(header, dict):
         raise ValueError("not a file of codes: its header is not a JSON object")
-    expected = {**spec, "rows": rows, "chunk_sha256": chunk_sha256}
+    expected = _parameters(rows, dimension, chunk_sha256)
     mismatched = [name for name, value in expected.items() if header.get(name) != value]
     if mismatched:
         raise ValueError(f"codes of other rows or parameters: {', '.join(mismatched)} differ")
     body = view[len(line) + 1 :]
     if hashlib.sha256(body).hexdigest() != header.get("sha256"):
         raise ValueError("the codes are corrupt: their hash differs")
-    arrays, offset = [], 0
-    for dtype, shape in layout:
-        array, offset = _array(body, offset, dtype, (rows, *shape))
-        arrays.append(array)
-    return arrays
+    norms = np.frombuffer(body, "<f4", rows)
+    offset, levels = _aligned(norms.nbytes), []
+    for words in expected["levels"]:
+        level = np.frombuffer(body, "<u8", rows * words, offset).reshape(rows, words)
+        offset += _aligned(level.nbytes)
+        levels.append(level)
+    return SignCodes(tuple(levels), norms)
 
 
-def _array(
-    body: memoryview, offset: int, dtype: str, shape: tuple[int, ...]
-) -> tuple[NDArray[Any], int]:
-    """Return the array at the offset, and the offset of the next one."""
-    array = np.frombuffer(body, dtype, math.prod(shape), offset).reshape(shape)
-    return array, offset + -(-array.nbytes // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
+def _parameters(rows: int, dimension: int, chunk_sha256: str) -> dict[str, Any]:
+    """What codes and rows must agree in; codes with other parameters can't be compared."""
+    return {
+        "format": SIGN_CODES_FORMAT,
+        "dimension": dimension,
+        "seed": SEED,
+        "rounds": ROUNDS,
+        "levels": list(level_words(get_rotation(dimension).padded)),
+        "rows": rows,
+        "chunk_sha256": chunk_sha256,
+    }
+
+
+def _aligned(size_bytes: int) -> int:
+    return -(-size_bytes // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
 
 
 def _padded(data: bytes, filling: bytes = b"\0", end: bytes = b"") -> bytes:
-    padding = -(len(data) + len(end)) % ALIGNMENT_BYTES
-    return data + filling * padding + end
+    size = len(data) + len(end)
+    return data + filling * (_aligned(size) - size) + end

@@ -27,9 +27,6 @@ class SearchSettings(BaseSettings):
         le=1,
         description="share of the answers that must be right, unless a search has `certainty`",
     )
-    search_wait_seconds: float = Field(
-        5.0, gt=0, description="maximum wait for `min_version`, seconds"
-    )
     search_memory_budget: Size | None = Field(
         None,
         ge=0,
@@ -48,12 +45,6 @@ class SearchSettings(BaseSettings):
         None,
         description="URLs of all search workers, separated by commas; unset: search runs in this "
         "process",
-    )
-    search_timeout_seconds: float = Field(
-        10.0,
-        gt=0,
-        description="timeout for the shards' responses, seconds; a shard that exceeds it is "
-        "omitted from the result",
     )
 
     @field_validator("estimate_radii_m")

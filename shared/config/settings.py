@@ -94,9 +94,6 @@ class JobSettings(BaseSettings):
         gt=0,
         description="time without a renewal after which a job's lease expires, seconds",
     )
-    query_ttl_seconds: float = Field(
-        3600.0, gt=0, description="retention of a query photo that is not stored, seconds"
-    )
     search_history_days: float = Field(
         90.0, gt=0, description="retention of a search in the history, days"
     )

@@ -111,6 +111,7 @@ def merge_statuses(
     )
 
 
+SHARD_TIMEOUT_SECONDS = 10.0  # a shard that takes longer is left out of the result and named
 MAX_CONCURRENT_CALLS = 64  # to all shards together; further calls are queued
 RESPONSE_MARGIN_SECONDS = 0.2  # for a call that times out at the deadline to return its error
 RETRY_PAUSE_SECONDS = 0.05  # before lagging workers are called again
@@ -153,7 +154,7 @@ class HttpSearchClient:
                 "SEARCH_URLS is not set. List the URL of every search worker, for example "
                 "http://search-1:8000,http://search-2:8000.",
             )
-        return cls(settings.search_worker_urls, settings.search_timeout_seconds)
+        return cls(settings.search_worker_urls, SHARD_TIMEOUT_SECONDS)
 
     def __enter__(self) -> Self:
         self._workers.refresh()

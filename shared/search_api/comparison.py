@@ -111,4 +111,4 @@ def check_explainable(config: ExtractorConfig, spec: Mapping[str, Any] | None) -
 
 def query_expired_error() -> Gone:
     """Error for a query whose photo or descriptor has expired."""
-    return Gone("query_expired", "The query has expired (QUERY_TTL_SECONDS). Send the query again.")
+    return Gone("query_expired", "The query has expired: it is kept for an hour. Send it again.")

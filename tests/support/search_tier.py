@@ -14,11 +14,11 @@ import uvicorn
 from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listen, reachable_url
 from services.search.service import create_search_app
-from services.search.worker import SearchWorker
+from services.search.worker import MAX_WAIT_SECONDS, SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.config.shards import Shard
-from shared.search_api.client import HttpSearchClient
+from shared.search_api.client import SHARD_TIMEOUT_SECONDS, HttpSearchClient
 from shared.storage import ObjectStore
 
 START_SECONDS = 20.0
@@ -31,9 +31,15 @@ class SearchServer:
     """
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, settings: Settings, shard: Shard
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        shard: Shard,
+        max_wait_seconds: float,
     ) -> None:
         self._of = (catalog, store, settings, shard)
+        self._max_wait_seconds = max_wait_seconds
         self._port = 0
         self._running: tuple[uvicorn.Server, threading.Thread, contextlib.ExitStack] | None = None
         self.url = ""
@@ -41,7 +47,7 @@ class SearchServer:
 
     def start(self) -> None:
         """A new worker, which has to load everything anew."""
-        self.worker = SearchWorker(*self._of)
+        self.worker = SearchWorker(*self._of, max_wait_seconds=self._max_wait_seconds)
         held = contextlib.ExitStack()
         listener = held.enter_context(listen("127.0.0.1", self._port))
         self._port = listener.getsockname()[1]
@@ -82,16 +88,18 @@ class SearchTier:
         store: ObjectStore,
         settings: Settings,
         replicas: Sequence[int] = (1,),
+        max_wait_seconds: float = MAX_WAIT_SECONDS,
+        timeout_seconds: float = SHARD_TIMEOUT_SECONDS,
     ) -> None:
         shards = [Shard(index, len(replicas)) for index in range(len(replicas))]
         self.servers = [
-            [SearchServer(catalog, store, settings, shard) for _ in range(count)]
+            [SearchServer(catalog, store, settings, shard, max_wait_seconds) for _ in range(count)]
             for shard, count in zip(shards, replicas, strict=True)
         ]
         for server in self._all():
             server.wait_until_started()
         urls = [server.url for server in self._all()]
-        self.port = HttpSearchClient(urls, settings.search_timeout_seconds)
+        self.port = HttpSearchClient(urls, timeout_seconds)
 
     def __enter__(self) -> Self:
         self.port.__enter__()

@@ -42,7 +42,7 @@ from services.gateway.uploads.query_photo import (
     query_job_search_params,
     receive_query_photo,
 )
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
+from shared.catalog.jobs import QUERY_JOBS, QUERY_TTL_SECONDS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
@@ -94,7 +94,7 @@ async def search_by_stored_photo(
             )
         check_comparison_supported(gateway, query.map, search_params)
         admission.admit_query()
-        idempotent.claim_key(None, gateway.settings.query_ttl_seconds)
+        idempotent.claim_key(None, QUERY_TTL_SECONDS)
         return start_comparison_of_stored_photo(
             gateway, query_from_photo(gateway, query.map, file_id), search_params, idempotent
         )
@@ -226,7 +226,7 @@ def _queue_query(
     idempotent: IdempotentRequest,
 ) -> Job:
     upload = file.complete()
-    with idempotent.claim_form(upload, gateway.settings.query_ttl_seconds):
+    with idempotent.claim_form(upload, QUERY_TTL_SECONDS):
         for name in upload.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with upload.open(gateway.store) as photo:

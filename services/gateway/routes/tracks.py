@@ -49,6 +49,7 @@ from services.gateway.tracks.schemas import (
 from services.gateway.uploads.multipart import FormFile, multipart_schema
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.database.session import Catalog
+from shared.catalog.jobs import QUERY_TTL_SECONDS
 from shared.catalog.maps import get_map
 from shared.catalog.tracks import (
     MAX_SMOOTHED_FRAMES,
@@ -319,7 +320,7 @@ def _accept_frame(
 ) -> TrackFrame:
     """Store the frame with its job, or return the frame that it repeats."""
     received = file.complete()
-    with idempotent.claim_form(received, gateway.settings.query_ttl_seconds):
+    with idempotent.claim_form(received, QUERY_TTL_SECONDS):
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as photo:
             read_photo_header(photo, gateway.settings.max_image_pixels)

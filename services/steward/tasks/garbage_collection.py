@@ -23,12 +23,11 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_JOBS, QUERY_TTL_SECONDS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending
 from shared.catalog.vocabularies import StoredWhitening
-from shared.config.settings import Settings
 from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
 from shared.storage.keys import (
@@ -284,8 +283,8 @@ def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
 def collect_garbage(
     catalog: Catalog,
     store: ObjectStore,
-    settings: Settings,
     *,
+    query_ttl_seconds: float = QUERY_TTL_SECONDS,
     superseded_grace_seconds: float = SUPERSEDED_GRACE_SECONDS,
     retired_grace_seconds: float = RETIRED_GRACE_SECONDS,
 ) -> None:
@@ -296,6 +295,6 @@ def collect_garbage(
     collect_ended_generations(catalog, store, retired_grace_seconds)
     collect_whitenings(catalog, store, retired_grace_seconds)
     collect_deleted_photos(catalog, store, retired_grace_seconds)
-    collect_queries(catalog, store, settings.query_ttl_seconds)
+    collect_queries(catalog, store, query_ttl_seconds)
     collect_presigned_uploads(catalog, store)
     collect_checkpoints(catalog, store)

@@ -36,7 +36,7 @@ whatever_the_catalog = pytest.mark.databases("sqlite")
 class SearchPortContract:
     """Every promise of the port. A subclass's fixture `port` opens one on the map `places`.
 
-    It takes settings by name, for example `port(search_wait_seconds=0.05)`.
+    It may take the time to wait for a version: `port(max_wait_seconds=0.05)`.
     """
 
     @pytest.fixture
@@ -309,7 +309,7 @@ class SearchPortContract:
     ) -> None:
         places.add(unit_rows(1, 3))
         reference = places.query(unit_rows(2, 1)[0])
-        search = port(search_wait_seconds=0.05, search_timeout_seconds=1)
+        search = port(max_wait_seconds=0.05)
         with pytest.raises(Unavailable) as caught:
             search.search(places.request(reference, min_version=places.version + 1))
         assert caught.value.code == "search_behind"
@@ -321,7 +321,7 @@ class SearchPortContract:
         places.add(unit_rows(1, 3))
         vector = unit_rows(2, 1)
         request = places.request(places.query(vector[0]), min_version=places.version + 1)
-        search = port(search_wait_seconds=30)
+        search = port(max_wait_seconds=30)
         search.search(places.request((request.object_key, 0)))
         publisher = threading.Timer(0.05, places.add, [vector])
         publisher.start()

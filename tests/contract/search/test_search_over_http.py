@@ -10,8 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from services.search.worker import MAX_WAIT_SECONDS
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
+from shared.search_api.client import SHARD_TIMEOUT_SECONDS
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore
 from tests.contract.search.test_search_backend import OpenPort, SearchPortContract
@@ -33,12 +35,12 @@ class TestSearchOverHttp(SearchPortContract):
     ) -> Iterator[OpenPort]:
         with contextlib.ExitStack() as running:
 
-            def open_port(**changes: object) -> SearchBackend:
+            def open_port(max_wait_seconds: float = MAX_WAIT_SECONDS) -> SearchBackend:
                 # Whoever waits longer for a version waits longer for the shards, too.
-                wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
-                patience = {"search_timeout_seconds": max(10.0, 5 * wait)}
-                own = settings.model_copy(update=patience | changes)
-                tier = SearchTier(catalog, store, own, REPLICAS)
+                timeout_seconds = max(SHARD_TIMEOUT_SECONDS, 5 * max_wait_seconds)
+                tier = SearchTier(
+                    catalog, store, settings, REPLICAS, max_wait_seconds, timeout_seconds
+                )
                 tier.follow()  # a search brings only one replica of a shard up to date
                 return running.enter_context(tier).port
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from services.search import executor, gpu
+from services.search import executor
 from services.search import worker as worker_module
 from services.search.catalog_sync import read_generation_versions
+from services.search.gpu import GpuRows
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
@@ -33,8 +34,8 @@ from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
 class TestSearchWorker(SearchPortContract):
     @pytest.fixture
     def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
-        def open_port(**changes: object) -> SearchBackend:
-            return SearchWorker(catalog, store, settings.model_copy(update=changes))
+        def open_port(**options: Any) -> SearchBackend:
+            return SearchWorker(catalog, store, settings, **options)
 
         return open_port
 
@@ -233,8 +234,8 @@ class TestSearchWorkerOfFloat16Rows(SearchPortContract):
 
     @pytest.fixture
     def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
-        def open_port(**changes: object) -> SearchBackend:
-            return SearchWorker(catalog, store, settings.model_copy(update=changes))
+        def open_port(**options: Any) -> SearchBackend:
+            return SearchWorker(catalog, store, settings, **options)
 
         return open_port
 
@@ -276,11 +277,9 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
     ) -> OpenPort:
         monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
 
-        def open_port(**changes: object) -> SearchBackend:
-            device = gpu.GpuDevice(torch.device("cpu"))
-            worker = SearchWorker(
-                catalog, store, settings.model_copy(update=changes), device=device
-            )
+        def open_port(**options: Any) -> SearchBackend:
+            rows = GpuRows(torch.device("cpu"))
+            worker = SearchWorker(catalog, store, settings, gpu=rows, **options)
             worker.sync()
             return worker
 

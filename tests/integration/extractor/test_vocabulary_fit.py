@@ -446,6 +446,6 @@ def test_what_a_switch_leaves_is_completed_in_small_transactions(
         killed.setattr(model_changes, "settle_photo_jobs", lambda catalog: None)
         assert fitted.finish(job_id).state == JobState.SUCCEEDED
     assert [fitted.job_of(photo_id).state for photo_id in bad] == [JobState.SUCCEEDED] * 3
-    collect_garbage(fitted.catalog, fitted.store, fitted.settings)
+    collect_garbage(fitted.catalog, fitted.store)
     assert [fitted.job_of(photo_id).state for photo_id in bad] == [JobState.FAILED] * 3
     assert {job.photo_id for job in fitted.reindex_jobs(new)} == set(bad)

@@ -59,11 +59,8 @@ def tier_of(catalog: Catalog, store: FolderStore, settings: Settings) -> Any:
     """Opens tiers with so many replicas of each shard; each has loaded everything."""
     opened: list[SearchTier] = []
 
-    def open_tier(*replicas: int, **changes: object) -> SearchTier:
-        own = settings.model_copy(
-            update={"search_wait_seconds": 0.2, "search_timeout_seconds": 10.0, **changes}
-        )
-        tier = SearchTier(catalog, store, own, replicas)
+    def open_tier(*replicas: int, **changes: float) -> SearchTier:
+        tier = SearchTier(catalog, store, settings, replicas, max_wait_seconds=0.2, **changes)
         tier.follow()
         opened.append(tier.__enter__())
         return tier
@@ -194,7 +191,7 @@ def test_of_a_replica_that_is_behind_the_other_one_answers(
 def test_a_shard_that_stays_behind_is_named_at_the_deadline(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tier = tier_of(1, 1, search_timeout_seconds=2.0)  # enough for the other one on a busy machine
+    tier = tier_of(1, 1, timeout_seconds=2.0)  # enough for the other one on a busy machine
     searched = behind(tier.servers[0][0], monkeypatch)
     started = time.monotonic()
     response = ask(tier, places)
@@ -207,7 +204,7 @@ def test_a_shard_that_stays_behind_is_named_at_the_deadline(
 def test_a_worker_that_hangs_costs_its_own_shard_alone(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tier = tier_of(1, 1, search_timeout_seconds=2.0)  # enough for the other one on a busy machine
+    tier = tier_of(1, 1, timeout_seconds=2.0)  # enough for the other one on a busy machine
     released = threading.Event()
     monkeypatch.setattr(tier.servers[1][0].worker, "search", lambda request: released.wait(60))
     response = ask(tier, places)

@@ -49,7 +49,7 @@ pytestmark = pytest.mark.databases("postgresql")
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: Settings) -> None:
+def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap) -> None:
     retained = sum_of(chunk_map.chunks(2, 2))
     merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
     gone = [
@@ -58,7 +58,6 @@ def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: S
     ]
     chunk_map.delete(*gone)
     ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
-    now = settings.model_copy(update={"query_ttl_seconds": -1.0})
     together = threading.Barrier(2)
 
     def both() -> None:
@@ -66,7 +65,7 @@ def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap, settings: S
         collect_garbage(
             chunk_map.catalog,
             chunk_map.store,
-            now,
+            query_ttl_seconds=-1.0,
             superseded_grace_seconds=-1.0,
             retired_grace_seconds=-1.0,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -32,32 +33,45 @@ def photo(number: int) -> UUID:
     return UUID(int=number + 1)
 
 
-def snapshot_of(rows: StoredRows, pieces: int = 3, *, coded: bool = True) -> Snapshot:
-    """The rows in so many chunks, with sign codes or without."""
+def snapshot_of(
+    rows: StoredRows,
+    pieces: int = 3,
+    *,
+    coded: bool = True,
+    numbers: Sequence[int] | None = None,
+    dead: Collection[int] = (),
+) -> Snapshot:
+    """The rows in so many chunks, with sign codes or without; `numbers` are those of their photos.
+
+    Rows of `dead` numbers have no photo.
+    """
+    numbers = range(len(rows)) if numbers is None else numbers
     bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
-    chunks = [
-        LoadedChunk(
-            new_id(),
-            f"chunks/{a}.npy",
-            rows[a:b],
-            PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
-            codes=encode_signs(rows[a:b]) if coded else None,
-        )
-        for a, b in pairwise(bounds.tolist())
-    ]
+    chunks = []
+    for a, b in pairwise(bounds.tolist()):
+        live = [(row, facts_of(photo(n))) for row, n in enumerate(numbers[a:b]) if n not in dead]
+        codes = encode_signs(rows[a:b]) if coded else None
+        columns = PhotoColumns.of(b - a, live)
+        chunks.append(LoadedChunk(new_id(), f"chunks/{a}.npy", rows[a:b], columns, codes=codes))
     return Snapshot(new_id(), new_id(), 1, tuple(chunks))
 
 
 def brute_force(
-    rows: StoredRows, query: Rows, k: int, selected: NDArray[np.bool_], min_score: float = -2.0
+    rows: StoredRows,
+    query: Rows,
+    k: int,
+    selected: NDArray[np.bool_] | None = None,
+    min_score: float = -2.0,
+    numbers: Sequence[int] | None = None,
 ) -> list[tuple[UUID, float]]:
+    numbers = range(len(rows)) if numbers is None else numbers
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
     scores = np.round([row.astype(np.float64) @ exact for row in rows], SCORE_DECIMALS)
     scored = [
-        (-min(1.0, score), photo(number))
-        for number, score in enumerate(scores.tolist())
-        if selected[number] and score >= min_score
+        (-float(np.clip(score, -1.0, 1.0)), photo(number))
+        for row, (number, score) in enumerate(zip(numbers, scores.tolist(), strict=True))
+        if (selected is None or selected[row]) and score >= min_score
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 

@@ -3,10 +3,8 @@ lies on the device, and the CPU's way where it fails."""
 
 from __future__ import annotations
 
-import gc
 import logging
 import math
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,8 @@ from hypothesis import given, settings
 from services.search import executor, gpu
 from services.search import residency as residency_module
 from services.search.executor import SearchOptions
-from services.search.gpu import GpuDevice, GpuError, GpuSnapshot
-from services.search.residency import GpuResidency, open_search_device
+from services.search.gpu import GpuRows
+from services.search.residency import open_search_gpu
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
 from shared.search_api.protocol import Mode
@@ -38,6 +36,9 @@ from tests.unit.search.search_rows import (
 pytestmark = pytest.mark.numerics
 
 DIMENSION = 512
+ROWS = places(6, 90, DIMENSION)
+QUERY = ROWS[3]
+EVERYTHING = np.ones(90, bool)
 
 
 @pytest.fixture(autouse=True)
@@ -45,14 +46,15 @@ def always_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: True)
 
 
-def cpu_device() -> GpuDevice:
-    return GpuDevice(torch.device("cpu"))
+def gpu_rows() -> GpuRows:
+    return GpuRows(torch.device("cpu"))
 
 
-def on_device(snapshot: Snapshot) -> Snapshot:
-    found = GpuResidency(cpu_device()).update(snapshot)
-    assert found.gpu_snapshot is not None
-    return found
+def on_device(snapshot: Snapshot, rows: GpuRows | None = None) -> Snapshot:
+    rows = rows or gpu_rows()
+    rows.load(snapshot)
+    assert rows.status().generations == (snapshot.generation_id,)
+    return replace(snapshot, gpu=rows)
 
 
 @settings(max_examples=25, deadline=None)
@@ -94,116 +96,94 @@ def test_rows_that_are_converted_in_parts_give_the_same_answer(
     assert answer(snapshot, rows[7], everything, SearchOptions(20)) == whole
 
 
+def is_loaded(snapshot: Snapshot, rows: GpuRows) -> bool:
+    return rows.find_candidates(snapshot, QUERY, EVERYTHING, 1, None) is not None
+
+
 def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = places(6, 90, DIMENSION)
-    whole = snapshot_of(rows, 3, coded=False)
+    whole = snapshot_of(ROWS, 3, coded=False)
     first = replace(whole, chunks=whole.chunks[:2])
-    residency = GpuResidency(cpu_device())
-    old = residency.update(first)
-    new = residency.carry_over(whole, old)
-    assert old.gpu_snapshot is not None
-    assert new.gpu_snapshot is not None
-    for chunk_id, there in old.gpu_snapshot.rows.items():
-        assert new.gpu_snapshot.rows[chunk_id] is there
-    assert len(new.gpu_snapshot.rows) == 3
-    found = answer(new, rows[80], np.ones(90, bool), SearchOptions(5))
-    assert hits_of(found) == brute_force(rows, rows[80], 5, np.ones(90, bool))
-    monkeypatch.setattr(residency_module, "MAX_SYNC_COPY_BYTES", 0)
-    assert residency.carry_over(whole, old).gpu_snapshot is None, (
-        "many rows are copied while none waits"
-    )
-    assert residency.needs_update(residency.carry_over(whole, old))
+    copied: list[int] = []
+    real = torch.tensor
+
+    def copy(data: Any, **options: Any) -> torch.Tensor:
+        copied.append(len(data))
+        return real(data, **options)
+
+    rows = gpu_rows()
+    with monkeypatch.context() as patched:
+        patched.setattr(torch, "tensor", copy)
+        rows.load(first)
+        rows.load(whole, max_bytes=0)
+        assert copied == [30, 30], "many rows are copied while no query waits"
+        rows.load(whole)
+    assert copied == [30, 30, 30]
+    found = answer(replace(whole, gpu=rows), QUERY, EVERYTHING, SearchOptions(5))
+    assert hits_of(found) == brute_force(ROWS, QUERY, 5, EVERYTHING)
 
 
-def test_memory_of_a_forgotten_snapshot_and_of_merged_chunks_is_free() -> None:
-    whole = snapshot_of(places(6, 90, DIMENSION), 3, coded=False)
-    residency = GpuResidency(cpu_device())
-    old = residency.update(whole)
-    assert old.gpu_snapshot is not None
-    resident = weakref.ref(old.gpu_snapshot)
-    tensors = [weakref.ref(there) for there in old.gpu_snapshot.rows.values()]
-    new = residency.carry_over(replace(whole, chunks=whole.chunks[1:]), old)
-    del old
-    gc.collect()
-    assert [tensor() is None for tensor in tensors] == [True, False, False]
-    assert resident() is None
-    del new
-    gc.collect()
-    assert all(tensor() is None for tensor in tensors)
+def test_memory_of_merged_chunks_and_of_ended_generations_is_freed() -> None:
+    whole, rows = snapshot_of(ROWS, 3, coded=False), gpu_rows()
+    rows.load(whole)
+    assert rows.status().resident_bytes == ROWS.nbytes
+    rows.load(replace(whole, chunks=whole.chunks[1:]))
+    assert rows.status().resident_bytes == ROWS.nbytes * 2 // 3
+    assert not is_loaded(whole, rows)
+    rows.release([whole.generation_id])
+    assert rows.status().resident_bytes == 0
 
 
-def test_rows_that_do_not_fit_are_searched_by_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(GpuDevice, "free_bytes", lambda _: 1000.0)
-    snapshot = snapshot_of(places(6, 90, DIMENSION), 3, coded=False)
-    residency = GpuResidency(cpu_device())
-    found = residency.update(snapshot)
-    assert found.gpu_snapshot is None
-    assert not residency.needs_update(found), "it is tried again later, not at every look"
+def test_generation_that_gets_sign_codes_leaves_the_device() -> None:
+    rows = gpu_rows()
+    rows.load(plain := snapshot_of(ROWS, coded=False))
+    rows.load(replace(snapshot_of(ROWS), generation_id=plain.generation_id))
+    assert rows.status().generations == ()
+
+
+@pytest.mark.parametrize("retry_seconds", [0.0, gpu.RETRY_SECONDS])
+def test_rows_that_do_not_fit_are_searched_by_the_cpu_and_tried_again_later(
+    monkeypatch: pytest.MonkeyPatch, retry_seconds: float
+) -> None:
+    monkeypatch.setattr(gpu, "RETRY_SECONDS", retry_seconds)
+    snapshot, rows = snapshot_of(ROWS, 3, coded=False), gpu_rows()
+    with monkeypatch.context() as patched:
+        patched.setattr(GpuRows, "free_bytes", lambda _: 1000.0)
+        rows.load(snapshot)
+    assert not is_loaded(snapshot, rows)
+    rows.load(snapshot)
+    assert is_loaded(snapshot, rows) == (retry_seconds == 0), "not at every look"
 
 
 def out_of_memory(*_: object, **__: object) -> Any:
     raise torch.OutOfMemoryError("CUDA out of memory")
 
 
-def test_device_out_of_memory_in_a_query_leaves_it_to_the_cpu(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("failing", ["query", "load"])
+def test_device_out_of_memory_leaves_the_generation_to_the_cpu_for_a_while(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, failing: str
 ) -> None:
-    rows = places(6, 90, DIMENSION)
-    residency = GpuResidency(cpu_device())
-    snapshot = residency.update(snapshot_of(rows, coded=False))
-    everything = np.ones(90, bool)
-    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(GpuSnapshot, "_cosines", out_of_memory)
-        found = answer(snapshot, rows[3], everything, SearchOptions(7))
-    assert hits_of(found) == brute_force(rows, rows[3], 7, everything)
-    assert "searched by the CPU: CUDA out of memory" in caplog.text
-    (status,) = residency.status([snapshot])
-    assert status.failure == "CUDA out of memory"
-    assert status.generations == ()
-    assert residency.needs_update(snapshot), "what failed is taken from the device"
-    without = residency.update(snapshot)
-    assert without.gpu_snapshot is None
-    assert not residency.needs_update(without), "and tried again after a while"
-    monkeypatch.setattr(residency, "_retry_at", {})
-    (status,) = residency.status([residency.update(without)])
-    assert status.failure is None
-    assert status.generations == (snapshot.generation_id,)
-    assert status.resident_bytes == 90 * DIMENSION * 4
-
-
-def test_device_out_of_memory_when_loading_is_reported_and_retried_later(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    snapshot = snapshot_of(places(6, 90, DIMENSION), coded=False)
-    residency = GpuResidency(cpu_device())
-    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(torch, "tensor", out_of_memory)
-        assert residency.update(snapshot).gpu_snapshot is None
-    assert "is searched by the CPU for now: CUDA out of memory" in caplog.text
-    (status,) = residency.status([snapshot])
-    assert status.failure == "CUDA out of memory"
-    assert not residency.needs_update(snapshot)
-    monkeypatch.setattr(residency, "_retry_at", {})
-    assert residency.needs_update(snapshot)
+    rows = gpu_rows()
+    snapshot = replace(snapshot_of(ROWS, coded=False), gpu=rows)
+    if failing == "query":
+        rows.load(snapshot)
+    with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):
+        patched.setattr(torch, "tensor", out_of_memory)
+        rows.load(snapshot)
+        found = answer(snapshot, QUERY, EVERYTHING, SearchOptions(7))
+    assert hits_of(found) == brute_force(ROWS, QUERY, 7, EVERYTHING)
+    assert "searched by the CPU for now: CUDA out of memory" in caplog.text
+    status = rows.status()
+    assert (status.failure, status.generations) == ("CUDA out of memory", ())
+    rows.release([snapshot.generation_id])
+    rows.load(snapshot)
+    status = rows.status()
+    assert (status.failure, status.generations) == (None, (snapshot.generation_id,))
 
 
 def test_dense_mode_never_asks_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = places(6, 90, DIMENSION)
-    snapshot = on_device(snapshot_of(rows, coded=False))
-    monkeypatch.setattr(GpuSnapshot, "_cosines", out_of_memory)
-    answer(snapshot, rows[3], np.ones(90, bool), SearchOptions(7, mode=Mode.DENSE))
-    assert snapshot.gpu_snapshot is not None
-    assert snapshot.gpu_snapshot.failure is None
-
-
-def test_device_failures_differ_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), coded=False))
-    assert snapshot.gpu_snapshot is not None
-    monkeypatch.setattr(GpuSnapshot, "_cosines", out_of_memory)
-    with pytest.raises(GpuError, match="out of memory"):
-        snapshot.gpu_snapshot.find_candidates(
-            np.ones(DIMENSION, np.float32), np.ones(90, bool), 1, None
-        )
+    snapshot = on_device(snapshot_of(ROWS, coded=False))
+    monkeypatch.setattr(GpuRows, "find_candidates", out_of_memory)
+    answer(snapshot, QUERY, EVERYTHING, SearchOptions(7, mode=Mode.DENSE))
 
 
 @pytest.mark.parametrize("sees_driver", [False, True])
@@ -215,14 +195,14 @@ def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
     if sees_driver:
         driver.touch()
     monkeypatch.setattr(residency_module, "DRIVER_PATHS", (driver,))
-    assert open_search_device("auto") is None
-    assert open_search_device("cpu") is None
+    assert open_search_gpu("auto") is None
+    assert open_search_gpu("cpu") is None
     with pytest.raises(Misconfigured, match="no CUDA device"):
-        open_search_device("cuda")
+        open_search_gpu("cuda")
 
 
 def test_without_pytorch_search_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert open_search_device("auto") is None
+    assert open_search_gpu("auto") is None
     with pytest.raises(Misconfigured, match="search-gpu"):
-        open_search_device("cuda")
+        open_search_gpu("cuda")
