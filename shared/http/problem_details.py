@@ -48,32 +48,25 @@ class Problem(BaseModel):
     code: str
 
 
+def _described(description: str) -> dict[str, Any]:
+    schema = Problem.model_json_schema()
+    return {
+        "description": description,
+        "content": {"application/problem+json": {"schema": schema}},
+    }
+
+
 # The error responses of every operation in the OpenAPI description.
 PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "The request was rejected; `code` gives the reason.",
-        "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
-    },
-    "5XX": {
-        "description": "A failure of the server; retry after `Retry-After` seconds if it is set.",
-        "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
-    },
+    "4XX": _described("The request was rejected; `code` gives the reason."),
+    "5XX": _described("A failure of the server; retry after `Retry-After` seconds if it is set."),
 }
 
 # The error responses of authentication, authorization and the rate limit.
 AUTHENTICATION_RESPONSES: dict[int | str, dict[str, Any]] = {
-    401: {
-        **PROBLEM_RESPONSES["4XX"],
-        "description": "The API key is missing, unknown, revoked or expired.",
-    },
-    403: {
-        **PROBLEM_RESPONSES["4XX"],
-        "description": "The API key lacks the scope of this operation.",
-    },
-    429: {
-        **PROBLEM_RESPONSES["4XX"],
-        "description": "Rate limit, quota or backpressure; retry after `Retry-After` seconds.",
-    },
+    401: _described("The API key is missing, unknown, revoked or expired."),
+    403: _described("The API key lacks the scope of this operation."),
+    429: _described("Rate limit, quota or backpressure; retry after `Retry-After` seconds."),
 }
 
 

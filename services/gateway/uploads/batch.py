@@ -97,9 +97,9 @@ async def parse_batch_upload(
                 )
         elif received.prefix is not None:
             raise _conflicting_sources_error("a prefix and another source")
-        parts.commit()
-    finally:
-        await run_in_threadpool(parts.discard_uncommitted)
+    except BaseException:
+        await run_in_threadpool(parts.discard)
+        raise
     return received
 
 
@@ -148,17 +148,11 @@ class _BatchPartHandler:
         self._file: BatchFile | None = None
         self._validator: StreamValidator | None = None
         self._writer: ObjectWriter | None = None
-        self._committed = False
 
-    def discard_uncommitted(self) -> None:
-        """Abort the current write, and delete the files unless `commit` was called."""
+    def discard(self) -> None:
+        """Abort the current write and delete the files."""
         self._abort_write()
-        if not self._committed:
-            discard_batch_upload(self._store, self.batch)
-
-    def commit(self) -> None:
-        """Keep the stored files: the body was complete."""
-        self._committed = True
+        discard_batch_upload(self._store, self.batch)
 
     def begin(self, name: str, filename: str | None) -> None:
         self._name = name
